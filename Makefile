@@ -1,0 +1,38 @@
+.PHONY: help demo test test-all lint bench serve api system venv clean
+.DEFAULT_GOAL := help
+VENV := .venv
+BIN := $(VENV)/bin
+GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
+
+help:  ## Show these targets
+	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
+
+venv:
+	@./scripts/venv.sh $(VENV) requirements/dev.lock
+
+demo:  ## One arm in simulation: found, driven and stopped, by an agent in another process
+	@[ -f $(VENV)/.installed-dev.lock ] || ./scripts/venv.sh $(VENV) requirements/demo.lock
+	@$(BIN)/strands-robots demo $(ARGS)
+
+serve: venv  ## Serve a simulated SO-100 on this machine (ROBOT=..., ARGS=...)
+	@$(BIN)/strands-robots serve $(or $(ROBOT),so100) $(ARGS)
+
+test: venv  ## Everything that needs nothing but wheels
+	@$(BIN)/python -m pytest -m "not system" $(ARGS)
+
+system:
+	@./scripts/system-packages.sh $(GL_PACKAGES)
+
+test-all: venv system  ## What needs Debian or npm packages besides
+	@$(BIN)/python -m pytest -m system $(ARGS)
+
+lint: venv  ## ruff and mypy --strict
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+bench: venv  ## The tables of docs/benchmarks.md, measured here and now
+	@$(BIN)/python -m benchmarks $(ARGS)
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis dist
