@@ -1,0 +1,80 @@
+"""One robot's motion gate: permits to move, revoked at once by a halt and not given while locked.
+
+Every motion source (a rollout, a teleoperation session, a single ``send_action``) asks :meth:`MotionGate.permit`
+before it moves and looks at :attr:`Permit.valid` under the same lock as each write to the device. A halt calls
+:meth:`MotionGate.revoke` first and then waits for the write that may be in flight, so that after its verdict no
+action reaches the device. Revoking is one assignment: it takes no lock and cannot be held up.
+"""
+
+from __future__ import annotations
+
+from itertools import count
+from typing import Protocol
+
+from strands_robots.envelope import Envelope
+
+
+class Latch(Protocol):
+    """What may hold a robot still: the lockout."""
+
+    def refusal(self, verb: str) -> Envelope | None:
+        """The refusal of ``verb`` while locked, or None while clear."""
+
+
+class MotionRefused(RuntimeError):  # noqa: N818 - a refusal, not a fault
+    """Motion is not allowed now; ``envelope`` is the answer to give."""
+
+    def __init__(self, envelope: Envelope) -> None:
+        super().__init__(str(envelope.get("reason", "motion refused")))
+        self.envelope = envelope
+
+
+class Permit:
+    """Leave to move, until the next halt."""
+
+    __slots__ = ("_gate", "_generation", "verb")
+
+    def __init__(self, gate: MotionGate, generation: int, verb: str) -> None:
+        self._gate = gate
+        self._generation = generation
+        self.verb = verb
+
+    @property
+    def valid(self) -> bool:
+        """False for ever once the robot was halted or locked."""
+        return self._gate.generation == self._generation
+
+
+class MotionGate:
+    """The gate of one robot. Thread-safe without a lock: the generation is one reference, replaced whole."""
+
+    def __init__(self, latch: Latch | None = None) -> None:
+        self._latch = latch
+        self._numbers = count(1)
+        self._generation = 0
+
+    @property
+    def generation(self) -> int:
+        """Rises with every halt; permits of an older one are void."""
+        return self._generation
+
+    def attach(self, latch: Latch) -> None:
+        """Let ``latch`` decide from now on whether motion is locked."""
+        self._latch = latch
+
+    def refusal(self, verb: str) -> Envelope | None:
+        """The answer to ``verb`` while locked, or None."""
+        return self._latch.refusal(verb) if self._latch is not None else None
+
+    def permit(self, verb: str) -> Permit:
+        """Leave to move. Raises :class:`MotionRefused` while locked."""
+        # The generation is read before the latch, so that a lock engaged in between voids this permit.
+        permit = Permit(self, self._generation, verb)
+        refusal = self.refusal(verb)
+        if refusal is not None:
+            raise MotionRefused(refusal)
+        return permit
+
+    def revoke(self) -> None:
+        """Void every permit given so far."""
+        self._generation = next(self._numbers)

@@ -1,0 +1,148 @@
+"""The one grader of "did it stop?".
+
+Whoever asks a robot to stop gets back something: a :class:`StopVerdict`, an envelope, a foreign robot's
+dictionary, an exception, or nothing in time. :func:`grade` sorts them. An affirmative failure, an exception,
+a timeout and a shape nobody knows are four different answers, and only an affirmative success is success.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.utils import shown
+
+
+class Outcome(Enum):
+    """What an answer to a stop says."""
+
+    STOPPED = "stopped"
+    REFUSED = "did not stop"
+    RAISED = "raised"
+    TIMED_OUT = "no answer"
+    UNKNOWN = "unknown answer"
+
+    @property
+    def stopped(self) -> bool | None:
+        """True or False where the answer settles it, None where it does not."""
+        if self is Outcome.UNKNOWN:
+            return None
+        return self is Outcome.STOPPED
+
+
+@dataclass(frozen=True, slots=True)
+class StopVerdict:
+    """What a robot's ``halt`` did.
+
+    ``halted`` names every motion source that was moving and is still now, ``not_stopped`` and ``unknown`` map a
+    source to the reason. A verdict with nothing in any of them is a robot that was standing still: stopped.
+    """
+
+    halted: tuple[str, ...] = ()
+    not_stopped: Mapping[str, str] = field(default_factory=dict)
+    unknown: Mapping[str, str] = field(default_factory=dict)
+    elapsed_ms: float = 0.0
+
+    @property
+    def stopped(self) -> bool | None:
+        """True: nothing moves. False: something is known to. None: nobody knows."""
+        if self.not_stopped:
+            return False
+        return None if self.unknown else True
+
+    def envelope(self) -> Envelope:
+        """The verdict as an answer; an error unless everything is known to be still."""
+        fields = {
+            "stopped": self.stopped,
+            "halted": list(self.halted),
+            "not_stopped": dict(self.not_stopped),
+            "unknown": dict(self.unknown),
+            "elapsed_ms": round(self.elapsed_ms, 3),
+        }
+        if self.stopped:
+            what = f"Stopped {', '.join(self.halted)}." if self.halted else "Nothing was moving."
+            return success(what, **fields)
+        doubts = [f"{name} did not stop: {why}" for name, why in self.not_stopped.items()]
+        doubts += [f"{name}: {why}" for name, why in self.unknown.items()]
+        return error("; ".join(doubts), **fields)
+
+
+def grade(answer: object) -> Outcome:
+    """Sort whatever a stop returned.
+
+    A contradiction is a failure: an envelope that says success beside ``stopped: false``, a non-empty
+    ``not_stopped`` or ``running: true`` did not stop.
+    """
+    if isinstance(answer, StopVerdict):
+        return {True: Outcome.STOPPED, False: Outcome.REFUSED, None: Outcome.UNKNOWN}[answer.stopped]
+    if isinstance(answer, TimeoutError):
+        return Outcome.TIMED_OUT
+    if isinstance(answer, BaseException):
+        return Outcome.RAISED
+    if not isinstance(answer, Mapping):
+        return Outcome.UNKNOWN
+    facts = [answer, *_json_blocks(answer)]
+    if any(_denies(fact) for fact in facts):
+        return Outcome.REFUSED
+    if any(fact.get("stopped", False) is None and "stopped" in fact for fact in facts):
+        return Outcome.UNKNOWN
+    if answer.get("status") == "success" or any(fact.get("ok") is True for fact in facts):
+        return Outcome.STOPPED
+    return Outcome.STOPPED if answer.get("stopped") is True and "status" not in answer else Outcome.UNKNOWN
+
+
+def explain(answer: object) -> str:
+    """Why :func:`grade` did not say stopped, in a few words for an operator."""
+    outcome = grade(answer)
+    if outcome in (Outcome.RAISED, Outcome.TIMED_OUT):
+        return f"{outcome.value}: {type(answer).__name__}: {answer}"
+    if outcome is Outcome.REFUSED and isinstance(answer, Mapping):
+        for key in ("reason", "error", "message"):
+            if isinstance(answer.get(key), str) and answer[key]:
+                return f"{outcome.value}: {answer[key]}"
+    return f"{outcome.value}: {shown(answer)}"
+
+
+def halt_each(sources: Mapping[str, Callable[[], object]]) -> StopVerdict:
+    """Ask every source to stop, in order, whatever the ones before it did, and grade each answer.
+
+    A source whose callable returns None had nothing to halt and is not listed.
+    """
+    started = time.monotonic()
+    halted: list[str] = []
+    not_stopped: dict[str, str] = {}
+    unknown: dict[str, str] = {}
+    for name, stop in sources.items():
+        try:
+            answer = stop()
+        except Exception as exc:  # noqa: BLE001 - whatever a stop raises is graded, and the next source still halts
+            answer = exc
+        if answer is None:
+            continue
+        outcome = grade(answer)
+        if outcome.stopped:
+            halted.append(name)
+        elif outcome.stopped is None:
+            unknown[name] = explain(answer)
+        else:
+            not_stopped[name] = explain(answer)
+    return StopVerdict(tuple(halted), not_stopped, unknown, (time.monotonic() - started) * 1000)
+
+
+def _json_blocks(answer: Mapping[str, object]) -> list[Mapping[str, object]]:
+    content = answer.get("content")
+    blocks = content if isinstance(content, list) else []
+    return [b["json"] for b in blocks if isinstance(b, Mapping) and isinstance(b.get("json"), Mapping)]
+
+
+def _denies(fact: Mapping[str, object]) -> bool:
+    return (
+        fact.get("status") == "error"
+        or fact.get("ok") is False
+        or fact.get("stopped") is False
+        or fact.get("running") is True
+        or bool(fact.get("not_stopped"))
+    )

@@ -1,0 +1,171 @@
+"""What each environment variable means, in one table.
+
+Nothing else in the package reads the environment. A value is read when it is asked for, not at import, so a
+test or a flag of ``serve`` may set it first. An unknown spelling of a boolean is the safe side and one
+warning; a number out of its domain is the default and one warning.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from dataclasses import dataclass
+
+logger = logging.getLogger(__name__)
+
+TRUE_WORDS = frozenset({"1", "true", "yes", "on"})
+FALSE_WORDS = frozenset({"0", "false", "no", "off"})
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One environment variable: its default as text, its kind, its domain and its meaning."""
+
+    name: str
+    kind: str
+    default: str
+    meaning: str
+    low: float | None = None
+    high: float | None = None
+
+
+_TABLE: dict[str, Setting] = {}
+_warned: set[tuple[str, str]] = set()
+
+
+def _declare(*settings: Setting) -> None:
+    for setting in settings:
+        _TABLE[setting.name] = setting
+
+
+_declare(
+    # The framework's own names, honoured as it documents them.
+    Setting("DEVICE_CONNECT_ALLOW_INSECURE", "boolean", "false", "Opt in to a transport without authentication."),
+    Setting("DEVICE_CONNECT_DISCOVERY_MODE", "text", "d2d", "How devices are found: d2d (presence) or registry."),
+    Setting("MESSAGING_BACKEND", "text", "zenoh", "Transport of Device Connect: zenoh or nats."),
+    Setting("MESSAGING_URLS", "list", "", "Broker or peer URLs of Device Connect."),
+    Setting("MESSAGING_CREDENTIALS_FILE", "path", "", "Device Connect credentials file (JSON)."),
+    Setting("MESSAGING_TLS_CA_FILE", "path", "", "Certificate authority that peers are checked against (PEM)."),
+    Setting("MESSAGING_TLS_CERT_FILE", "path", "", "This device's certificate (PEM)."),
+    Setting("MESSAGING_TLS_KEY_FILE", "path", "", "This device's private key (PEM)."),
+    Setting("NATS_URL", "text", "", "NATS server URL."),
+    Setting("NATS_URLS", "list", "", "NATS server URLs."),
+    Setting("NATS_CREDENTIALS_FILE", "path", "", "NATS credentials file."),
+    Setting("ZENOH_CONNECT", "list", "", "Zenoh endpoints to connect to, such as tcp/127.0.0.1:7447."),
+    Setting("ZENOH_LISTEN", "list", "", "Zenoh endpoints to listen on."),
+    Setting("TENANT", "text", "default", "Device Connect tenant."),
+    # Ours, on Device Connect.
+    Setting(
+        "DEVICE_CONNECT_RPC_ALLOW",
+        "list",
+        "",
+        "Callers that may move a robot: globs; '*' any named caller; 'anonymous' the unnamed. "
+        "Unset: simulations move for anybody, real hardware for nobody.",
+    ),
+    Setting(
+        "DEVICE_CONNECT_ESTOP_ALLOW",
+        "list",
+        "",
+        "Sources whose emergencyStop is honoured: globs. Unset: every named source.",
+    ),
+    Setting(
+        "STRANDS_MESH_POLICY_TYPE_ALLOW",
+        "list",
+        "",
+        "Policy providers that callers may ask for. Unset: all registered.",
+    ),
+    Setting(
+        "STRANDS_ROBOT_COMMAND_ALLOW",
+        "list",
+        "",
+        "Motion verbs the operator approves on real hardware: 'verb' or 'verb@peer'.",
+    ),
+    Setting("BYPASS_TOOL_CONSENT", "boolean", "false", "Approve every motion verb on real hardware."),
+    Setting("STRANDS_DC_PORT", "integer", "7447", "Loopback port where local robots meet.", 1, 65535),
+    Setting("STRANDS_DC_STATE_HZ", "number", "1", "stateUpdate events a second while idle.", 0.01, 100),
+    Setting(
+        "STRANDS_DC_STATE_BUSY_HZ",
+        "number",
+        "10",
+        "stateUpdate events a second while a task runs.",
+        0.01,
+        100,
+    ),
+    Setting("STRANDS_DC_OBSERVATION_HZ", "number", "10", "observationUpdate events a second.", 0.01, 100),
+    Setting("STRANDS_DC_STREAM_HZ", "number", "50", "streamStep events a second at most.", 0.01, 1000),
+    # Robots.
+    Setting("STRANDS_CONTROL_HZ", "number", "50", "Control loop rate of a rollout.", 1, 2000),
+    Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Network of the robot_mesh tool: off means the native mesh."),
+    Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants and lockouts. Unset: ~/.strands_robots."),
+    # Safety.
+    Setting(
+        "STRANDS_HALT_DEADLINE_S",
+        "number",
+        "1.0",
+        "Seconds a robot has to halt before it is reported.",
+        0.05,
+        60,
+    ),
+)
+
+
+def declared() -> tuple[Setting, ...]:
+    """Every setting, in the order in which the table declares them."""
+    return tuple(_TABLE.values())
+
+
+def raw(name: str) -> str:
+    """The variable's text, stripped; the declared default when unset or blank."""
+    return os.environ.get(name, "").strip() or _TABLE[name].default
+
+
+def is_set(name: str) -> bool:
+    """True when the variable holds anything but blanks."""
+    return bool(os.environ.get(_TABLE[name].name, "").strip())
+
+
+def boolean(name: str, *, safe: bool = False) -> bool:
+    """A switch. An unknown spelling is ``safe``, with one warning."""
+    word = raw(name).lower()
+    if word in TRUE_WORDS:
+        return True
+    if word in FALSE_WORDS:
+        return False
+    _warn_once(name, word, f"is no boolean; taken as {str(safe).lower()}, the safe side")
+    return safe
+
+
+def number(name: str) -> float:
+    """A finite number in the setting's domain, else its default with one warning."""
+    setting, word = _TABLE[name], raw(name)
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    low = -math.inf if setting.low is None else setting.low
+    high = math.inf if setting.high is None else setting.high
+    if math.isfinite(value) and low <= value <= high:
+        return value
+    _warn_once(name, word, f"is no number from {low:g} to {high:g}; {setting.default} is used")
+    return float(setting.default)
+
+
+def integer(name: str) -> int:
+    """A whole number in the setting's domain, else its default with one warning."""
+    value = number(name)
+    if value != int(value):
+        _warn_once(name, raw(name), f"is not whole; {_TABLE[name].default} is used")
+        return int(_TABLE[name].default)
+    return int(value)
+
+
+def items(name: str) -> tuple[str, ...]:
+    """A comma list without its blanks; empty when unset."""
+    return tuple(part.strip() for part in raw(name).split(",") if part.strip())
+
+
+def _warn_once(name: str, value: str, what: str) -> None:
+    if (name, value) not in _warned:
+        _warned.add((name, value))
+        logger.warning("%s=%r %s.", name, value, what)

@@ -1,0 +1,172 @@
+"""Value domains and identifiers: is this number usable, is this name allowed?
+
+Every check returns the value, typed, or raises :class:`ValidationError` whose sentence names the argument,
+the value and the domain. The doors (RPC handlers, constructors, wire decoders) call these once; what is
+inside trusts its types. Booleans are not numbers, and NaN is not a number.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import re
+from typing import Any
+
+IDENTIFIER_MAX = 128
+"""Longest peer id and message identifier, in characters (the mesh wire's bound)."""
+
+_IDENTIFIER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")
+_DEVICE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*\Z")
+_HOSTNAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?\Z")
+_SHOWN_MAX = 80
+
+
+class ValidationError(ValueError):
+    """A value outside its domain. ``code`` is for machines, the message for people."""
+
+    def __init__(self, message: str, code: str = "INVALID") -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class MissingExtraError(ImportError):
+    """An optional dependency is not installed; the message says which extra brings it."""
+
+
+def missing_extra(what: str, extra: str) -> MissingExtraError:
+    """The one sentence for an absent optional package."""
+    return MissingExtraError(f"{what} needs the [{extra}] extra: pip install 'strands-robots[{extra}]'.")
+
+
+def shown(value: object) -> str:
+    """``repr`` of a refused value, shortened so that a hostile one cannot flood a log or a reply."""
+    if isinstance(value, str | bytes) and len(value) > _SHOWN_MAX:
+        return f"{value[:_SHOWN_MAX]!r}... ({len(value)} long)"
+    if isinstance(value, list | tuple | dict | set) and len(value) > 8:
+        return f"a {type(value).__name__} of {len(value)}"
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 256:
+        return f"an integer of {value.bit_length()} bits"
+    try:
+        text = repr(value)
+    except Exception as exc:  # noqa: BLE001 - a foreign __repr__ may raise anything
+        return f"a {type(value).__name__} whose repr raises {type(exc).__name__}"
+    return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
+
+
+def number(
+    name: str,
+    value: object,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+) -> float:
+    """A finite number, ``low`` and ``high`` included, ``above`` excluded."""
+    domain = _domain("a finite number", low, high, above)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    try:
+        result = float(value)
+    except OverflowError:
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.") from None
+    outside = (
+        not math.isfinite(result)
+        or (low is not None and result < low)
+        or (high is not None and result > high)
+        or (above is not None and result <= above)
+    )
+    if outside:
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    return result
+
+
+def whole(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:
+    """An integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
+    domain = _domain("an integer", low, high, None)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    return value
+
+
+def flag(name: str, value: object) -> bool:
+    """A boolean; no spelling of one and no 0 or 1 stands for it."""
+    if not isinstance(value, bool):
+        raise ValidationError(f"{name} must be true or false, not {shown(value)}.")
+    return value
+
+
+def text(name: str, value: object, *, longest: int = 2000, empty: bool = False) -> str:
+    """A string of at most ``longest`` characters without control characters; blank only where ``empty``."""
+    domain = f"text of {0 if empty else 1} to {longest} characters without control characters"
+    if not isinstance(value, str):
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    unprintable = any(ord(c) < 32 or 127 <= ord(c) < 160 or 0xD800 <= ord(c) < 0xE000 for c in value[: longest + 1])
+    if len(value) > longest or unprintable or (not empty and not value.strip()):
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    return value
+
+
+def choice(name: str, value: object, allowed: tuple[str, ...]) -> str:
+    """One of a few words."""
+    if not isinstance(value, str) or value not in allowed:
+        raise ValidationError(f"{name} must be one of {', '.join(allowed)}, not {shown(value)}.")
+    return value
+
+
+def mapping(name: str, value: object) -> dict[str, Any]:
+    """A JSON object."""
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise ValidationError(f"{name} must be an object with string keys, not {shown(value)}.")
+    return value
+
+
+def identifier(name: str, value: object) -> str:
+    """A peer id or an identifier inside a message: letters, digits, ``.``, ``_``, ``-``, the first alphanumeric."""
+    domain = f"1 to {IDENTIFIER_MAX} letters, digits, '.', '_' or '-', the first one alphanumeric"
+    if not isinstance(value, str) or len(value) > IDENTIFIER_MAX or not _IDENTIFIER.match(value):
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    return value
+
+
+def device_id(name: str, value: object) -> str:
+    """An id on Device Connect: an identifier without dots, because discovery cannot see a dotted one."""
+    domain = f"1 to {IDENTIFIER_MAX} letters, digits, '_' or '-', the first one alphanumeric, without dots"
+    if not isinstance(value, str) or len(value) > IDENTIFIER_MAX or not _DEVICE_ID.match(value):
+        raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    return value
+
+
+def port(name: str, value: object) -> int:
+    """A TCP port, 1 to 65535."""
+    return whole(name, value, low=1, high=65535)
+
+
+def dial_host_error(value: object) -> str | None:
+    """Why ``value`` cannot be the host half of a URL, or None: a bare hostname or an IP literal can."""
+    domain = "a bare hostname or IP address"
+    if not isinstance(value, str) or not 0 < len(value) <= 253:
+        return f"host must be {domain}, not {shown(value)}."
+    try:
+        ipaddress.ip_address(value.strip("[]"))
+    except ValueError:
+        return None if _HOSTNAME.match(value) else f"host must be {domain}, not {shown(value)}."
+    return None
+
+
+def teleoperator_contract_error(teleoperator: object) -> str | None:
+    """Why ``teleoperator`` cannot lead a robot, or None: it must have a callable ``get_action``."""
+    if callable(getattr(teleoperator, "get_action", None)):
+        return None
+    return f"teleoperator must have a callable get_action(), and {shown(teleoperator)} has none."
+
+
+def _domain(kind: str, low: float | None, high: float | None, above: float | None) -> str:
+    if above is not None:
+        return f"{kind} above {above:g}" + (f" and at most {high:g}" if high is not None else "")
+    if low is not None and high is not None:
+        return f"{kind} from {low:g} to {high:g}"
+    if low is not None:
+        return f"{kind} of at least {low:g}"
+    return f"{kind} of at most {high:g}" if high is not None else kind
