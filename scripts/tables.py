@@ -1,0 +1,68 @@
+"""Writes the tables of README.md that the code already knows: settings and extras.
+
+``python scripts/tables.py`` rewrites them in place; ``--check`` only says whether they are up to date.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+from strands_robots import settings
+
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
+
+EXTRA_MEANINGS = {
+    "device-connect": "the Device Connect networks (Zenoh, NATS), drivers and client",
+    "sim": "the MuJoCo simulation and its pictures",
+    "remote": "policies served over a WebSocket",
+    "agent": "the Strands agent tool and the MCP bridge",
+    "reachy": "Reachy Mini",
+    "lerobot": "real arms through LeRobot, and its checkpoints (brings torch; not in `all`)",
+    "all": "everything but `lerobot`",
+}
+
+
+def settings_table() -> str:
+    rows = ["| variable | default | meaning |", "|---|---|---|"]
+    for setting in settings.declared():
+        domain = "" if setting.low is None else f" ({setting.low:g} to {setting.high:g})"
+        default = f"`{setting.default}`" if setting.default else "unset"
+        rows.append(f"| `{setting.name}` | {default}{domain} | {setting.meaning.replace('|', '&#124;')} |")
+    return "\n".join(rows)
+
+
+def extras_table() -> str:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    rows = ["| extra | gives | brings |", "|---|---|---|"]
+    for name, packages in project["optional-dependencies"].items():
+        brought = ", ".join(re.split(r"[<>=]", package)[0] for package in packages)
+        rows.append(f"| `{name}` | {EXTRA_MEANINGS[name]} | {brought} |")
+    return "\n".join(rows)
+
+
+def rewritten(text: str) -> str:
+    for name, table in (("settings", settings_table()), ("extras", extras_table())):
+        pattern = rf"(<!-- table: {name} -->\n).*?(\n<!-- end -->)"
+        text, found = re.subn(pattern, lambda m, t=table: m[1] + t + m[2], text, flags=re.DOTALL)
+        if not found:
+            raise SystemExit(f"README.md has no table marker for {name}.")
+    return text
+
+
+def main() -> int:
+    current = README.read_text(encoding="utf-8")
+    wanted = rewritten(current)
+    if "--check" in sys.argv:
+        if wanted != current:
+            print("README.md is behind the code: run python scripts/tables.py")
+        return int(wanted != current)
+    README.write_text(wanted, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
