@@ -1,0 +1,65 @@
+"""``python -m benchmarks``: measure every claim of speed on this machine and print one table a part.
+
+Each part measures ours and the bare thing side by side in the same run, so that the ratio holds on any machine.
+Exits with 1 when a bound was not kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import platform
+import sys
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.table import Row, markdown
+
+PARTS = {
+    "rpc": "Calls and events over Zenoh and NATS",
+    "device": "Bring-up, import and fleets in one process",
+    "simulation": "Physics",
+    "safety": "From the controller's call to the last write",
+    "reachy": "Reachy Mini",
+}
+
+
+def shown(title: str, rows: list[Row]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for heading in ("what", "ours", "against", "ratio", "must", "kept"):
+        table.add_column(heading, justify="right" if heading == "ratio" else "left")
+    for row in rows:
+        kept = "[green]yes[/]" if row.ok else "[bold red]no[/]"
+        table.add_row(row.what, row.ours, row.against, "" if row.ratio is None else f"{row.ratio:.2f}", row.must, kept)
+    return table
+
+
+def main() -> int:
+    here = Path(__file__).parent
+    available = [name for name in PARTS if (here / f"{name}.py").exists()]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"what to measure: {', '.join(available)} (all)")
+    parser.add_argument("--quick", action="store_true", help="fewer repeats: a look, not a figure to quote")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables there")
+    options = parser.parse_args()
+    if unknown := set(options.parts) - set(available):
+        parser.error(f"no such part: {', '.join(sorted(unknown))}; there are {', '.join(available)}")
+
+    console, pages, kept = Console(), [], True
+    for name in options.parts or available:
+        started = time.monotonic()
+        rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run(quick=options.quick)
+        kept = kept and all(row.ok for row in rows)
+        console.print(shown(PARTS[name], rows))
+        console.print(f"[dim]{time.monotonic() - started:.0f} s, Python {platform.python_version()}[/]\n")
+        pages.append(f"## {PARTS[name]}\n\n`make bench ARGS={name}`\n\n{markdown(rows)}\n")
+    if options.markdown:
+        options.markdown.write_text("\n".join(pages), encoding="utf-8")
+    return 0 if kept else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
