@@ -1,0 +1,128 @@
+"""May this caller? Who may move a robot, whose emergency stop counts, which policy may be asked for.
+
+A caller's name is what the caller says it is: no transport of Device Connect vouches for it unless a broker's
+access rules do, so a name here is a label to sort by and to log, not a proof. Stops and reads never come
+here: they are answered to every caller.
+
+The lists are comma lists of case-sensitive globs (:func:`fnmatch.fnmatchcase`), and a blank list is no list.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
+
+from strands_robots import settings
+from strands_robots.utils import shown
+
+logger = logging.getLogger(__name__)
+
+ANONYMOUS = "anonymous"
+"""The entry that admits callers without a name, which the framework's plain agent tools are."""
+
+NAME_MAX = 255
+"""Longest name of a caller, the framework's own bound on a device id."""
+
+
+def caller_name(source: object) -> str | None:
+    """The declared name, or None for whatever names nobody: no string, blank, too long or unprintable."""
+    if not isinstance(source, str) or not source.strip() or len(source) > NAME_MAX or not source.isprintable():
+        return None
+    return source
+
+
+def entries(words: Sequence[str]) -> tuple[str, ...]:
+    """The list without its blanks; empty means that nobody set it."""
+    return tuple(word.strip() for word in words if word.strip())
+
+
+def matches(name: str, words: Sequence[str]) -> bool:
+    """True when one of the globs fits ``name``, letter case included."""
+    return any(fnmatchcase(name, word) for word in words)
+
+
+def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> str | None:
+    """Why ``source`` may not move a robot, or None.
+
+    Without a list a simulation moves for anybody and real hardware for nobody. ``*`` and the other globs admit
+    named callers; only the entry ``anonymous`` admits the unnamed.
+    """
+    listed, name = entries(allow), caller_name(source)
+    if not listed:
+        if not hardware:
+            return None
+        return (
+            "Nobody may move this robot: DEVICE_CONNECT_RPC_ALLOW is not set. Set it to the callers that may "
+            "(names or globs, '*' for every named caller, 'anonymous' for callers without a name)."
+        )
+    if name is None:
+        if ANONYMOUS in listed:
+            return None
+        return (
+            "A caller without a name may not move this robot: add 'anonymous' to DEVICE_CONNECT_RPC_ALLOW to admit "
+            "those, or have the caller name itself."
+        )
+    if matches(name, [word for word in listed if word != ANONYMOUS]):
+        return None
+    return f"Caller {shown(name)} may not move this robot: no entry of DEVICE_CONNECT_RPC_ALLOW fits it."
+
+
+def estop_refusal(source: object, allow: Sequence[str]) -> str | None:
+    """Why an emergency stop of ``source`` does not count, or None. Without a list every named source counts."""
+    name, listed = caller_name(source), entries(allow)
+    if name is None:
+        return "an emergency stop without a source is not honoured"
+    if not listed or matches(name, listed):
+        return None
+    return f"source {shown(name)} fits no entry of DEVICE_CONNECT_ESTOP_ALLOW"
+
+
+def provider_refusal(provider: str, allow: Sequence[str]) -> str | None:
+    """Why a caller may not ask for a policy provider, or None. Without a list every registered one is open."""
+    listed = entries(allow)
+    if not listed or matches(provider, listed):
+        return None
+    return (
+        f"policy_provider must be one of {', '.join(listed)} (STRANDS_MESH_POLICY_TYPE_ALLOW), not {shown(provider)}."
+    )
+
+
+class Authorization:
+    """The same questions for one robot, with the lists read when they are asked.
+
+    Args:
+        hardware: True for a robot that can hurt somebody.
+        read_list: gives the list of a setting by its name; the environment's by default.
+    """
+
+    def __init__(
+        self, *, hardware: bool, read_list: Callable[[str], Sequence[str]] = settings.items, robot: str = "robot"
+    ) -> None:
+        self.hardware = hardware
+        self._read = read_list
+        self._robot = robot
+        self._told = threading.Event()
+
+    def motion(self, source: object, verb: str) -> str | None:
+        """Why ``source`` may not do ``verb``, or None; a refusal and its caller are logged."""
+        allow = self._read("DEVICE_CONNECT_RPC_ALLOW")
+        refusal = motion_refusal(source, allow, hardware=self.hardware)
+        if refusal is not None:
+            logger.warning("%s: %s refused to caller %s (self-declared).", self._robot, verb, shown(source))
+        elif not entries(allow) and not self._told.is_set():
+            self._told.set()
+            logger.warning(
+                "%s moves for anybody on its network: it is a simulation and DEVICE_CONNECT_RPC_ALLOW is not set.",
+                self._robot,
+            )
+        return refusal
+
+    def estop(self, source: object) -> str | None:
+        """Why an emergency stop of ``source`` does not count, or None."""
+        return estop_refusal(source, self._read("DEVICE_CONNECT_ESTOP_ALLOW"))
+
+    def provider(self, provider: str) -> str | None:
+        """Why ``provider`` may not be asked for over the network, or None."""
+        return provider_refusal(provider, self._read("STRANDS_MESH_POLICY_TYPE_ALLOW"))
