@@ -94,10 +94,52 @@ _declare(
     ),
     Setting("STRANDS_DC_OBSERVATION_HZ", "number", "10", "observationUpdate events a second.", 0.01, 100),
     Setting("STRANDS_DC_STREAM_HZ", "number", "50", "streamStep events a second at most.", 0.01, 1000),
+    # The native mesh.
+    Setting("STRANDS_MESH", "text", "", "false: no mesh at all. true: a bare Robot() joins the mesh."),
+    Setting("STRANDS_MESH_BACKEND", "text", "zenoh", "Transport of the mesh: zenoh, iot, bridge or memory."),
+    Setting("STRANDS_MESH_PORT", "integer", "7447", "Loopback port of the mesh's hub.", 1, 65535),
+    Setting("STRANDS_MESH_NAMESPACE", "text", "strands", "Zenoh namespace on top of the mesh's keys."),
+    Setting("STRANDS_MESH_MULTICAST", "boolean", "false", "Find peers by multicast on the local network."),
+    Setting("STRANDS_MESH_MAX_SESSIONS", "integer", "256", "Zenoh sessions a hub accepts.", 1, 65535),
+    Setting("STRANDS_MESH_MAX_PEERS", "integer", "1024", "Peers remembered; the oldest leaves first.", 1, 1_000_000),
+    Setting("STRANDS_MESH_PEER_RETENTION_S", "number", "0", "Seconds a silent peer stays listed.", 0, 10_000_000),
+    Setting("STRANDS_MESH_AUTH_MODE", "text", "mtls", "mtls, or none with STRANDS_MESH_I_KNOW_THIS_IS_INSECURE."),
+    Setting("STRANDS_MESH_I_KNOW_THIS_IS_INSECURE", "boolean", "false", "Opt in to a mesh without certificates."),
+    Setting("STRANDS_MESH_LOCAL_DEV", "boolean", "false", "STRANDS_MESH_AUTH_MODE=none and its opt-in in one."),
+    Setting("STRANDS_MESH_TLS_CA", "path", "", "Certificate authority of the mesh (PEM)."),
+    Setting("STRANDS_MESH_TLS_CERT", "path", "", "This peer's certificate (PEM)."),
+    Setting("STRANDS_MESH_TLS_KEY", "path", "", "This peer's private key (PEM, mode 0600)."),
+    Setting("STRANDS_MESH_ACL_FILE", "path", "", "Zenoh access control of the mesh (JSON5)."),
+    Setting("STRANDS_MESH_ACCEPT_PERMISSIVE_ACL", "boolean", "false", "Accept access control that allows by default."),
+    Setting("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY", "text", "auto", "Signed messages only: 1, 0 or auto."),
+    Setting("STRANDS_MESH_POLICY_HOST_ALLOW", "list", "", "Hosts and CIDRs of policy servers besides loopback."),
+    Setting("STRANDS_MESH_HF_REPO_ALLOW", "list", "", "Hub organisations of checkpoints besides the built-in three."),
+    Setting("STRANDS_MESH_POSE_HZ", "number", "10", "Pose messages a second.", -1, 1000),
+    Setting("STRANDS_MESH_IMU_HZ", "number", "10", "IMU messages a second.", -1, 1000),
+    Setting("STRANDS_MESH_ODOM_HZ", "number", "10", "Odometry messages a second.", -1, 1000),
+    Setting("STRANDS_MESH_HEALTH_HZ", "number", "0.5", "Health messages a second.", -1, 1000),
+    Setting("STRANDS_MESH_LIDAR_SUMMARY_HZ", "number", "5", "Lidar summaries a second.", -1, 1000),
+    Setting("STRANDS_MESH_HAND_HZ", "number", "50", "Hand states a second.", -1, 1000),
+    Setting("STRANDS_MESH_MAP_INFO_HZ", "number", "0.2", "Map messages a second.", -1, 1000),
+    Setting("STRANDS_MESH_CAMERA_HZ", "number", "0", "Camera frames a second and camera; 0 is off.", -1, 1000),
+    Setting("STRANDS_MESH_STREAM_HZ", "number", "50", "Policy steps a second at most; 0 is off.", -1, 1000),
+    Setting("STRANDS_MESH_CAMERA_DISABLED", "boolean", "false", "Privacy switch: no camera frame is ever built."),
+    Setting("STRANDS_MESH_INPUT_MAX_HZ", "number", "100", "Remote actions applied a second; 0 is no cap.", 0, 10_000),
+    Setting("STRANDS_MESH_INPUT_VALUE_ABS", "number", "720", "Largest magnitude of a remote action.", 0, 1e6),
+    Setting("STRANDS_MESH_INPUT_SLEW_ABS", "number", "1440", "Fastest remote action, units a second.", 0, 1e6),
+    Setting("STRANDS_MESH_INPUT_STREAM_TTL_S", "number", "900", "Seconds a remote input stream lives.", 1, 86_400),
+    Setting("STRANDS_IOT_ENDPOINT", "text", "", "MQTT 5 endpoint of the iot backend: host or host:port."),
+    Setting("STRANDS_IOT_THING_NAME", "text", "", "MQTT client id, certificate name and peer id."),
+    Setting("STRANDS_IOT_CERT_DIR", "path", "", "Folder of cert.pem and key.pem of the iot backend."),
+    Setting("STRANDS_IOT_CA_FILE", "path", "", "Certificate authority of the MQTT broker (PEM)."),
+    Setting("STRANDS_MESH_BRIDGE_TOPICS", "list", "", "Topics the bridge carries to MQTT, by name in the table."),
     # Robots.
     Setting("STRANDS_CONTROL_HZ", "number", "50", "Control loop rate of a rollout.", 1, 2000),
     Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Network of the robot_mesh tool: off means the native mesh."),
     Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants and lockouts. Unset: ~/.strands_robots."),
+    # Rendering, by names that are not ours.
+    Setting("MUJOCO_GL", "text", "", "OpenGL of MuJoCo: egl, osmesa, glfw. Unset: what works without a display."),
+    Setting("DISPLAY", "text", "", "X display; where there is one, MuJoCo's own choice of OpenGL is kept."),
     # Safety.
     Setting(
         "STRANDS_HALT_DEADLINE_S",
@@ -107,6 +149,29 @@ _declare(
         0.05,
         60,
     ),
+    Setting("STRANDS_ESTOP_TORQUE", "text", "hold", "What a stop does to torque: hold (stiff) or limp (off)."),
+    Setting(
+        "STRANDS_CHECKIN_TIMEOUT_S",
+        "number",
+        "0",
+        "Seconds without a safety controller's check-in after which a robot halts and locks. 0: off.",
+        0,
+        3600,
+    ),
+    Setting(
+        "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS",
+        "list",
+        "",
+        "Ed25519 keys (base64url) that an emergencyStop must be signed with. Unset: its source is self-asserted.",
+    ),
+    Setting(
+        "STRANDS_MESH_RESUME_PUBLIC_KEY",
+        "list",
+        "",
+        "Ed25519 keys (base64url) of the operators whose resume counts. Unset: no signed resume is admitted.",
+    ),
+    Setting("STRANDS_MESH_AUDIT_DIR", "path", "", "Directory of the safety audit. Unset: ~/.strands_robots."),
+    Setting("STRANDS_MESH_AUDIT_PSK", "text", "", "Secret that signs each audit record (HMAC-SHA256)."),
 )
 
 
@@ -118,6 +183,11 @@ def declared() -> tuple[Setting, ...]:
 def raw(name: str) -> str:
     """The variable's text, stripped; the declared default when unset or blank."""
     return os.environ.get(name, "").strip() or _TABLE[name].default
+
+
+def put(name: str, value: str) -> None:
+    """Set a declared variable for this process and its children: how a flag of a command takes effect."""
+    os.environ[_TABLE[name].name] = value
 
 
 def is_set(name: str) -> bool:

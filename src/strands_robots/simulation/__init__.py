@@ -1,0 +1,30 @@
+"""Robots in a MuJoCo world: arms, a rover and any MJCF or URDF, behind the same contract as real ones.
+
+``from strands_robots.simulation import Simulation`` is the door. Importing this package alone loads neither
+numpy nor MuJoCo; without the ``sim`` extra, asking for :class:`Simulation` says so in one sentence.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.utils import missing_extra
+
+if TYPE_CHECKING:
+    from strands_robots.simulation.world import Simulation
+
+__all__ = ["Simulation"]
+
+_EXTRA = ("mujoco", "numpy", "PIL")
+
+
+def __getattr__(name: str) -> Any:
+    if name != "Simulation":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        from strands_robots.simulation.world import Simulation  # noqa: PLC0415 - heavy, so only when asked for
+    except ModuleNotFoundError as exc:
+        if (exc.name or "").partition(".")[0] in _EXTRA:
+            raise missing_extra("Simulation", "sim") from exc
+        raise
+    return Simulation

@@ -1,0 +1,101 @@
+"""Where a robot's model comes from: ours by name, a file, or the ``robot_descriptions`` package."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from strands_robots.simulation.engine import mujoco
+from strands_robots.utils import ValidationError, shown
+
+MODELS = Path(__file__).parent / "models"
+OURS = ("so100", "so101", "rover")
+"""Models that come with the package; nothing is downloaded for them."""
+
+ALIASES = {
+    "so_arm100": "so100",
+    "so-100": "so100",
+    "so100_follower": "so100",
+    "so_arm101": "so101",
+    "so-101": "so101",
+    "so101_follower": "so101",
+}
+
+_SUFFIXES = (".xml", ".mjcf", ".urdf")
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSource:
+    """A model that was found: what the caller asked for and the file that holds it."""
+
+    label: str
+    path: Path
+
+    def load(self) -> Any:
+        """A fresh ``MjSpec`` of the file. Raises :class:`ValidationError` with MuJoCo's reason when it cannot."""
+        try:
+            return mujoco.MjSpec.from_file(str(self.path))
+        except (ValueError, OSError, mujoco.FatalError) as exc:
+            raise ValidationError(f"model {shown(self.label)} cannot be loaded: {_first_line(exc)}") from exc
+
+
+def find(model: object) -> ModelSource:
+    """The source of ``model``: one of ours, a path to MJCF or URDF, or a ``robot_descriptions`` name.
+
+    Raises:
+        ValidationError: naming the near ones when nothing of that name is known.
+    """
+    if isinstance(model, Path):
+        model = str(model)
+    if not isinstance(model, str) or not model.strip() or len(model) > 4096 or "\0" in model:
+        raise ValidationError(f"model must be a model's name or the path of an MJCF or URDF file, not {shown(model)}.")
+    name = ALIASES.get(model.lower(), model.lower())
+    if name in OURS:
+        return ModelSource(name, MODELS / f"{name}.xml")
+    if model.lower().endswith(_SUFFIXES) or "/" in model:
+        return _file(model)
+    return _described(model)
+
+
+def known() -> list[str]:
+    """Every model name that :func:`find` takes: ours first, then those of ``robot_descriptions`` when it is there."""
+    return [*OURS, *_description_names()]
+
+
+def _file(model: str) -> ModelSource:
+    path = Path(model).expanduser()
+    if not path.is_file():
+        raise ValidationError(f"model must be an existing MJCF or URDF file; there is no {shown(model)}.")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValidationError(f"model must end in {', '.join(_SUFFIXES)}, not {shown(model)}.")
+    return ModelSource(path.stem, path)
+
+
+def _described(model: str) -> ModelSource:
+    names = _description_names()
+    for candidate in (model, f"{model}_mj_description", f"{model}_description"):
+        if candidate in names:
+            # Importing one of these modules fetches the description when it is not in its cache yet.
+            module = importlib.import_module(f"robot_descriptions.{candidate}")
+            path = getattr(module, "MJCF_PATH", None) or getattr(module, "URDF_PATH", None)
+            if isinstance(path, str):
+                return ModelSource(model, Path(path))
+    near = difflib.get_close_matches(model.lower(), [*OURS, *ALIASES, *names], n=5, cutoff=0.4)
+    hint = f"near it: {', '.join(near)}" if near else f"known: {', '.join(OURS)}"
+    raise ValidationError(f"model {shown(model)} is not known; {hint}. A path to an MJCF or URDF file works too.")
+
+
+def _description_names() -> list[str]:
+    if importlib.util.find_spec("robot_descriptions") is None:
+        return []
+    listing = importlib.import_module("robot_descriptions._descriptions")
+    return sorted(listing.DESCRIPTIONS)
+
+
+def _first_line(exc: BaseException) -> str:
+    text = " ".join(str(exc).split())
+    return text[:300] or type(exc).__name__

@@ -1,0 +1,52 @@
+"""Which OpenGL MuJoCo renders with, chosen once, before MuJoCo is imported.
+
+MuJoCo reads ``MUJOCO_GL`` while it is being imported and never again. Without a display its default (GLFW)
+cannot work, so EGL is taken where its library is there, else OSMesa; a value the user has set is kept.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import sys
+from functools import cache
+
+from strands_robots import settings
+
+PACKAGES = "libegl1 libgl1 libgl1-mesa-dri (EGL) or libosmesa6 (OSMesa)"
+"""The Debian packages that bring software rendering."""
+
+_LIBRARIES = {"egl": ("libEGL.so.1", "libGL.so.1"), "osmesa": ("libOSMesa.so.8",)}
+
+
+def loads(backend: str) -> bool:
+    """True when every shared library of ``backend`` (egl or osmesa) can be loaded."""
+    try:
+        for library in _LIBRARIES[backend]:
+            ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+@cache
+def prepare() -> str:
+    """Choose the backend and set ``MUJOCO_GL``: the chosen one, the user's own, or empty for MuJoCo's default."""
+    if settings.is_set("MUJOCO_GL"):
+        return settings.raw("MUJOCO_GL").lower()
+    if platform.system() != "Linux" or settings.is_set("DISPLAY") or "mujoco" in sys.modules:
+        return ""
+    for backend in _LIBRARIES:
+        if loads(backend):
+            settings.put("MUJOCO_GL", backend)
+            return backend
+    # Importing GLFW without a display only prints warnings: rendering is not to be had here.
+    settings.put("MUJOCO_GL", "disable")
+    return "disable"
+
+
+def remedy() -> str:
+    """What to install, or to set, when rendering does not work."""
+    if platform.system() == "Linux":
+        return f"install the Debian packages {PACKAGES}, or use picture(), which needs no OpenGL"
+    return "set MUJOCO_GL to a backend of this platform, or use picture(), which needs no OpenGL"

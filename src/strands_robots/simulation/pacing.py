@@ -1,0 +1,185 @@
+"""Real time: one thread for all the worlds of a process, alive only while one of them runs.
+
+Stepping releases the GIL, and thirty worlds that each wake a thread two hundred times a second would spend more
+time handing it round than computing; one thread visits them in turn instead. A world runs while somebody holds a
+:meth:`Clock.running` lease (a rollout, a teleoperation session) or was commanded within the last
+:data:`SETTLE_S`. Whoever steps by hand owns the clock until the next lease: then commands alone start nothing,
+and the same steps give the same numbers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Iterator
+
+from strands_robots.simulation.physics import Physics
+
+logger = logging.getLogger(__name__)
+
+TICK_S = 0.005
+"""How often the pacing thread visits each running world."""
+
+SETTLE_S = 2.0
+"""How long physics goes on after a single command."""
+
+MAX_BEHIND_S = 0.1
+"""A world that is further behind real time than this lets the rest go, so that it cannot starve the others."""
+
+
+class Clock:
+    """Paces one world. ``slipped_s`` is the simulated time that was let go because the machine was too slow."""
+
+    def __init__(self, physics: Physics, *, on_command: bool = True) -> None:
+        self._physics = physics
+        self._on_command = on_command
+        self._lock = threading.Lock()
+        self._leases = 0
+        self._until = 0.0
+        self._by_hand = False
+        self._due: float | None = None
+        self.slipped_s = 0.0
+        self.paced_s = 0.0
+        self.closed = False
+
+    @contextlib.contextmanager
+    def running(self) -> Iterator[None]:
+        """Real time passes while this is held."""
+        self.acquire()
+        try:
+            yield
+        finally:
+            self.release()
+
+    def acquire(self) -> None:
+        """Take a lease; every one needs its :meth:`release`."""
+        with self._lock:
+            self._leases += 1
+            self._by_hand = False
+        _pacer.wake(self)
+
+    def release(self) -> None:
+        """Give a lease back; physics settles for a moment longer."""
+        with self._lock:
+            self._leases -= 1
+            self._until = time.monotonic() + SETTLE_S / 4
+
+    def commanded(self) -> None:
+        """A setpoint was written: let physics follow it, unless somebody steps by hand."""
+        with self._lock:
+            if self.closed or self._by_hand or not self._on_command:
+                return
+            self._until = time.monotonic() + SETTLE_S
+        _pacer.wake(self)
+
+    def by_hand(self) -> None:
+        """Somebody steps: commands alone do not start the clock from now on."""
+        with self._lock:
+            self._by_hand = True
+            self._until = 0.0
+
+    def close(self) -> None:
+        """Never run again; returns when the pacing thread has let go of this world."""
+        with self._lock:
+            self.closed = True
+        _pacer.forget(self)
+
+    @property
+    def wanted(self) -> bool:
+        """True while real time should pass."""
+        with self._lock:
+            return not self.closed and (self._leases > 0 or time.monotonic() < self._until)
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated seconds for each real one while paced: 1.0 unless the machine is too slow."""
+        with self._lock:
+            return 1.0 if self.paced_s <= 0 else max(0.0, 1.0 - self.slipped_s / self.paced_s)
+
+    def tick(self, now: float) -> None:
+        """Catch up with ``now``; called by the pacing thread alone."""
+        timestep = self._physics.stage.plan.timestep
+        if self._due is None:
+            self._due = now
+            return
+        behind = now - self._due
+        if behind > MAX_BEHIND_S:
+            with self._lock:
+                self.slipped_s += behind - MAX_BEHIND_S
+                self.paced_s += behind - MAX_BEHIND_S
+            self._due = now - MAX_BEHIND_S
+            behind = MAX_BEHIND_S
+        steps = int(behind / timestep)
+        if steps:
+            self._physics.advance(steps)
+            self._due += steps * timestep
+            with self._lock:
+                self.paced_s += steps * timestep
+
+    def rest(self) -> None:
+        """Nothing runs any more: forget when the next step was due."""
+        self._due = None
+
+
+class _Pacer:
+    """The thread and the worlds it visits."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._clocks: list[Clock] = []
+        self._thread: threading.Thread | None = None
+
+    def wake(self, clock: Clock) -> None:
+        with self._lock:
+            if clock.closed:
+                return
+            if clock not in self._clocks:
+                self._clocks.append(clock)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="simulation-pacer", daemon=True)
+                self._thread.start()
+
+    def forget(self, clock: Clock) -> None:
+        """Wait until ``clock`` is visited no more, and until the thread is gone when it was the last."""
+        with self._lock:
+            thread = self._thread
+            if clock in self._clocks:
+                self._clocks.remove(clock)
+            others = bool(self._clocks)
+        if thread is not None and thread is not threading.current_thread() and not others:
+            thread.join(timeout=2.0)
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while True:
+            clocks = self._visited()
+            if not clocks:
+                return
+            now = time.monotonic()
+            for clock in clocks:
+                self._visit(clock, now)
+            due = max(due + TICK_S, time.monotonic())
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def _visited(self) -> list[Clock]:
+        """The clocks that still run; the thread ends when there is none, and says so under the lock."""
+        with self._lock:
+            for clock in [c for c in self._clocks if not c.wanted]:
+                self._clocks.remove(clock)
+                clock.rest()
+            if not self._clocks:
+                self._thread = None
+            return list(self._clocks)
+
+    def _visit(self, clock: Clock, now: float) -> None:
+        try:
+            clock.tick(now)
+        except Exception:
+            logger.exception("A simulated world cannot be stepped; it stands still from now on.")
+            with self._lock:
+                clock.closed = True
+
+
+_pacer = _Pacer()

@@ -1,0 +1,146 @@
+"""``Simulation``: a MuJoCo world with robots in it, as the networks, tools and people use it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from strands_robots.envelope import Envelope, success
+from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.simulation.arguments import STEPS_MAX, answered
+from strands_robots.simulation.construction import Construction, checked_plan
+from strands_robots.simulation.physics import CHUNK, CommandVoidError
+from strands_robots.utils import ValidationError, flag, text, whole
+
+
+class Simulation(Construction):
+    """A world of simulated robots, each with its own rollout, behind the contract :class:`WorldRobot`.
+
+    Physics keeps real time while a rollout or a teleoperation runs, and for a moment after a single command;
+    :meth:`step` advances it as fast as it computes. Verbs answer envelopes; what a caller gets wrong is refused
+    by name and nothing moves.
+
+    Args:
+        tool_name: what the simulation is called on a network.
+        timestep: physics step in seconds, 0.0001 to 0.02.
+        gravity: along z, m/s².
+        realtime: false if single commands shall start no clock, so that only :meth:`step` and rollouts move time.
+
+    Raises:
+        ValidationError: an argument outside its domain.
+    """
+
+    def __init__(
+        self,
+        tool_name: str = "simulation",
+        *,
+        timestep: float = 0.002,
+        gravity: float = -9.81,
+        realtime: bool = True,
+    ) -> None:
+        self.tool_name_str = text("tool_name", tool_name, longest=128)
+        super().__init__(checked_plan(timestep, gravity), realtime=flag("realtime", realtime))
+
+    def get_observation(self, robot_name: str | None = None) -> dict[str, float]:
+        """Joint positions of one robot (rad, or m for a sliding joint) and its base's pose where it has one.
+
+        Raises:
+            ValidationError: no such robot.
+        """
+        return self.body(robot_name).get_observation()
+
+    @answered
+    def send_action(self, action: dict[str, float], robot_name: str | None = None) -> Envelope:
+        """Set targets of one robot; ``sent`` holds what was really set, clamped to each actuator's range."""
+        self._open()
+        body = self.body(robot_name)
+        permit = self.gate.permit("send_action")
+        try:
+            sent = body.send_action(action, permit)
+        except CommandVoidError as void:
+            raise ValidationError(f"send_action was overtaken by a stop: {void}.") from None
+        return success(f"Sent {len(sent)} targets to {body.name}.", robot=body.name, sent=sent)
+
+    @answered
+    def step(self, n: int = 1) -> Envelope:
+        """Advance physics by ``n`` time steps (1 to 1,000,000) as fast as they compute; setpoints stay as they are."""
+        count = whole("n", n, low=1, high=STEPS_MAX)
+        self._open()
+        self._clock.by_hand()
+        left = count
+        while left and not self._closed:
+            self._physics.advance(min(left, CHUNK))
+            left -= min(left, CHUNK)
+        snapshot = self._physics.snapshot
+        return success(
+            f"Stepped {count - left} times, to {snapshot.time:.3f} s.",
+            steps=count - left,
+            sim_time=snapshot.time,
+            step_count=snapshot.steps,
+        )
+
+    @answered
+    def reset(self) -> Envelope:
+        """Halt, then put the world back to its initial state. Refused while the robot is locked."""
+        self._open()
+        self.gate.permit("reset")
+        verdict = self.halt("reset")
+        if not verdict.stopped:
+            return verdict.envelope()
+        with self._building:
+            self._physics.reset()
+        return success("The world is back at its start.", sim_time=self._physics.snapshot.time, halted=verdict.halted)
+
+    @answered
+    def get_state(self) -> Envelope:
+        """``sim_time`` (s), ``step_count``, ``robots`` (name to joints in radians), ``running_policies``, and more."""
+        snapshot = self._physics.snapshot
+        robots = {name: {**snapshot.joints(p), **snapshot.base_pose(p)} for name, p in snapshot.stage.robots.items()}
+        return success(
+            f"{len(robots)} robots at {snapshot.time:.3f} s of simulated time.",
+            sim_time=snapshot.time,
+            step_count=snapshot.steps,
+            robots=robots,
+            running_policies={},
+            real_time_factor=round(self._clock.real_time_factor, 4),
+            diverged=self._physics.diverged,
+        )
+
+    @answered
+    def get_features(self) -> Envelope:
+        """Joints, actuators and cameras by robot, with ranges in the joint's unit (null where there is no limit)."""
+        stage = self._physics.snapshot.stage
+        robots: dict[str, Any] = {
+            name: {
+                "model": parts.model,
+                "joints": {key: _range(j.low, j.high) for key, j in parts.joints.items()},
+                "actuators": {key: _range(a.low, a.high) for key, a in parts.actuators.items()},
+                "cameras": list(parts.cameras),
+                "observation_features": list(self.body(name).observation_features),
+                "action_features": list(parts.actuators),
+            }
+            for name, parts in stage.robots.items()
+        }
+        cameras = [stage.model.camera(i).name for i in range(stage.model.ncam)]
+        objects = [o.name for o in stage.plan.objects]
+        return success(
+            f"{len(robots)} robots.", robots=robots, cameras=cameras, objects=objects, timestep=stage.plan.timestep
+        )
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop everything that moves a robot of this world, and freeze them where they are."""
+        self.gate.revoke()
+        self._physics.hold()
+        return halt_each({})
+
+    def cleanup(self) -> Envelope:
+        """Halt, stop the clock and free the pictures. A second call does nothing."""
+        if self._closed:
+            return success("Already cleaned up.")
+        verdict = self.halt("cleanup")
+        self._closed = True
+        self._clock.close()
+        return verdict.envelope()
+
+
+def _range(low: float, high: float) -> list[float] | None:
+    return [low, high] if low > float("-inf") or high < float("inf") else None
