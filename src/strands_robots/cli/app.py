@@ -1,0 +1,27 @@
+"""The command line put together."""
+
+from __future__ import annotations
+
+import typer
+
+from strands_robots.cli import doctor, grant
+
+HELP = """Robots on Device Connect: serve one, find them, drive them, and always stop them.
+
+Without network flags everything stays on this machine. Exit codes: 0 done, 1 refused or failed,
+2 wrong usage, 3 nobody answered, 130 Ctrl-C."""
+
+
+def build() -> typer.Typer:
+    """The application with every command."""
+    app = typer.Typer(
+        name="strands-robots",
+        help=HELP,
+        no_args_is_help=True,
+        add_completion=False,
+        # A traceback with local variables could print keys.
+        pretty_exceptions_enable=False,
+    )
+    for module in (grant, doctor):
+        module.register(app)
+    return app

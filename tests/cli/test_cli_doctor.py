@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from fixtures.certificates import Authority
+
+from strands_robots.cli import checks
+from strands_robots.cli.checks import certificate_error
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture(autouse=True)
+def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rendering is tried in a process of its own; the integration test does that."""
+    monkeypatch.setattr(checks, "_RENDER", "print('rendered with nothing')")
+
+
+def checked(result: Result) -> dict[str, dict[str, str]]:
+    return {found["name"]: found for found in json.loads(result.stdout)["checks"]}
+
+
+def test_a_working_installation_is_ok(run: Run) -> None:
+    result = run("doctor", "--json")
+    found = checked(result)
+    assert result.exit_code == 0
+    assert found["extra device-connect"]["mark"] == "ok"
+    assert "127.0.0.1" in found["network"]["said"]
+
+
+def test_every_check_that_is_not_well_names_a_remedy(run: Run) -> None:
+    for found in checked(run("doctor", "--json")).values():
+        assert found["mark"] == "ok" or found["remedy"], found
+
+
+def test_a_missing_required_package_is_broken_and_exits_with_1(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "_version", lambda name: None)
+    result = run("doctor", "--json")
+    assert result.exit_code == 1
+    assert checked(result)["extra device-connect"]["mark"] == "broken"
+    assert "strands-robots[device-connect]" in checked(result)["extra device-connect"]["remedy"]
+    assert checked(result)["extra lerobot"]["mark"] == "note"
+
+
+def test_another_release_of_the_framework_is_broken(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "_version", lambda name: "0.3.0")
+    result = run("doctor", "--json")
+    assert result.exit_code == 1
+    assert "0.2.5" in checked(result)["extra device-connect"]["remedy"]
+
+
+def test_an_unusable_network_is_broken_and_says_the_way_out(run: Run) -> None:
+    result = run("doctor", "--json", "--nats", "nats://192.0.2.1:4222")
+    assert result.exit_code == 1
+    assert "--insecure" in checked(result)["network"]["remedy"]
+
+
+def test_a_taken_port_is_noted_with_its_number(run: Run) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        found = checked(run("doctor", "--json", "--port", str(port)))["port"]
+    assert str(port) in found["said"]
+    assert found["mark"] == "note"
+
+
+def test_credentials_that_others_can_read_are_a_warning(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "arm.json"
+    file.write_text("{}")
+    file.chmod(0o644)
+    monkeypatch.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
+    found = checked(run("doctor", "--json"))["credentials"]
+    assert found["mark"] == "warn"
+    assert "chmod 600" in found["remedy"]
+
+
+def test_certificates_are_checked_against_their_key_and_their_time(tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    arm, other = authority.issue("arm"), authority.issue("other")
+    assert certificate_error(str(arm.ca), str(arm.cert), str(arm.key))[0] == ""
+    assert "not the certificate's" in certificate_error(str(arm.ca), str(arm.cert), str(other.key))[0]
+    later = datetime.now(UTC) + timedelta(days=9)
+    assert "only" in certificate_error(str(arm.ca), str(arm.cert), str(arm.key), later)[0]
+    assert "cannot be read" in certificate_error(str(arm.ca), str(tmp_path / "absent"), str(arm.key))[0]
+    assert "no usable PEM" in certificate_error(str(arm.key), str(arm.cert), str(arm.key))[0]
+
+
+def test_people_get_a_table_and_a_verdict(run: Run) -> None:
+    result = run("doctor")
+    assert result.exit_code == 0
+    assert "Everything that is required works." in result.stdout

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from strands_robots.cli.network import Network, describe
+from strands_robots.cli.output import Exit, Failure
+
+
+def test_without_flags_everything_stays_on_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_DC_PORT", "7555")
+    link = Network().link()
+    assert link.loopback_only
+    assert link.meet_port == 7555
+    assert "127.0.0.1:7555" in describe(link)
+
+
+def test_the_environment_names_a_network_and_a_flag_outranks_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7001")
+    assert Network().link().connect == ("tcp/127.0.0.1:7001",)
+    assert Network(port=7002).link().meet_port == 7002
+    assert Network(connect=["tcp/127.0.0.1:7003"]).link().connect == ("tcp/127.0.0.1:7003",)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        Network(connect=["tcp/192.0.2.1:7447"]),
+        Network(listen=["tcp/0.0.0.0:7447"]),
+        Network(nats="nats://192.0.2.1:4222"),
+        Network(multicast=True),
+    ],
+)
+def test_leaving_this_machine_without_proof_is_refused_with_every_way_out(network: Network) -> None:
+    with pytest.raises(Failure) as refused:
+        network.link()
+    assert refused.value.code is Exit.USAGE
+    for way in ("--tls-ca", "--credentials", "--insecure"):
+        assert way in refused.value.reason
+
+
+def test_insecure_and_certificates_are_ways_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Network(nats="nats://192.0.2.1:4222", insecure=True).link().transport == "nats"
+    for name in ("ca", "cert", "key"):
+        (tmp_path / name).write_text("pem")
+    files = {"tls_ca": tmp_path / "ca", "tls_cert": tmp_path / "cert", "tls_key": tmp_path / "key"}
+    assert Network(connect=["tls/192.0.2.1:7447"], **files).link().authenticated
+    monkeypatch.setenv("DEVICE_CONNECT_ALLOW_INSECURE", "yes")
+    assert Network(listen=["tcp/0.0.0.0:7447"]).link().is_peer
+
+
+def test_a_broker_on_this_machine_needs_no_proof() -> None:
+    assert Network(nats="nats://127.0.0.1:4222").link().loopback_only
+
+
+def test_contradicting_flags_and_missing_files_are_wrong_usage(tmp_path: Path) -> None:
+    with pytest.raises(Failure, match="--nats names a broker"):
+        Network(nats="nats://127.0.0.1:4222", connect=["tcp/127.0.0.1:1"]).link()
+    with pytest.raises(Failure, match=r"--tls-ca .* is no file"):
+        Network(tls_ca=tmp_path / "absent").link()
