@@ -1,0 +1,204 @@
+"""The framework's private members that we lean on, all in this file, for ``device-connect-edge`` 0.2.5.
+
+``tests/device_connect/test_compat.py`` fails when one of them changes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from typing import Any
+
+from device_connect_edge import device as framework
+from device_connect_edge.device import DeviceRuntime
+from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.messaging.exceptions import MessagingError, NotConnectedError
+
+from .backends import LinkConfig, register
+
+FRAMEWORK_VERSION = "0.2.5"
+
+LEANED_ON = {
+    "DeviceRuntime": (
+        "__init__",
+        "run",
+        "stop",
+        "_connect_messaging",
+        "_cmd_subscription",
+        "_event_dispatch_loop",
+        "_heartbeat_loop",
+        "_validate_startup_config",
+        "_resubscribe_after_reconnect",
+        "_notify_conn_state",
+        "enqueue_event",
+    )
+}
+"""Members that are called, replaced or whose way of working is relied upon."""
+
+HOLD_EVENTS_S = 5.0
+"""Seconds of a lost link for which events are kept; a server that restarts is back sooner, and an older event is a
+lie about the present."""
+
+_log = logging.getLogger(__name__)
+
+
+class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type information
+    """The framework's runtime on our backend: ready when it says so, ended without remains, events that flow.
+
+    Args:
+        driver: what to serve.
+        device_id: without dots, because discovery cannot see a dotted one.
+        link: how to reach the others.
+        allow_insecure: required for a link on which nobody proves who he is.
+        discovery: ``d2d`` announces presence; ``registry`` registers with the framework's registry service.
+        stock: further arguments of ``DeviceRuntime``, such as ``identity``, ``status``, ``ttl``.
+
+    ``status`` is a live dict: presence sends what it holds at that moment.
+    """
+
+    def __init__(
+        self,
+        *,
+        driver: DeviceDriver,
+        device_id: str,
+        link: LinkConfig,
+        allow_insecure: bool = False,
+        discovery: str = "d2d",
+        **stock: Any,
+    ) -> None:
+        super().__init__(
+            driver=driver,
+            device_id=device_id,
+            tenant=link.tenant,
+            # With the stock name the framework's own branches on it stay as they are.
+            messaging_backend=link.transport,
+            # Never empty, so that the environment is not asked a second time.
+            messaging_urls=list(link.connect) or ["zenoh://"],
+            allow_insecure=allow_insecure,
+            **stock,
+        )
+        self._messaging_backend = link.transport
+        self._d2d_mode = discovery != "registry"
+        self.link = link
+        self._started = asyncio.Event()
+        self._ready = asyncio.Event()
+        self._linked = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._running: asyncio.Task[Any] | None = None
+        self._lost_at: float | None = None
+
+    async def run(self) -> None:
+        """Serve until ``shutdown`` or ``stop``; whatever ends it, the link is closed."""
+        self._loop = asyncio.get_running_loop()
+        self._running = asyncio.current_task()
+        self._started.set()
+        try:
+            await super().run()
+        finally:
+            self._ready.clear()
+            if self.messaging is not None and not self.messaging.is_closed:
+                await self.messaging.close()
+
+    async def wait_ready(self, within_s: float) -> None:
+        """Return once the device is callable, announced and sending its events.
+
+        Raises:
+            TimeoutError: not within ``within_s`` seconds. Call ``shutdown`` then.
+            Exception: what ``run`` raised.
+        """
+        ready = asyncio.ensure_future(self._ready.wait())
+        try:
+            async with asyncio.timeout(within_s):
+                await self._started.wait()
+                assert self._running is not None
+                await asyncio.wait({ready, self._running}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            ready.cancel()
+        if self._running is not None and self._running.done() and not self._ready.is_set():
+            await self._running
+
+    async def shutdown(self) -> None:
+        """End ``run`` wherever it stands, announce the departure, and wait until nothing is open."""
+        running = self._running
+        if running is None:
+            return
+        if self._ready.is_set():
+            await self.stop()
+        else:
+            running.cancel()
+        await asyncio.wait({running})
+
+    def emit_from_thread(self, event: str, payload: dict[str, Any]) -> Future[None]:
+        """Emit from any thread at once; the future tells a bad event name.
+
+        Raises:
+            RuntimeError: the runtime is not running.
+        """
+        if self._loop is None or not self._ready.is_set():
+            raise RuntimeError(f"{self.device_id} is not on the network")
+        return asyncio.run_coroutine_threadsafe(self.enqueue_event(event, payload), self._loop)
+
+    async def _connect_messaging(self) -> None:
+        stock, self._messaging_backend = self._messaging_backend, register(self.link)
+        try:
+            await super()._connect_messaging()
+        finally:
+            self._messaging_backend = stock
+
+    async def _notify_conn_state(self, state: bool) -> None:
+        if state:
+            self._linked.set()
+        await super()._notify_conn_state(state)
+
+    def _validate_startup_config(self) -> None:
+        if not self.link.authenticated and not self.allow_insecure:
+            raise ValueError(
+                f"{self.device_id}: nobody proves who he is on this link; give certificates or credentials, "
+                "or opt in with allow_insecure=True"
+            )
+
+    async def _heartbeat_loop(self) -> None:
+        # The last thing the framework starts: from here on the device is callable and announced.
+        self._ready.set()
+        await super()._heartbeat_loop()
+
+    async def _event_dispatch_loop(self) -> None:
+        """Send events in order. The stock loop tries a refused one for ever, with all others behind it."""
+        while True:
+            subject, data = await self._event_queue.get()
+            await self._send_event(subject, data)
+            self._event_queue.task_done()
+
+    async def _send_event(self, subject: str, data: bytes) -> None:
+        assert self.messaging is not None
+        try:
+            if self.messaging.is_connected:
+                self._lost_at = None
+            else:
+                await self._wait_for_link()
+            await self.messaging.publish(subject, data)
+        except NotConnectedError:
+            _log.warning("dropped an event on %s: the link is lost", subject)
+        except MessagingError as error:
+            _log.error("dropped an event: %s", error)
+
+    async def _wait_for_link(self) -> None:
+        assert self._loop is not None and self.messaging is not None
+        if self._lost_at is None:
+            self._lost_at = self._loop.time()
+        self._linked.clear()
+        left = self._lost_at + HOLD_EVENTS_S - self._loop.time()
+        with contextlib.suppress(TimeoutError):  # whether the link is back is asked by whoever waited
+            await asyncio.wait_for(self._linked.wait(), max(left, 0.0))
+
+
+def sources() -> dict[str, Callable[..., Any] | Coroutine[Any, Any, Any]]:
+    """The framework's functions named in ``LEANED_ON``, for the test that watches them."""
+    return {
+        f"{owner}.{name}": getattr(getattr(framework, owner), name)
+        for owner, names in LEANED_ON.items()
+        for name in names
+    }

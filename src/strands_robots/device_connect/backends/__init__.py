@@ -1,0 +1,103 @@
+"""A Zenoh and a NATS messaging backend for ``device_connect_edge``, wire-compatible with every bare peer and agent.
+
+What they add to the framework's own: commands are served concurrently and bounded, ``stop`` and reads never wait
+behind motion, malformed commands are answered at once, puts and replies use no thread pool, peers may speak mutual
+TLS or meet without multicast, and all runtimes of a process share one Zenoh session.
+
+A device::
+
+    from strands_robots.device_connect._compat import Runtime
+    from strands_robots.device_connect.backends import loopback_config
+
+    runtime = Runtime(driver=driver, device_id="arm-1", link=loopback_config(), allow_insecure=True)
+    task = asyncio.create_task(runtime.run())
+    await runtime.wait_ready(10.0)       # raises what run() raised, or TimeoutError
+    ...
+    await runtime.shutdown()             # ends a start that is still under way, too; leaves nothing open
+
+``Runtime`` is the framework's ``DeviceRuntime`` with our backend under it; see its docstring. ``runtime.messaging``
+is the connected client, ``runtime.emit_from_thread(name, payload)`` emits from any thread.
+
+A client without a device (command line, tools)::
+
+    client = await open_client(loopback_config())
+    answer = await client.request("device-connect.default.arm-1.cmd", payload, timeout=5.0)
+    await client.close()
+
+Which link: ``loopback_config()`` needs nothing and stays on this machine; ``link_from_environment()`` reads the
+framework's own variables (``ZENOH_CONNECT``, ``NATS_URL``, ``MESSAGING_TLS_*`` ...) as the framework does;
+``LinkConfig(...)`` says everything. ``link.authenticated`` tells whether the far side is checked.
+
+A stock ``DeviceRuntime`` may use them as well: after ``register()``, ``messaging_backend="strands-zenoh"`` or
+``"strands-nats"``; ``register(link)`` returns the name for one particular link.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+from .config import LinkConfig, link_from_environment, loopback_config
+
+if TYPE_CHECKING:
+    from device_connect_edge.messaging.base import MessagingClient
+
+__all__ = [
+    "LinkConfig",
+    "backend_for",
+    "link_from_environment",
+    "loopback_config",
+    "open_client",
+    "register",
+]
+
+
+def backend_for(link: LinkConfig, *, open_ended: bool = False) -> MessagingClient:
+    """An unconnected messaging client for ``link``.
+
+    Args:
+        link: what to connect to.
+        open_ended: take what the link leaves open from the arguments of ``connect``, as the framework's own do.
+    """
+    client: MessagingClient
+    if link.transport == "nats":
+        from .nats import NatsBackend  # noqa: PLC0415 - only the transport in use is loaded
+
+        client = NatsBackend(link, open_ended=open_ended)
+    else:
+        from .zenoh import ZenohBackend  # noqa: PLC0415 - only the transport in use is loaded
+
+        client = ZenohBackend(link, open_ended=open_ended)
+    return client
+
+
+def register(link: LinkConfig | None = None) -> str:
+    """Make the backends known to the framework; the name to give as ``messaging_backend``.
+
+    Args:
+        link: with it, the returned name stands for exactly this link. Without it, ``strands-zenoh`` and
+            ``strands-nats`` are registered, which take their link from the URLs that ``connect`` gets, and
+            ``strands-zenoh`` is returned.
+    """
+    from device_connect_edge.messaging import register_backend  # noqa: PLC0415 - importing this package stays light
+
+    if link is None:
+        for transport in ("zenoh", "nats"):
+            register_backend(
+                f"strands-{transport}", partial(backend_for, LinkConfig(transport=transport), open_ended=True)
+            )
+        return "strands-zenoh"
+    name = f"strands-{link.transport}-{link.fingerprint}"
+    register_backend(name, partial(backend_for, link))
+    return name
+
+
+async def open_client(link: LinkConfig) -> MessagingClient:
+    """A connected client without a device.
+
+    Raises:
+        MessagingConnectionError: the far side did not answer within ``link.connect_timeout_s``.
+    """
+    client = backend_for(link)
+    await client.connect(servers=[])
+    return client

@@ -1,0 +1,318 @@
+"""What a link to Device Connect is made of: endpoints, scouting, certificates, credentials, deadlines."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlparse
+
+from ... import settings
+from ...utils import ValidationError, choice, port
+
+LOOPBACK = "127.0.0.1"
+
+# A peer that is stopped in a debugger costs this much per priority and link, and no more (64 KiB batches).
+QUEUED_BATCHES = 16
+
+# What a receiver puts together from fragments at most, in bytes; Zenoh's own default is 1 GiB.
+MAX_MESSAGE_BYTES = 64 * 2**20
+
+# Zenoh waits this long for room before it drops a message, in microseconds; the caller is an event loop.
+WAIT_BEFORE_DROP_US = 50
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig:
+    """One link. Two links that compare equal share one session in the process.
+
+    Args:
+        transport: ``zenoh`` or ``nats``.
+        mode: Zenoh only: ``peer``, ``client``, or ``auto``, which is a client where ``connect`` names a router
+            and a peer where it is empty.
+        connect: endpoints to connect to: ``tcp/host:port``, ``tls/host:port``, ``zenoh://host:port``,
+            ``nats://host:port``.
+        listen: Zenoh peers only: endpoints to listen on.
+        meet_port: Zenoh peers only: the loopback port where local peers meet; see ``loopback_config``.
+        multicast: Zenoh peers only: find peers by multicast. None: only where no endpoint is given.
+        ca, cert, key: PEM text, or the path of a PEM file. With all three a link is mutually authenticated.
+        verify_hostname: check the server's name in its certificate.
+        jwt, nkey_seed: NATS credentials.
+        tenant: links of two tenants never share a session.
+        connect_timeout_s: seconds until ``connect`` gives up.
+    """
+
+    transport: str = "zenoh"
+    mode: str = "auto"
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    meet_port: int | None = None
+    multicast: bool | None = None
+    ca: str = ""
+    cert: str = ""
+    key: str = field(default="", repr=False)
+    verify_hostname: bool = True
+    jwt: str = field(default="", repr=False)
+    nkey_seed: str = field(default="", repr=False)
+    tenant: str = "default"
+    connect_timeout_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        choice("transport", self.transport, ("zenoh", "nats"))
+        choice("mode", self.mode, ("auto", "peer", "client"))
+        if self.meet_port is not None:
+            port("meet_port", self.meet_port)
+        if bool(self.cert) != bool(self.key):
+            raise ValidationError("a certificate needs its key and a key its certificate; one of them is missing")
+        if self.cert and not self.ca:
+            raise ValidationError("a certificate needs ca, the authority that the far side is checked against")
+        if bool(self.jwt) != bool(self.nkey_seed):
+            raise ValidationError("jwt needs nkey_seed and nkey_seed needs jwt; one of them is missing")
+
+    @property
+    def is_peer(self) -> bool:
+        """True when this link is a Zenoh peer and no client of a router."""
+        return self.transport == "zenoh" and (self.mode == "peer" or (self.mode == "auto" and not self.connect))
+
+    @property
+    def authenticated(self) -> bool:
+        """True when both sides prove who they are: mutual TLS, or a NATS token whose key is proven."""
+        if self.transport == "nats":
+            return bool(self.jwt or self.cert)
+        return bool(self.ca and self.cert)
+
+    @property
+    def loopback_only(self) -> bool:
+        """True when nothing outside this machine is reached or let in."""
+        if self.is_peer and (self.uses_multicast or not self.listeners):
+            return False
+        return all(_host(endpoint) in (LOOPBACK, "localhost", "::1") for endpoint in self.connect + self.listeners)
+
+    @property
+    def uses_multicast(self) -> bool:
+        """True when peers are looked for by multicast."""
+        if self.multicast is None:
+            return self.is_peer and not (self.connect or self.listen or self.meet_port)
+        return self.is_peer and self.multicast
+
+    @property
+    def listeners(self) -> tuple[str, ...]:
+        """The endpoints a peer listens on, without the meeting port."""
+        if not self.is_peer or self.listen:
+            return self.listen
+        scheme = "tls" if self.cert else "tcp"
+        local = self.meet_port is not None or (
+            not self.uses_multicast and all(_host(endpoint) == LOOPBACK for endpoint in self.connect)
+        )
+        return (f"{scheme}/{LOOPBACK}:0" if local else f"{scheme}/[::]:0",)
+
+    @property
+    def meeting_point(self) -> str | None:
+        """The endpoint where local peers meet."""
+        if self.meet_port is None:
+            return None
+        return f"{'tls' if self.cert else 'tcp'}/{LOOPBACK}:{self.meet_port}"
+
+    @property
+    def fingerprint(self) -> str:
+        """A short name for this link that gives nothing of it away."""
+        text = json.dumps([str(getattr(self, each.name)) for each in fields(self)])
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def filled(
+        self,
+        servers: Sequence[str],
+        credentials: Mapping[str, Any] | None,
+        tls: Mapping[str, Any] | None,
+    ) -> LinkConfig:
+        """This link, with what it leaves open taken from the framework's ``connect`` arguments."""
+        link = self
+        if servers and not (link.connect or link.listen or link.meet_port):
+            link = replace(link, connect=endpoints(servers))
+        if tls and not (link.ca or link.cert):
+            parts = _tls_fields(tls)
+            link = replace(link, ca=parts["ca"], cert=parts["cert"], key=parts["key"])
+        if credentials and not link.jwt and credentials.get("jwt") and credentials.get("nkey_seed"):
+            link = replace(link, jwt=credentials["jwt"], nkey_seed=credentials["nkey_seed"])
+        return link
+
+    def zenoh(self, *, meet: bool = False) -> dict[str, Any]:
+        """The configuration that ``zenoh.open`` takes.
+
+        Args:
+            meet: listen on the meeting port too; opening then fails where another process has it.
+        """
+        peer = self.is_peer
+        listen = list(self.listeners) + ([self.meeting_point] if meet and self.meeting_point else [])
+        connect = list(self.connect) + ([self.meeting_point] if self.meeting_point and not meet else [])
+        patience = -1 if peer else max(1, round(self.connect_timeout_s * 1000))
+        config: dict[str, Any] = {
+            "mode": "peer" if peer else "client",
+            "listen": {"endpoints": listen if peer else [], "timeout_ms": 0, "exit_on_failure": True},
+            "connect": {
+                "endpoints": connect,
+                "timeout_ms": patience,
+                "exit_on_failure": not peer,
+                "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
+            },
+            # Peers come and go; only a multicast peer gains from waiting for the first of them.
+            "open": {"return_conditions": {"connect_scouted": self.uses_multicast, "declares": True}},
+            "scouting": {
+                "multicast": {"enabled": self.uses_multicast, "autoconnect": {"peer": ["router", "peer"]}},
+                "gossip": {"enabled": peer, "autoconnect": {"peer": ["router", "peer"]}},
+            },
+            "transport": {
+                "link": {
+                    "tx": {
+                        "queue": {
+                            "size": {"data": QUEUED_BATCHES, "interactive_high": QUEUED_BATCHES},
+                            "congestion_control": {"drop": {"wait_before_drop": WAIT_BEFORE_DROP_US}},
+                        }
+                    },
+                    "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+                }
+            },
+        }
+        if self.ca:
+            # With certificates at hand a plain link is never what was meant.
+            config["transport"]["link"]["protocols"] = ["tls"]
+            config["transport"]["link"]["tls"] = self._zenoh_tls()
+        return config
+
+    def meeting_host(self) -> dict[str, Any]:
+        """The configuration of a session that does nothing but hold the meeting port."""
+        return replace(self, listen=(self.meeting_point or "",), connect=(), meet_port=None, mode="peer").zenoh()
+
+    def _zenoh_tls(self) -> dict[str, Any]:
+        tls: dict[str, Any] = {"verify_name_on_connect": self.verify_hostname}
+        tls |= _pem_field("root_ca_certificate", self.ca)
+        if self.cert:
+            tls["enable_mtls"] = True
+            for side in ("connect", "listen"):
+                tls |= _pem_field(f"{side}_certificate", self.cert)
+                tls |= _pem_field(f"{side}_private_key", self.key)
+        return tls
+
+
+def loopback_config(meet_port: int | None = None, tenant: str = "default") -> LinkConfig:
+    """A link for any number of processes on this machine, which find each other without configuration.
+
+    The first process listens on ``meet_port`` (default: ``STRANDS_DC_PORT``); the others connect to it and learn of
+    each other there. When the process that has the port goes, another takes it over within seconds. A bare agent
+    joins with ``ZENOH_CONNECT=tcp/127.0.0.1:PORT DEVICE_CONNECT_DISCOVERY_MODE=d2d``. Nothing leaves the machine.
+    """
+    meet = settings.integer("STRANDS_DC_PORT") if meet_port is None else meet_port
+    return LinkConfig(mode="peer", meet_port=meet, multicast=False, tenant=tenant)
+
+
+def link_from_environment(tenant: str = "default", transport: str | None = None) -> LinkConfig:
+    """The link that the framework's own variables describe; a multicast peer when they say nothing.
+
+    Raises:
+        ValidationError: an unknown backend, or a credentials file that cannot be read.
+    """
+    credentials = _credentials_file()
+    backend = transport or (settings.raw("MESSAGING_BACKEND") if settings.is_set("MESSAGING_BACKEND") else "")
+    urls = _first_set("MESSAGING_URLS", "NATS_URLS" if backend == "nats" else "", "NATS_URL", "ZENOH_CONNECT")
+    if backend == "zenoh" and settings.is_set("ZENOH_CONNECT") and not settings.is_set("MESSAGING_URLS"):
+        urls = settings.items("ZENOH_CONNECT")
+    if not backend:
+        backend = _backend_of(urls, credentials)
+    section = credentials.get(backend) or {}
+    if not urls:
+        urls = tuple(section.get("urls") or ())
+    files = {part: settings.raw(f"MESSAGING_TLS_{part.upper()}_FILE") for part in ("ca", "cert", "key")}
+    from_file = _tls_fields(section.get("tls") or {})
+    tls = {part: files[part] or from_file.get(part, "") for part in files}
+    return LinkConfig(
+        transport=choice("MESSAGING_BACKEND", backend, ("zenoh", "nats")),
+        connect=endpoints(urls) if backend == "zenoh" else urls,
+        listen=settings.items("ZENOH_LISTEN") if backend == "zenoh" else (),
+        multicast=True if backend == "zenoh" and not urls else None,
+        jwt=section.get("jwt", ""),
+        nkey_seed=section.get("nkey_seed", ""),
+        # The framework does not check the name in a NATS server's certificate; many of those carry none.
+        verify_hostname=backend == "zenoh",
+        tenant=tenant if tenant != "default" else str(credentials.get("tenant", tenant)),
+        ca=tls["ca"],
+        cert=tls["cert"],
+        key=tls["key"],
+    )
+
+
+def endpoints(servers: Sequence[str]) -> tuple[str, ...]:
+    """Zenoh endpoints for URLs in any of the framework's spellings; ``zenoh://`` alone means none."""
+    found = []
+    for server in (each.strip() for each in servers):
+        scheme, _, rest = server.partition("://")
+        if rest and scheme in ("zenoh", "zenoh+tls"):
+            url = urlparse(server)
+            found.append(f"{'tls' if scheme.endswith('tls') else 'tcp'}/{url.hostname}:{url.port or 7447}")
+        elif server and "://" not in server:
+            found.append(server if "/" in server else f"tcp/{server}")
+        elif rest:
+            found.append(server)
+    return tuple(found)
+
+
+def _host(endpoint: str) -> str:
+    address = endpoint.partition("://")[2] or endpoint.partition("/")[2]
+    return address.rpartition("@")[2].rpartition(":")[0].strip("[]")
+
+
+def _first_set(*names: str) -> tuple[str, ...]:
+    for name in names:
+        if name and settings.is_set(name):
+            return settings.items(name)
+    return ()
+
+
+def _backend_of(urls: Sequence[str], credentials: Mapping[str, Any]) -> str:
+    if urls:
+        return "nats" if urls[0].startswith(("nats://", "tls://")) else "zenoh"
+    return "nats" if "nats" in credentials and "zenoh" not in credentials else "zenoh"
+
+
+def _credentials_file() -> dict[str, Any]:
+    name = settings.raw("MESSAGING_CREDENTIALS_FILE") or settings.raw("NATS_CREDENTIALS_FILE")
+    if not name:
+        return {}
+    try:
+        text = Path(name).read_text()
+    except OSError as error:
+        raise ValidationError(f"MESSAGING_CREDENTIALS_FILE={name!r} cannot be read: {error.strerror}") from error
+    try:
+        content = json.loads(text)
+    except ValueError:
+        return {"nats": _armoured(text)}
+    if not isinstance(content, dict):
+        raise ValidationError(f"MESSAGING_CREDENTIALS_FILE={name!r} holds no JSON object")
+    return content
+
+
+def _armoured(text: str) -> dict[str, str]:
+    """Token and seed of a NATS ``.creds`` file: each is the block between its BEGIN and END line."""
+    blocks: dict[str, str] = {}
+    title = ""
+    for line in (each.strip() for each in text.splitlines()):
+        if "BEGIN" in line:
+            title = "jwt" if "JWT" in line else "nkey_seed"
+        elif "END" in line:
+            title = ""
+        elif title and line and not line.startswith("*"):
+            blocks[title] = blocks.get(title, "") + line
+    return blocks
+
+
+def _tls_fields(tls: Mapping[str, Any]) -> dict[str, str]:
+    return {part: str(tls.get(f"{part}_file") or tls.get(f"{part}_pem") or "") for part in ("ca", "cert", "key")}
+
+
+def _pem_field(name: str, value: str) -> dict[str, str]:
+    if value.lstrip().startswith("-----BEGIN"):
+        return {f"{name}_base64": base64.b64encode(value.encode()).decode()}
+    return {name: value}

@@ -1,0 +1,195 @@
+"""From a transport's thread to handlers on an event loop: commands side by side, events in order.
+
+Nothing here knows a transport. All queues are bounded, and a flood costs one log line a second.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from . import jsonrpc
+
+logger = logging.getLogger(__name__)
+
+MAX_COMMANDS = 256
+"""Commands of one device that run at once; the next is answered 'busy'."""
+
+RESERVED_COMMANDS = 64
+"""Room besides, for ``stop`` and reads alone, so that they are never behind motion."""
+
+MAX_EVENTS = 65_536
+"""Messages of one subscription that wait for its handler; the oldest is dropped for the next."""
+
+# One turn of the loop serves this many messages, then timers and sockets have their turn.
+DRAIN_AT_ONCE = 256
+
+Answer = Callable[[bytes], None]
+Handler = Callable[[bytes, str | None], Awaitable[None]]
+
+
+def never_behind_motion(method: str) -> bool:
+    """True for stops and reads, which find room when motion has filled the rest."""
+    return method.startswith(("stop", "get", "list", "describe")) or method in ("emergencyStop", "requestRegistration")
+
+
+class Throttled:
+    """A logger of one line a second; the next line says how many it stands for."""
+
+    def __init__(self, log: logging.Logger, every_s: float = 1.0) -> None:
+        self._log = log
+        self._every_s = every_s
+        self._next = 0.0
+        self._left_out = 0
+
+    def warning(self, message: str, *args: object) -> None:
+        """One warning, or a count until one is due."""
+        now = time.monotonic()
+        if now < self._next:
+            self._left_out += 1
+            return
+        more = f" ({self._left_out} more like it were left out)" if self._left_out else ""
+        self._next, self._left_out = now + self._every_s, 0
+        self._log.warning(message + "%s", *args, more)
+
+
+class Inbox:
+    """Calls from any thread, made on the loop in their order. One wake-up serves all that came meanwhile."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._calls: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
+        self._awake = False
+
+    def put(self, function: Callable[..., None], *args: Any) -> None:
+        """Have ``function(*args)`` called on the loop soon."""
+        self._calls.append((function, args))
+        if not self._awake:
+            self._awake = True
+            # A loop that is closed has nobody left to tell.
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._drain)
+
+    def _drain(self) -> None:
+        # Lowered before the first call is taken: whoever comes from here on wakes the loop again.
+        self._awake = False
+        for _ in range(DRAIN_AT_ONCE):
+            try:
+                function, args = self._calls.popleft()
+            except IndexError:
+                return
+            function(*args)
+        if self._calls and not self._awake:
+            self._awake = True
+            self._loop.call_soon(self._drain)
+
+
+class CommandDesk:
+    """Serves one device's commands, each in a task of its own, so that none waits for another.
+
+    Args:
+        subject: for the log.
+        handler: the framework's; it answers by publishing to the reply subject.
+        answer: sends an encoded reply to a reply subject.
+        finish: told a reply subject whose command is over; True when nobody has answered it yet.
+    """
+
+    def __init__(
+        self,
+        subject: str,
+        handler: Handler,
+        answer: Callable[[str, bytes], None],
+        finish: Callable[[str], bool],
+    ) -> None:
+        self._subject = subject
+        self._handler = handler
+        self._answer = answer
+        self._finish = finish
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._log = Throttled(logger)
+
+    def accept(self, data: bytes, reply: str | None) -> None:
+        """Start a command or refuse it at once. On the loop's thread."""
+        found = jsonrpc.check(data)
+        if isinstance(found, jsonrpc.Command):
+            room = MAX_COMMANDS + (RESERVED_COMMANDS if never_behind_motion(found.method) else 0)
+            if len(self._tasks) < room:
+                task = asyncio.ensure_future(self._serve(data, reply, found))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+                return
+            found = jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {len(self._tasks)} commands are running", found.id)
+        self.refuse(found, reply)
+
+    def refuse(self, refusal: jsonrpc.Refusal, reply: str | None) -> None:
+        """Answer a message that is no command, when somebody waits for an answer, and log it."""
+        self._log.warning("refused a message on %s: %d %s", self._subject, refusal.code, refusal.reason)
+        if reply is not None:
+            self._answer(reply, refusal.encoded())
+
+    async def close(self) -> None:
+        """Cancel what runs and wait for it."""
+        tasks = [task for task in self._tasks if task is not asyncio.current_task()]
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _serve(self, data: bytes, reply: str | None, command: jsonrpc.Command) -> None:
+        try:
+            await self._handler(data, reply)
+        except Exception as problem:
+            # The framework's own handler catches its own; what comes here must still not leave a caller waiting.
+            logger.exception("the handler of %s failed", self._subject)
+            self._close_books(reply, command, f"{type(problem).__name__} in the device")
+        else:
+            self._close_books(reply, command, "the device gave no answer")
+
+    def _close_books(self, reply: str | None, command: jsonrpc.Command, reason: str) -> None:
+        if reply is not None and self._finish(reply):
+            self._answer(reply, jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, reason))
+
+
+class OrderedFeed:
+    """Serves one subscription's messages one after another, in the order of their arrival."""
+
+    def __init__(self, subject: str, handler: Callable[..., Awaitable[None]]) -> None:
+        self._subject = subject
+        self._handler = handler
+        self._waiting: deque[tuple[Any, ...]] = deque()
+        self._arrived = asyncio.Event()
+        self._log = Throttled(logger)
+        self._task = asyncio.ensure_future(self._work())
+
+    def accept(self, *message: Any) -> None:
+        """Take a message for the handler. On the loop's thread."""
+        if len(self._waiting) >= MAX_EVENTS:
+            self._waiting.popleft()
+            self._log.warning("the handler of %s is %d messages behind; dropped the oldest", self._subject, MAX_EVENTS)
+        self._waiting.append(message)
+        self._arrived.set()
+
+    async def close(self) -> None:
+        """Stop serving; what still waits is dropped."""
+        self._task.cancel()
+        if self._task is not asyncio.current_task():
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    async def _work(self) -> None:
+        while True:
+            await self._arrived.wait()
+            self._arrived.clear()
+            served = 0
+            while self._waiting:
+                try:
+                    await self._handler(*self._waiting.popleft())
+                except Exception:
+                    logger.exception("the handler of %s failed", self._subject)
+                served += 1
+                if served % DRAIN_AT_ONCE == 0:
+                    await asyncio.sleep(0)

@@ -1,0 +1,165 @@
+"""Is this a JSON-RPC 2.0 command, and if not, which answer is owed?
+
+Codes are those of the JSON-RPC 2.0 specification, section 5.1; -32000 to -32099 are free for servers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from ...utils import shown
+
+PARSE_ERROR = -32700
+INVALID_REQUEST = -32600
+INVALID_PARAMS = -32602
+INTERNAL_ERROR = -32603
+BUSY = -32001
+
+MAX_COMMAND_BYTES = 2**20
+"""Largest command that is read, in bytes: what a NATS server accepts by default, parsed in some 10 ms."""
+
+MAX_DEPTH = 64
+"""Deepest nesting of a command; no robot's argument comes near."""
+
+# The framework hands params to ``invoke(function_name, **params)``; these would collide with its own arguments.
+_TAKEN = ("self", "function_name")
+
+# The W3C trace headers, which the tracer behind the framework reads as text without asking.
+_TRACE = ("traceparent", "tracestate", "baggage", "source_device")
+
+RpcId = str | int | float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What dispatching needs to know of a well-formed command."""
+
+    method: str
+    id: RpcId
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a message is no command: the JSON-RPC error it is owed."""
+
+    code: int
+    reason: str
+    id: RpcId = None
+
+    def encoded(self) -> bytes:
+        """The JSON-RPC error reply."""
+        return error(self.id, self.code, self.reason)
+
+
+def error(rpc_id: RpcId, code: int, reason: str) -> bytes:
+    """An encoded JSON-RPC error reply."""
+    return json.dumps({"jsonrpc": "2.0", "id": rpc_id, "error": {"code": code, "message": reason}}).encode()
+
+
+def check(data: bytes) -> Command | Refusal:
+    """What ``data`` is: a command, or the refusal it is owed. Never raises."""
+    if len(data) > MAX_COMMAND_BYTES:
+        return too_large(len(data))
+    try:
+        request = _DECODER.decode(data.decode())
+    except (ValueError, RecursionError) as problem:
+        return Refusal(PARSE_ERROR, f"no JSON: {_short(problem)}")
+    if not isinstance(request, dict):
+        return Refusal(INVALID_REQUEST, f"a command is a JSON object, not {_kind(request)}")
+    if data.count(b"[") + data.count(b"{") > MAX_DEPTH and _deeper_than(request, MAX_DEPTH):
+        return Refusal(INVALID_REQUEST, f"nested deeper than {MAX_DEPTH}")
+    return _check_request(request)
+
+
+def too_large(size: int) -> Refusal:
+    """The refusal for a command of ``size`` bytes, whose id nobody has read."""
+    return Refusal(INVALID_REQUEST, f"a command has at most {MAX_COMMAND_BYTES} bytes, not {size}")
+
+
+def valid_json(data: bytes) -> bool:
+    """False when ``data`` holds NaN or Infinity, which Python writes and JSON forbids."""
+    if b"NaN" not in data and b"Infinity" not in data:
+        return True
+    try:
+        _DECODER.decode(data.decode())
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+def id_of(data: bytes) -> RpcId:
+    """The id of an encoded reply, as far as it can be read."""
+    try:
+        found = json.loads(data).get("id")
+    except (ValueError, RecursionError, AttributeError):
+        return None
+    return found if isinstance(found, str | int | float) else None
+
+
+def _check_request(request: dict[str, Any]) -> Command | Refusal:
+    if "id" not in request:
+        return Refusal(INVALID_REQUEST, "id is missing")
+    rpc_id = request["id"]
+    if isinstance(rpc_id, bool) or not (rpc_id is None or isinstance(rpc_id, str | int | float)):
+        return Refusal(INVALID_REQUEST, f"id must be a string or a number, not {_kind(rpc_id)}")
+    if isinstance(rpc_id, float) and not math.isfinite(rpc_id):
+        return Refusal(INVALID_REQUEST, "id must be a finite number")
+    if request.get("jsonrpc", "2.0") != "2.0":
+        return Refusal(INVALID_REQUEST, f"jsonrpc must be '2.0', not {shown(request['jsonrpc'])}", rpc_id)
+    method = request.get("method")
+    if not isinstance(method, str) or not method:
+        return Refusal(INVALID_REQUEST, f"method must be a name, not {shown(method)}", rpc_id)
+    problem = _params_problem(request.get("params", {}))
+    return Refusal(INVALID_PARAMS, problem, rpc_id) if problem else Command(method, rpc_id)
+
+
+def _params_problem(params: object) -> str:
+    if not isinstance(params, dict):
+        return f"params must be an object of named arguments, not {_kind(params)}"
+    for name in _TAKEN:
+        if name in params:
+            return f"no function takes a parameter named {name!r}"
+    meta = params.get("_dc_meta", {})
+    if not isinstance(meta, dict):
+        return f"_dc_meta must be an object, not {_kind(meta)}"
+    for name, value in meta.items():
+        if value is not None and not isinstance(value, str if name in _TRACE else str | int | float):
+            return f"_dc_meta.{shown(name)[1:-1]} must be text, not {_kind(value)}"
+    source = meta.get("source_device", params.get("source_device"))
+    if source is not None and not isinstance(source, str):
+        return f"source_device must be text, not {_kind(source)}"
+    return ""
+
+
+def _deeper_than(value: object, limit: int) -> bool:
+    """True when ``value`` nests deeper; walks level by level, so depth costs no stack."""
+    level: list[object] = [value]
+    for _ in range(limit):
+        level = [
+            child
+            for node in level
+            for child in (node.values() if isinstance(node, dict) else node if isinstance(node, list) else ())
+            if isinstance(child, dict | list)
+        ]
+        if not level:
+            return False
+    return True
+
+
+def _kind(value: object) -> str:
+    names = {dict: "an object", list: "an array", str: "a string", bool: "a boolean", type(None): "null"}
+    return names.get(type(value), "a number")
+
+
+def _short(problem: BaseException) -> str:
+    return "nested too deep" if isinstance(problem, RecursionError) else str(problem)[:120]
+
+
+def _no_constant(token: str) -> NoReturn:
+    raise ValueError(f"{token} is no JSON number")
+
+
+_DECODER = json.JSONDecoder(parse_constant=_no_constant)

@@ -1,0 +1,334 @@
+"""Device Connect over NATS: the framework's wire, with commands side by side and a connect that ends.
+
+A ``nats-py`` client belongs to one event loop, so runtimes share a connection where they share a loop; each further
+loop costs one descriptor and no thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import logging
+import ssl
+import tempfile
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import nats.errors
+from device_connect_edge.messaging.base import MessagingClient, Subscription
+from device_connect_edge.messaging.exceptions import (
+    AuthenticationError,
+    MessagingConnectionError,
+    NotConnectedError,
+    PublishError,
+    RequestTimeoutError,
+    SubscribeError,
+)
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.aio.subscription import Subscription as NatsSubscription
+
+from . import jsonrpc
+from .config import LinkConfig
+from .dispatch import CommandDesk, OrderedFeed, Throttled
+from .errors import NoResponderError
+
+logger = logging.getLogger(__name__)
+
+RECONNECT_WAIT_S = 0.5
+"""Seconds between attempts to reach a server that went away."""
+
+DEFAULT_URL = "nats://127.0.0.1:4222"
+
+
+class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has no type information
+    """A messaging client on a NATS connection; ``open_ended`` takes what the link leaves open from ``connect``."""
+
+    def __init__(self, link: LinkConfig, *, open_ended: bool = False) -> None:
+        self._link = link
+        self._open_ended = open_ended
+        self._client = Client()
+        self._closing = False
+        self._desks: set[_NatsSubscription] = set()
+        self._unanswered: set[str] = set()
+        self._log = Throttled(logger)
+
+    @property
+    def link(self) -> LinkConfig:
+        """The link as it is used, with what ``connect`` was given filled in."""
+        return self._link
+
+    async def connect(
+        self,
+        servers: list[str],
+        credentials: dict[str, Any] | None = None,
+        tls_config: dict[str, Any] | None = None,
+        reconnect_cb: Callable[[], Awaitable[None]] | None = None,
+        disconnect_cb: Callable[[], Awaitable[None]] | None = None,
+        **_options: Any,
+    ) -> None:
+        """Connect, and stay connected: a lost server is tried again for ever.
+
+        Raises:
+            AuthenticationError: the server refuses the credentials.
+            MessagingConnectionError: no server answered within the link's ``connect_timeout_s``.
+        """
+        self._link = link = self._link.filled(servers, credentials, tls_config) if self._open_ended else self._link
+        options: dict[str, Any] = {}
+        if link.jwt:
+            options["user_jwt_cb"] = lambda: bytearray(link.jwt.encode())
+            options["signature_cb"] = (credentials or {}).get("signature_cb") or partial(_signed, link.nkey_seed)
+        if link.ca:
+            options["tls"] = _tls_context(link)
+        refused: list[str] = []
+
+        async def on_error(error: Exception) -> None:
+            if "authorization" in str(error).lower():
+                refused.append(str(error))
+            self._log.warning("NATS: %s", error)
+
+        options |= {
+            "servers": list(link.connect) or [DEFAULT_URL],
+            "connect_timeout": link.connect_timeout_s,
+            "reconnect_time_wait": RECONNECT_WAIT_S,
+            "max_reconnect_attempts": -1,
+            "disconnected_cb": partial(self._tell, "lost", disconnect_cb),
+            "reconnected_cb": partial(self._tell, "is back", reconnect_cb),
+            "error_cb": on_error,
+        }
+        where = ", ".join(link.connect) or DEFAULT_URL
+        try:
+            async with asyncio.timeout(link.connect_timeout_s):
+                await self._client.connect(**options)
+        except (TimeoutError, OSError, nats.errors.Error) as error:
+            await self._abandon()
+            reason = refused[-1] if refused else str(error) or f"no answer within {link.connect_timeout_s:g} s"
+            kind = AuthenticationError if "authorization" in reason.lower() else MessagingConnectionError
+            raise kind(f"no NATS connection to {where}: {reason}") from error
+        except asyncio.CancelledError:
+            await self._abandon()
+            raise
+
+    async def publish(self, subject: str, data: bytes) -> None:
+        """Send ``data``.
+
+        Raises:
+            NotConnectedError: no server at this moment; nothing is kept for later, when it would be stale.
+            PublishError: the server would refuse it: too large, or a bad subject.
+        """
+        if subject in self._unanswered:
+            self._unanswered.discard(subject)
+            data = self._fit_to_send(data)
+        if not self._client.is_connected:
+            raise NotConnectedError("not connected to NATS")
+        if len(data) > self._client.max_payload:
+            raise PublishError(
+                f"{len(data)} bytes for {subject}: the NATS server takes at most {self._client.max_payload}"
+            )
+        try:
+            await self._client.publish(subject, data)
+        except nats.errors.Error as error:
+            raise PublishError(f"cannot publish on {subject}: {error}") from error
+
+    async def subscribe(
+        self,
+        subject: str,
+        callback: Callable[[bytes, str | None], Awaitable[None]],
+        queue: str | None = None,
+        subscribe_only: bool = False,
+    ) -> Subscription:
+        """Have ``callback(data, reply_subject)`` called; one subject ending in ``.cmd`` is served concurrently.
+
+        Raises:
+            NotConnectedError: no server at this moment.
+            SubscribeError: the subject is none.
+        """
+        if subject.endswith(".cmd") and not subscribe_only:
+            desk = CommandDesk(subject, callback, self._answer, self._unanswered.__contains__)
+            return await self._declare(subject, queue, partial(self._command, desk), desk)
+        feed = OrderedFeed(subject, callback)
+        return await self._declare(subject, queue, lambda msg: feed.accept(msg.data, msg.reply or None), feed)
+
+    async def subscribe_with_subject(
+        self,
+        subject: str,
+        callback: Callable[[bytes, str, str | None], Awaitable[None]],
+        queue: str | None = None,
+        subscribe_only: bool = False,
+    ) -> Subscription:
+        """``subscribe`` whose callback also gets the subject that matched: ``callback(data, subject, reply)``."""
+        feed = OrderedFeed(subject, callback)
+        return await self._declare(
+            subject, queue, lambda msg: feed.accept(msg.data, msg.subject, msg.reply or None), feed
+        )
+
+    async def request(self, subject: str, data: bytes, timeout: float = 5.0) -> bytes:  # noqa: ASYNC109 - the framework's signature
+        """The first reply to ``data``.
+
+        Raises:
+            NoResponderError: nobody serves ``subject``.
+            RequestTimeoutError: somebody does, but gave no reply within ``timeout`` seconds.
+            PublishError: the server would refuse the request.
+            NotConnectedError: no server at this moment.
+        """
+        if not self._client.is_connected:
+            raise NotConnectedError("not connected to NATS")
+        try:
+            answer = await self._client.request(subject, data, timeout=timeout)
+        except nats.errors.NoRespondersError as error:
+            raise NoResponderError(f"nobody answers on {subject}") from error
+        except (nats.errors.TimeoutError, TimeoutError) as error:
+            raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
+        except nats.errors.Error as error:
+            raise PublishError(f"cannot ask {subject}: {error}") from error
+        payload: bytes = answer.data
+        return payload
+
+    async def flush(self) -> None:
+        """Wait until the server has everything published so far."""
+        with contextlib.suppress(nats.errors.Error):  # a connection that is lost has nothing to flush
+            await self._client.flush(timeout=2)
+
+    async def close(self) -> None:
+        """Unsubscribe, send what is pending, and close."""
+        self._closing = True
+        for subscription in tuple(self._desks):
+            await subscription.unsubscribe()
+        if not self._client.is_closed:
+            if self._client.is_connected:
+                await self.flush()
+            await self._client.close()
+
+    @property
+    def is_connected(self) -> bool:
+        """True while a server is there."""
+        return bool(self._client.is_connected)
+
+    @property
+    def is_closed(self) -> bool:
+        """True after ``close``."""
+        return bool(self._client.is_closed)
+
+    async def _declare(
+        self,
+        subject: str,
+        queue: str | None,
+        accept: Callable[[Msg], None],
+        served_by: CommandDesk | OrderedFeed,
+    ) -> Subscription:
+        async def on_message(message: Msg) -> None:
+            accept(message)
+
+        if not self._client.is_connected:
+            await served_by.close()
+            raise NotConnectedError("not connected to NATS")
+        try:
+            inner = await self._client.subscribe(subject, queue=queue or "", cb=on_message)
+        except nats.errors.Error as error:
+            await served_by.close()
+            raise SubscribeError(f"cannot subscribe to {subject}: {error}") from error
+        subscription = _NatsSubscription(inner, served_by, self._desks.discard)
+        self._desks.add(subscription)
+        return subscription
+
+    def _command(self, desk: CommandDesk, message: Msg) -> None:
+        reply = message.reply or None
+        if reply is not None:
+            self._unanswered.add(reply)
+        desk.accept(message.data, reply)
+
+    def _answer(self, reply: str, data: bytes) -> None:
+        task = asyncio.ensure_future(self._send_answer(reply, data))
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())
+
+    async def _send_answer(self, reply: str, data: bytes) -> None:
+        self._unanswered.discard(reply)
+        with contextlib.suppress(PublishError, NotConnectedError):  # the caller is out of reach
+            await self.publish(reply, data)
+
+    def _fit_to_send(self, data: bytes) -> bytes:
+        limit = self._client.max_payload
+        if len(data) > limit:
+            return jsonrpc.error(
+                jsonrpc.id_of(data),
+                jsonrpc.INTERNAL_ERROR,
+                f"the result has {len(data)} bytes and the NATS server takes at most {limit}",
+            )
+        if not jsonrpc.valid_json(data):
+            return jsonrpc.error(
+                jsonrpc.id_of(data), jsonrpc.INTERNAL_ERROR, "the result holds NaN or Infinity, which JSON cannot carry"
+            )
+        return data
+
+    async def _tell(self, what: str, callback: Callable[[], Awaitable[None]] | None) -> None:
+        if self._closing:
+            return
+        logger.log(logging.INFO if what == "is back" else logging.WARNING, "NATS connection %s", what)
+        if callback is not None:
+            await callback()
+
+    async def _abandon(self) -> None:
+        self._closing = True
+        await self._client.close()
+        # The framework asks this very object again when its connect failed.
+        self._client = Client()
+        self._closing = False
+
+
+class _NatsSubscription(Subscription):  # type: ignore[misc]  # the framework has no type information
+    """A handle that unsubscribes once."""
+
+    def __init__(
+        self,
+        inner: NatsSubscription,
+        served_by: CommandDesk | OrderedFeed,
+        forget: Callable[[_NatsSubscription], None],
+    ) -> None:
+        self._inner: NatsSubscription | None = inner
+        self._served_by = served_by
+        self._forget = forget
+
+    async def unsubscribe(self) -> None:
+        """Stop receiving; cancels what is being served."""
+        inner, self._inner = self._inner, None
+        self._forget(self)
+        if inner is not None:
+            # A closed connection has dropped its subscriptions already.
+            with contextlib.suppress(nats.errors.Error):
+                await inner.unsubscribe()
+            await self._served_by.close()
+
+
+def _signed(seed: str, nonce: str | bytes) -> bytes:
+    """The server's nonce, signed with the seed's key, in base64."""
+    import nkeys  # type: ignore[import-untyped]  # noqa: PLC0415 - only credentials need it
+
+    challenge = nonce.encode() if isinstance(nonce, str) else nonce
+    return base64.b64encode(nkeys.from_seed(seed.encode()).sign(challenge))
+
+
+def _tls_context(link: LinkConfig) -> ssl.SSLContext:
+    context = ssl.create_default_context(ssl.Purpose.SERVER_AUTH, cafile=None)
+    if link.ca.lstrip().startswith("-----BEGIN"):
+        context.load_verify_locations(cadata=link.ca)
+    else:
+        context.load_verify_locations(cafile=link.ca)
+    context.check_hostname = link.verify_hostname
+    if link.cert:
+        _load_identity(context, link.cert, link.key)
+    return context
+
+
+def _load_identity(context: ssl.SSLContext, cert: str, key: str) -> None:
+    """Certificate and key, which the standard library reads from files only."""
+    if not cert.lstrip().startswith("-----BEGIN"):
+        context.load_cert_chain(cert, key)
+        return
+    with tempfile.TemporaryDirectory(prefix="strands-") as folder:
+        both = Path(folder, "identity.pem")
+        both.touch(mode=0o600)
+        both.write_text(f"{cert}\n{key}\n")
+        context.load_cert_chain(both)

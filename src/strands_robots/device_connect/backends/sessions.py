@@ -1,0 +1,252 @@
+"""One Zenoh session for each distinct link in the process, shared by every client and closed by the last.
+
+Zenoh calls back on its own threads; a sink given here runs there and must only hand over. Callbacks are direct: the
+binding would otherwise start one Python thread for each subscriber, queryable and query.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import logging
+import random
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from ...utils import missing_extra
+from .config import LinkConfig
+
+try:
+    import zenoh
+except ImportError as error:
+    raise missing_extra("Device Connect over Zenoh", "device-connect") from error
+
+logger = logging.getLogger(__name__)
+
+Sink = Callable[[Any], None]
+
+# How often a process without the meeting port looks whether somebody still has it, in seconds, half of it at random
+# so that two survivors rarely try in the same instant.
+MEETING_CHECK_S = 1.0
+
+_sessions: dict[LinkConfig, SharedSession] = {}
+_lock = threading.Lock()
+
+
+def acquire(link: LinkConfig) -> SharedSession:
+    """The process's session for ``link``, opened if nobody has. Blocks; call it off the event loop.
+
+    Raises:
+        zenoh.ZError: the session cannot be opened.
+    """
+    with _lock:
+        shared = _sessions.get(link)
+        if shared is None:
+            shared = _sessions[link] = SharedSession(link)
+        shared.users += 1
+    try:
+        shared.open()
+    except BaseException:
+        release(shared)
+        raise
+    return shared
+
+
+def release(shared: SharedSession) -> None:
+    """Give a session back; the last one closes it. Blocks; call it off the event loop."""
+    with _lock:
+        shared.users -= 1
+        if shared.users > 0:
+            return
+        if _sessions.get(shared.link) is shared:
+            del _sessions[shared.link]
+    shared.close()
+
+
+def open_links() -> tuple[LinkConfig, ...]:
+    """The links that have a session at this moment."""
+    with _lock:
+        return tuple(_sessions)
+
+
+def direct(sink: Sink, drop: Callable[[], None] | None = None) -> Any:
+    """A Zenoh handler that calls ``sink`` on the thread on which Zenoh received."""
+    return zenoh.handlers.Callback(sink, drop, indirect=False)
+
+
+class SharedSession:
+    """A Zenoh session with its users, its subscribers by key, and what it knows of its far sides."""
+
+    def __init__(self, link: LinkConfig) -> None:
+        self.link = link
+        self.users = 0
+        self.session: Any = None
+        self._lock = threading.RLock()
+        self._topics: dict[str, _Topic] = {}
+        self._far_sides: set[str] = set()
+        self._watchers: list[Callable[[bool], None]] = []
+        self._link_events: Any = None
+        self._meeting: Meeting | None = None
+
+    def open(self) -> None:
+        """Open the session unless it is open."""
+        with self._lock:
+            if self.session is not None:
+                return
+            self.session, self._meeting = _open(self.link)
+            self._link_events = self.session.info.declare_transport_events_listener(
+                direct(self._on_transport), history=True
+            )
+
+    def close(self) -> None:
+        """Close everything. Safe to call twice."""
+        with self._lock:
+            session, self.session = self.session, None
+            meeting, self._meeting = self._meeting, None
+            self._watchers.clear()
+            self._topics.clear()
+        if meeting is not None:
+            meeting.close()
+        if session is not None:
+            try:
+                session.close()
+            except zenoh.ZError as problem:
+                logger.warning("a Zenoh session did not close in order: %s", problem)
+
+    @property
+    def linked(self) -> bool:
+        """True when the session can reach somebody, or is a peer, which needs nobody."""
+        return self.session is not None and (self.link.is_peer or bool(self._far_sides))
+
+    def watch(self, watcher: Callable[[bool], None]) -> None:
+        """Have ``watcher(linked)`` called, on a foreign thread, when the link is lost or back."""
+        with self._lock:
+            self._watchers.append(watcher)
+
+    def unwatch(self, watcher: Callable[[bool], None]) -> None:
+        """Undo ``watch``."""
+        with self._lock, contextlib.suppress(ValueError):
+            self._watchers.remove(watcher)
+
+    def subscribe(self, key: str, sink: Sink) -> Callable[[], None]:
+        """Have ``sink(sample)`` called for every sample on ``key``; the result undoes it.
+
+        All sinks of a key share one Zenoh subscriber.
+        """
+        with self._lock:
+            topic = self._topics.get(key)
+            if topic is None:
+                topic = self._topics[key] = _Topic()
+                topic.sinks = (sink,)
+                topic.subscriber = self.session.declare_subscriber(key, direct(topic.deliver))
+            else:
+                topic.sinks = (*topic.sinks, sink)
+        return lambda: self._unsubscribe(key, sink)
+
+    def answer(self, key: str, sink: Sink) -> Callable[[], None]:
+        """Have ``sink(query)`` called for every query on ``key``; the result undoes it."""
+        queryable = self.session.declare_queryable(key, direct(sink), complete=True)
+        return lambda: _undeclare(queryable)
+
+    def _unsubscribe(self, key: str, sink: Sink) -> None:
+        with self._lock:
+            topic = self._topics.get(key)
+            if topic is None or sink not in topic.sinks:
+                return
+            topic.sinks = tuple(each for each in topic.sinks if each != sink)
+            if topic.sinks:
+                return
+            del self._topics[key]
+        _undeclare(topic.subscriber)
+
+    def _on_transport(self, event: Any) -> None:
+        zid = str(event.transport.zid)
+        with self._lock:
+            before = self.linked
+            (self._far_sides.add if event.kind == zenoh.SampleKind.PUT else self._far_sides.discard)(zid)
+            after = self.linked
+            watchers = tuple(self._watchers)
+        if before != after:
+            for watcher in watchers:
+                watcher(after)
+
+
+class _Topic:
+    """One Zenoh subscriber and the sinks that share it."""
+
+    __slots__ = ("sinks", "subscriber")
+
+    def __init__(self) -> None:
+        self.sinks: tuple[Sink, ...] = ()
+        self.subscriber: Any = None
+
+    def deliver(self, sample: Any) -> None:
+        """Hand a sample to every sink."""
+        for sink in self.sinks:
+            sink(sample)
+
+
+class Meeting:
+    """Takes over the meeting port when the process that has it goes.
+
+    Zenoh cannot add a listener to an open session, and a session that still waits for a port does not close, so the
+    port gets a small session of its own, which the main one finds by its own connect retry.
+    """
+
+    def __init__(self, link: LinkConfig, session: Any) -> None:
+        self._link = link
+        self._session = session
+        self._host: Any = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="strands-meeting", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop watching and give the port back."""
+        self._closing.set()
+        self._thread.join()
+        if self._host is not None:
+            self._host.close()
+
+    def _watch(self) -> None:
+        while not self._closing.wait(MEETING_CHECK_S * random.uniform(0.5, 1.0)):
+            if self._host is None and not self._somebody_has_it():
+                # Whoever was faster has it now, and the main session's retry finds them.
+                with contextlib.suppress(zenoh.ZError):
+                    self._host = zenoh.open(_zenoh_config(self._link.meeting_host()))
+                    logger.info("took over the meeting point %s", self._link.meeting_point)
+
+    def _somebody_has_it(self) -> bool:
+        return any(str(link.dst) == self._link.meeting_point for link in self._session.info.links())
+
+
+def _open(link: LinkConfig) -> tuple[Any, Meeting | None]:
+    if link.meeting_point is None:
+        return zenoh.open(_zenoh_config(link.zenoh())), None
+    try:
+        return zenoh.open(_zenoh_config(link.zenoh(meet=True))), None
+    except zenoh.ZError:
+        session = zenoh.open(_zenoh_config(link.zenoh()))
+        return session, Meeting(link, session)
+
+
+def _zenoh_config(config: dict[str, Any]) -> Any:
+    return zenoh.Config.from_json5(json.dumps(config))
+
+
+def _undeclare(entity: Any) -> None:
+    # A session that was closed meanwhile has undeclared it already.
+    with contextlib.suppress(zenoh.ZError):
+        entity.undeclare()
+
+
+@atexit.register
+def _close_all() -> None:
+    """A session left open with a subscriber would hang the interpreter's exit."""
+    with _lock:
+        left = list(_sessions.values())
+        _sessions.clear()
+    for shared in left:
+        shared.close()

@@ -1,0 +1,350 @@
+"""Device Connect over Zenoh: the framework's wire, without its thread pool and its queue of commands.
+
+The wire is that of the framework's own adapter: subjects become key expressions, a command is a Zenoh query on the
+device's ``cmd`` key whose payload is the JSON-RPC request, its reply carries the JSON-RPC response, events are puts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import logging
+import math
+import time
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
+
+import zenoh
+from device_connect_edge.messaging.base import MessagingClient, Subscription
+from device_connect_edge.messaging.exceptions import (
+    MessagingConnectionError,
+    NotConnectedError,
+    PublishError,
+    RequestTimeoutError,
+    SubscribeError,
+)
+
+from . import jsonrpc, sessions
+from .config import LinkConfig
+from .dispatch import CommandDesk, Inbox, OrderedFeed
+from .errors import NoResponderError
+from .threads import on_a_thread
+from .zenoh_intake import Handle, Intake
+
+logger = logging.getLogger(__name__)
+
+LARGE_BYTES = 2**19
+"""From here on a message goes out on a thread, with patience: cut into many fragments it would hold up the loop."""
+
+REPLY_TTL_S = 60.0
+"""Seconds a query outside a command waits for its reply before it is given up."""
+
+_REPLY = "_strands_reply/"
+
+_QUICK = {
+    "congestion_control": zenoh.CongestionControl.DROP,
+    "priority": zenoh.Priority.INTERACTIVE_HIGH,
+    "express": True,
+}
+_PATIENT = {"congestion_control": zenoh.CongestionControl.BLOCK}
+
+
+def key_of(subject: str) -> str:
+    """The key expression for a dotted subject; one with a slash in it is a key expression already."""
+    if "/" in subject:
+        return subject
+    return "/".join("**" if token == ">" else token for token in subject.split("."))
+
+
+class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has no type information
+    """A messaging client on a shared session. Everything but zenoh's callbacks runs on the loop that connected.
+
+    ``open_ended`` takes what the link leaves open from the arguments of ``connect``.
+    """
+
+    def __init__(self, link: LinkConfig, *, open_ended: bool = False) -> None:
+        self._link = link
+        self._open_ended = open_ended
+        self._shared: sessions.SharedSession | None = None
+        self._closed = False
+        self._inbox: Inbox | None = None
+        self._queries: dict[str, tuple[Any, float]] = {}
+        self._numbers = itertools.count()
+        self._subscriptions: set[Handle] = set()
+        self._callbacks: tuple[Callable[[], Awaitable[None]] | None, ...] = (None, None)
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._tries, self._retry_delay = 3, 0.3
+
+    @property
+    def link(self) -> LinkConfig:
+        """The link as it is used, with what ``connect`` was given filled in."""
+        return self._link
+
+    async def connect(
+        self,
+        servers: list[str],
+        credentials: dict[str, Any] | None = None,
+        tls_config: dict[str, Any] | None = None,
+        reconnect_cb: Callable[[], Awaitable[None]] | None = None,
+        disconnect_cb: Callable[[], Awaitable[None]] | None = None,
+        **_options: Any,
+    ) -> None:
+        """Open the link or join it where the process has it already.
+
+        Raises:
+            MessagingConnectionError: no router answered within the link's ``connect_timeout_s``, a port is taken,
+                or a certificate is unusable.
+        """
+        self._link = self._link.filled(servers, credentials, tls_config) if self._open_ended else self._link
+        self._inbox = Inbox(asyncio.get_running_loop())
+        self._callbacks = (disconnect_cb, reconnect_cb)
+        try:
+            self._shared = await on_a_thread(partial(sessions.acquire, self._link), undo=sessions.release)
+        except zenoh.ZError as error:
+            where = ", ".join(self._link.connect or self._link.listeners)
+            raise MessagingConnectionError(f"no Zenoh link at {where}: {error}") from error
+        self._closed = False
+        self._shared.watch(self._on_link)
+
+    async def publish(self, subject: str, data: bytes) -> None:
+        """Send ``data``; never waits for a slow peer.
+
+        Raises:
+            NotConnectedError: closed, or a client without its router.
+            PublishError: the subject is no key, the message is larger than a peer accepts, or it is no valid JSON
+                reply.
+        """
+        if subject.startswith(_REPLY):
+            await self._reply(subject, data)
+            return
+        shared = self._session()
+        try:
+            if len(data) < LARGE_BYTES:
+                shared.session.put(key_of(subject), data)
+            else:
+                await on_a_thread(partial(shared.session.put, key_of(subject), data, **_PATIENT))
+        except zenoh.ZError as error:
+            raise PublishError(f"cannot publish on {subject}: {error}") from error
+
+    async def subscribe(
+        self,
+        subject: str,
+        callback: Callable[[bytes, str | None], Awaitable[None]],
+        queue: str | None = None,
+        subscribe_only: bool = False,
+    ) -> Subscription:
+        """Have ``callback(data, reply_subject)`` called; one subject ending in ``.cmd`` is served concurrently.
+
+        Raises:
+            NotConnectedError: not connected.
+            SubscribeError: the subject is no key expression.
+        """
+        if key_of(subject).endswith("/cmd") and not subscribe_only:
+            return self._declare(subject, queue, desk=CommandDesk(subject, callback, self._answer, self._unanswered))
+        return self._declare(subject, queue, OrderedFeed(subject, callback), answers=not subscribe_only)
+
+    async def subscribe_with_subject(
+        self,
+        subject: str,
+        callback: Callable[[bytes, str, str | None], Awaitable[None]],
+        queue: str | None = None,
+        subscribe_only: bool = False,
+    ) -> Subscription:
+        """``subscribe`` whose callback also gets the key that matched: ``callback(data, key, reply_subject)``."""
+        feed = OrderedFeed(subject, callback)
+        return self._declare(subject, queue, feed, answers=not subscribe_only, with_subject=True)
+
+    async def request(self, subject: str, data: bytes, timeout: float = 5.0) -> bytes:  # noqa: ASYNC109 - the framework's signature
+        """The first reply to ``data``.
+
+        Raises:
+            NoResponderError: nobody serves ``subject``.
+            RequestTimeoutError: somebody does, but gave no reply within ``timeout`` seconds.
+            NotConnectedError: closed, or a client without its router.
+        """
+        deadline = time.monotonic() + timeout
+        tries = self._tries if self._link.is_peer else 1
+        for left in reversed(range(tries)):
+            remaining = deadline - time.monotonic()
+            answer = await self._ask(key_of(subject), data, max(remaining, 0.001), subject, timeout)
+            if answer is not None:
+                return answer
+            if left == 0 or deadline - time.monotonic() <= self._retry_delay:
+                break
+            # A peer that links at this very moment is not known here yet.
+            await asyncio.sleep(self._retry_delay)
+        raise NoResponderError(f"nobody answers on {subject}")
+
+    async def close(self) -> None:
+        """Undeclare everything and give the session back; the last of the process closes it."""
+        self._closed = True
+        shared, self._shared = self._shared, None
+        for subscription in tuple(self._subscriptions):
+            await subscription.unsubscribe()
+        self._queries.clear()
+        for task in tuple(self._tasks):
+            task.cancel()
+        if shared is not None:
+            shared.unwatch(self._on_link)
+            await on_a_thread(partial(sessions.release, shared))
+
+    @property
+    def is_connected(self) -> bool:
+        """True while messages can leave: a peer's session is open, a client has its router."""
+        return self._shared is not None and self._shared.linked
+
+    @property
+    def is_closed(self) -> bool:
+        """True after ``close``."""
+        return self._closed
+
+    def convert_subject_syntax(self, subject: str) -> str:
+        """The key expression for a dotted subject."""
+        return key_of(subject)
+
+    def configure_d2d_retry(self, retries: int = 3, delay: float = 0.3) -> None:
+        """How often a peer asks again when nobody answers, and after how many seconds; the framework calls this."""
+        self._tries, self._retry_delay = retries, delay
+
+    def _session(self) -> sessions.SharedSession:
+        if self._shared is None or not self._shared.linked:
+            raise NotConnectedError("closed" if self._closed else "not connected to Zenoh")
+        return self._shared
+
+    async def _ask(self, key: str, data: bytes, remaining: float, subject: str, patience: float) -> bytes | None:
+        shared, inbox = self._session(), self._inbox
+        assert inbox is not None
+        future: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
+        failure: list[str] = []
+
+        def on_reply(reply: Any) -> None:
+            if reply.ok is not None:
+                inbox.put(_settle, future, reply.ok.payload.to_bytes())
+            else:
+                failure.append(reply.err.payload.to_bytes()[:200].decode(errors="replace"))
+
+        token: Any = zenoh.CancellationToken()
+        options: dict[str, Any] = dict(_QUICK if len(data) < LARGE_BYTES else _PATIENT)
+        if self._link.is_peer:
+            options["target"] = zenoh.QueryTarget.ALL
+        options["consolidation"] = zenoh.ConsolidationMode.NONE
+        get = partial(
+            shared.session.get,
+            key,
+            sessions.direct(on_reply, partial(inbox.put, _settle, future, None)),
+            payload=data,
+            timeout=remaining,
+            cancellation_token=token,
+            **options,
+        )
+        try:
+            if len(data) < LARGE_BYTES:
+                get()
+            else:
+                await on_a_thread(get)
+            async with asyncio.timeout(remaining + 0.05):
+                answer = await future
+        except TimeoutError:
+            answer = None
+            failure.append("Timeout")
+        except zenoh.ZError as error:
+            raise PublishError(f"cannot ask {subject}: {error}") from error
+        finally:
+            if not future.done() or future.cancelled():
+                token.cancel()
+        if answer is None and "Timeout" in failure:
+            raise RequestTimeoutError(f"no reply on {subject} within {patience:g} s")
+        if answer is None and failure:
+            raise PublishError(f"{subject} refused: {failure[-1]}")
+        return answer
+
+    def _declare(
+        self,
+        subject: str,
+        queue: str | None,
+        feed: OrderedFeed | None = None,
+        *,
+        desk: CommandDesk | None = None,
+        answers: bool = True,
+        with_subject: bool = False,
+    ) -> Subscription:
+        if queue:
+            logger.warning("Zenoh has no queue groups: every subscriber of %s gets every message", subject)
+        shared, key = self._session(), key_of(subject)
+        intake = Intake(self, desk, feed, with_subject)
+        undo = []
+        try:
+            undo.append(shared.subscribe(key, intake.on_sample))
+            if answers:
+                undo.append(shared.answer(key, intake.on_query))
+        except zenoh.ZError as error:
+            for each in undo:
+                each()
+            raise SubscribeError(f"cannot subscribe to {subject}: {error}") from error
+        subscription = Handle(undo, desk or feed, self._subscriptions.discard)
+        self._subscriptions.add(subscription)
+        return subscription
+
+    def hand_over(self, function: Callable[..., None], *args: Any) -> None:
+        """Call ``function(*args)`` on the client's loop; from any thread."""
+        if self._inbox is not None:
+            self._inbox.put(function, *args)
+
+    def keep(self, query: Any, *, until_answered: bool) -> str:
+        """Remember a query until its reply is published; the subject to publish it to. On the loop.
+
+        A command's query is let go when its handler ends, any other after ``REPLY_TTL_S``.
+        """
+        now = time.monotonic()
+        for reply, (_, until) in tuple(itertools.islice(self._queries.items(), 4)):
+            if now > until:
+                del self._queries[reply]
+        reply = f"{_REPLY}{next(self._numbers)}"
+        self._queries[reply] = (query, math.inf if until_answered else now + REPLY_TTL_S)
+        return reply
+
+    def _unanswered(self, reply: str) -> bool:
+        return reply in self._queries
+
+    def _answer(self, reply: str, data: bytes) -> None:
+        query, _ = self._queries.pop(reply, (None, 0.0))
+        if query is not None:
+            answer_query(query, data)
+
+    async def _reply(self, reply: str, data: bytes) -> None:
+        query, _ = self._queries.pop(reply, (None, 0.0))
+        if query is None:
+            raise PublishError("the caller no longer waits for this reply")
+        if not jsonrpc.valid_json(data):
+            data = jsonrpc.error(
+                jsonrpc.id_of(data), jsonrpc.INTERNAL_ERROR, "the result holds NaN or Infinity, which JSON cannot carry"
+            )
+        if len(data) < LARGE_BYTES:
+            answer_query(query, data)
+        else:
+            await on_a_thread(partial(answer_query, query, data, _PATIENT))
+
+    def _on_link(self, linked: bool) -> None:
+        self.hand_over(self._tell, linked)
+
+    def _tell(self, linked: bool) -> None:
+        logger.log(logging.INFO if linked else logging.WARNING, "Zenoh link %s", "is back" if linked else "lost")
+        callback = self._callbacks[linked]
+        if callback is not None and not self._closed:
+            task = asyncio.ensure_future(callback())
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+
+def answer_query(query: Any, data: bytes, options: dict[str, Any] | None = None) -> None:
+    """Reply and let go of the query, which tells the caller that no more comes."""
+    with contextlib.suppress(zenoh.ZError):  # the caller's link is gone; nobody is left to tell
+        query.reply(query.key_expr, data, **(_QUICK if options is None else options))
+    query.drop()
+
+
+def _settle(future: asyncio.Future[bytes | None], value: bytes | None) -> None:
+    if not future.done():
+        future.set_result(value)
