@@ -6,7 +6,6 @@ from typing import Any
 
 from strands_robots.simulation.engine import mujoco
 
-CAMERAS = ("overview", "front", "side", "top")
 MAX_WIDTH, MAX_HEIGHT = 1920, 1440
 """Largest picture, in pixels: the size of the off-screen buffer."""
 
@@ -17,10 +16,14 @@ def dress(spec: Any, *, floor: bool) -> None:
     visual.global_.offwidth, visual.global_.offheight = MAX_WIDTH, MAX_HEIGHT
     visual.headlight.active = 1
     visual.headlight.ambient = [0.34, 0.34, 0.36]
-    visual.headlight.diffuse = [0.30, 0.30, 0.30]
+    visual.headlight.diffuse = [0.18, 0.18, 0.18]
     visual.headlight.specular = [0.10, 0.10, 0.10]
     visual.rgba.haze = [0.86, 0.89, 0.93, 1]
+    # The shadow map covers this much around the middle: a larger one speckles the floor.
+    spec.stat.extent = 1.0
+    spec.stat.center = [0.1, 0.0, 0.1]
     visual.map.znear, visual.map.zfar = 0.005, 30
+    visual.map.shadowclip = 1.2
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -45,7 +48,6 @@ def dress(spec: Any, *, floor: bool) -> None:
         diffuse=[0.20, 0.22, 0.25],
         castshadow=False,
     )
-    world.add_camera(name="overview", pos=[0.62, -0.52, 0.42], xyaxes=[0.68, 0.73, 0, -0.29, 0.27, 0.918], fovy=45)
     world.add_camera(name="front", pos=[0.95, 0, 0.28], xyaxes=[0, 1, 0, -0.16, 0, 0.987], fovy=45)
     world.add_camera(name="side", pos=[0.15, -0.85, 0.25], xyaxes=[1, 0, 0, 0, 0.12, 0.993], fovy=45)
     world.add_camera(name="top", pos=[0.12, 0, 1.1], xyaxes=[0, -1, 0, 1, 0, 0], fovy=45)
@@ -57,13 +59,13 @@ def _floor(spec: Any) -> None:
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         mark=mujoco.mjtMark.mjMARK_EDGE,
-        rgb1=[0.80, 0.82, 0.85],
-        rgb2=[0.76, 0.785, 0.82],
-        markrgb=[0.68, 0.71, 0.75],
+        rgb1=[0.72, 0.74, 0.77],
+        rgb2=[0.68, 0.705, 0.74],
+        markrgb=[0.60, 0.63, 0.67],
         width=512,
         height=512,
     )
-    material = spec.add_material(name="floor", reflectance=0.05, specular=0.1, shininess=0.1)
+    material = spec.add_material(name="floor", reflectance=0.0, specular=0.1, shininess=0.1)
     material.texrepeat = [5, 5]
     material.texuniform = True
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"

@@ -80,7 +80,10 @@ def _described(model: str) -> ModelSource:
     for candidate in (model, f"{model}_mj_description", f"{model}_description"):
         if candidate in names:
             # Importing one of these modules fetches the description when it is not in its cache yet.
-            module = importlib.import_module(f"robot_descriptions.{candidate}")
+            try:
+                module = importlib.import_module(f"robot_descriptions.{candidate}")
+            except Exception as exc:  # that package clones with git, whose failures have no common type
+                raise ValidationError(f"model {shown(model)} cannot be fetched: {_first_line(exc)}") from exc
             path = getattr(module, "MJCF_PATH", None) or getattr(module, "URDF_PATH", None)
             if isinstance(path, str):
                 return ModelSource(model, Path(path))
@@ -92,8 +95,7 @@ def _described(model: str) -> ModelSource:
 def _description_names() -> list[str]:
     if importlib.util.find_spec("robot_descriptions") is None:
         return []
-    listing = importlib.import_module("robot_descriptions._descriptions")
-    return sorted(listing.DESCRIPTIONS)
+    return sorted(importlib.import_module("robot_descriptions").DESCRIPTIONS)
 
 
 def _first_line(exc: BaseException) -> str:

@@ -45,6 +45,7 @@ class RobotParts:
     actuators: dict[str, Actuator]
     cameras: tuple[str, ...]
     tip: str
+    root: str
     base: int | None
 
     @property
@@ -84,12 +85,17 @@ def map_robot(model: Any, name: str, label: str) -> RobotParts:
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-UNBOUNDED, UNBOUNDED)
         actuators[key] = Actuator(key, index, float(low), float(high), is_servo(model, index))
     cameras = tuple(n for n in (model.camera(i).name for i in range(model.ncam)) if n.startswith(prefix))
-    return RobotParts(name, label, joints, actuators, cameras, _tip(model, prefix), base)
+    return RobotParts(name, label, joints, actuators, cameras, _tip(model, prefix), _root(model, prefix), base)
 
 
 def is_servo(model: Any, index: int) -> bool:
     """True when the actuator is a position servo: its bias pulls back in proportion to its length."""
     return bool(model.actuator_biasprm[index][1] < 0.0)
+
+
+def _root(model: Any, prefix: str) -> str:
+    """The robot's first body."""
+    return next((n for n in (str(model.body(i).name) for i in range(model.nbody)) if n.startswith(prefix)), "world")
 
 
 def _tip(model: Any, prefix: str) -> str:

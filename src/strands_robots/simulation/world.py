@@ -7,12 +7,14 @@ from typing import Any
 from strands_robots.envelope import Envelope, success
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.simulation.arguments import STEPS_MAX, answered
-from strands_robots.simulation.construction import Construction, checked_plan
+from strands_robots.simulation.construction import checked_plan
 from strands_robots.simulation.physics import CHUNK, CommandVoidError
+from strands_robots.simulation.pictures import Pictures
+from strands_robots.simulation.views import camera_names
 from strands_robots.utils import ValidationError, flag, text, whole
 
 
-class Simulation(Construction):
+class Simulation(Pictures):
     """A world of simulated robots, each with its own rollout, behind the contract :class:`WorldRobot`.
 
     Physics keeps real time while a rollout or a teleoperation runs, and for a moment after a single command;
@@ -120,10 +122,13 @@ class Simulation(Construction):
             }
             for name, parts in stage.robots.items()
         }
-        cameras = [stage.model.camera(i).name for i in range(stage.model.ncam)]
         objects = [o.name for o in stage.plan.objects]
         return success(
-            f"{len(robots)} robots.", robots=robots, cameras=cameras, objects=objects, timestep=stage.plan.timestep
+            f"{len(robots)} robots.",
+            robots=robots,
+            cameras=camera_names(stage),
+            objects=objects,
+            timestep=stage.plan.timestep,
         )
 
     def halt(self, reason: str = "") -> StopVerdict:
@@ -139,6 +144,7 @@ class Simulation(Construction):
         verdict = self.halt("cleanup")
         self._closed = True
         self._clock.close()
+        self._close_pictures()
         return verdict.envelope()
 
 
