@@ -1,0 +1,226 @@
+"""The safety record: chained, signed, shared by processes, and never in the way."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import stat
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots import audit
+from strands_robots.audit import flush_audit, log_safety_event, read_audit_log, verify_audit_integrity
+from strands_robots.safety import integrity
+from strands_robots.safety.journal import GENESIS, NAME, Entry, Journal
+
+
+def entry(number: int, peer: str = "arm-1", **payload: Any) -> Entry:
+    return Entry(float(number), "emergency_stop", peer, {"n": number, **payload})
+
+
+def check(journal: Journal, *, keyed: bool = False) -> dict[str, Any]:
+    return integrity.verify(journal, keyed=keyed)
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Journal:
+    return Journal(tmp_path / "log")
+
+
+def test_an_event_is_recorded_with_its_fields_sorted_and_compact(state_directory: Path) -> None:
+    before = time.time()
+    log_safety_event("emergency_stop", "arm-1", {"reason": "smoke"})
+    assert flush_audit()
+    line = (state_directory / NAME).read_text().strip()
+    record = json.loads(line)
+    assert line == json.dumps(record, sort_keys=True, separators=(",", ":"))
+    assert set(record) == {"ts", "event", "peer_id", "payload", "seq", "prev"}
+    assert (record["seq"], record["prev"], record["payload"]) == (1, GENESIS, {"reason": "smoke"})
+    assert before <= record["ts"] <= time.time()
+    assert stat.S_IMODE((state_directory / NAME).stat().st_mode) == 0o600
+
+
+def test_the_directory_is_made_for_its_owner_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_DIR", str(tmp_path / "audit"))
+    log_safety_event("emergency_stop", "arm-1", {})
+    assert flush_audit()
+    assert stat.S_IMODE((tmp_path / "audit").stat().st_mode) == 0o700
+
+
+def test_numbers_rise_by_peer_and_over_a_restart(journal: Journal) -> None:
+    journal.append([entry(1), entry(2, "arm-2"), entry(3)])
+    Journal(journal.directory).append([entry(4), entry(5, "arm-2")])
+    seqs = [(each["peer_id"], each["seq"]) for each in journal.records()]
+    assert seqs == [("arm-1", 1), ("arm-2", 1), ("arm-1", 2), ("arm-1", 3), ("arm-2", 2)]
+    assert check(journal)["ok"]
+
+
+def test_reading_since_gives_what_is_not_older(state_directory: Path) -> None:
+    Journal(state_directory).append([entry(1), entry(2), entry(3)])
+    assert [each["ts"] for each in read_audit_log(2.0)] == [2.0, 3.0]
+    assert len(read_audit_log()) == 3
+
+
+def test_with_a_key_every_record_is_signed_and_verified(state_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", "a secret")
+    for _ in range(3):
+        log_safety_event("emergency_stop", "arm-1", {})
+    found = verify_audit_integrity()
+    assert (found["total"], found["signed"], found["verified"], found["ok"]) == (3, 3, 3, True)
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", "another secret")
+    found = verify_audit_integrity()
+    assert (found["bad"], found["ok"]) == (3, False)
+    (state_directory / NAME).write_bytes(b"")
+
+
+def test_a_record_without_a_signature_is_missing_one_where_a_key_is_set(journal: Journal) -> None:
+    journal.append([entry(1)])
+    found = check(Journal(journal.directory, b"secret"), keyed=True)
+    assert (found["missing"], found["ok"]) == (1, False)
+
+
+def lines_of(journal: Journal) -> list[bytes]:
+    return journal.path.read_bytes().splitlines(keepends=True)
+
+
+def test_a_record_taken_out_of_the_middle_shows_and_says_where(journal: Journal) -> None:
+    journal.append([entry(n) for n in range(5)])
+    lines = lines_of(journal)
+    journal.path.write_bytes(b"".join(lines[:2] + lines[3:]))
+    found = check(journal)
+    assert not found["ok"]
+    assert (found["broken"], found["gaps"]) == (1, 1)
+    assert found["breaks"][0]["where"] == f"{NAME}:3"
+
+
+def test_a_changed_record_shows_even_without_a_key(journal: Journal) -> None:
+    journal.append([entry(n) for n in range(3)])
+    lines = lines_of(journal)
+    lines[1] = lines[1].replace(b'"n":1', b'"n":7')
+    journal.path.write_bytes(b"".join(lines))
+    assert check(journal)["broken"] == 1
+
+
+def test_a_log_cut_at_its_end_or_start_shows(journal: Journal) -> None:
+    journal.append([entry(n) for n in range(3)])
+    lines = lines_of(journal)
+    journal.path.write_bytes(b"".join(lines[:2]))
+    found = check(journal)
+    assert (found["head"], found["ok"]) == ("cut", False)
+    journal.path.write_bytes(b"".join(lines[1:]))
+    assert check(journal)["broken"] == 1
+
+
+def test_a_torn_last_line_is_closed_off_and_the_chain_passes_over_it(journal: Journal) -> None:
+    journal.append([entry(1)])
+    with journal.path.open("ab") as file:
+        file.write(b'{"event":"emergency_st')
+    Journal(journal.directory).append([entry(2)])
+    found = check(journal)
+    assert (found["total"], found["torn"], found["ok"]) == (2, 1, True)
+
+
+@pytest.mark.parametrize("lost", ["mesh_audit.head", None])
+def test_the_chain_goes_on_after_the_head_file_was_lost_or_lags(journal: Journal, lost: str | None) -> None:
+    journal.append([entry(1), entry(2, "arm-2")])
+    if lost:
+        (journal.directory / lost).unlink()
+    else:
+        (journal.directory / "mesh_audit.head").write_text("{not json")
+    Journal(journal.directory).append([entry(3)])
+    assert [each["seq"] for each in journal.records()] == [1, 1, 2]
+    assert check(journal)["ok"]
+
+
+def test_rotation_keeps_five_files_and_the_chain_and_the_numbers(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, max_bytes=500)
+    for number in range(60):
+        journal.append([entry(number)])
+    assert len(journal.files()) == 6
+    records = list(journal.records())
+    assert records[-1]["seq"] == 60
+    assert records[0]["seq"] > 1
+    assert check(journal)["ok"]
+    journal.files()[0].unlink()
+    assert not check(journal)["ok"]
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [{"x": object()}, {"x": math.nan}, {"x": {1, 2}}, {"x": "y" * 300_000}, {("a", "b"): 1}, [object()], "\ud800"],
+)
+def test_what_json_cannot_hold_is_recorded_with_what_could_be_kept(payload: Any) -> None:
+    log_safety_event("odd", "arm-1", payload)
+    (record,) = read_audit_log()
+    assert record["payload"] == payload or "SERIALISE_FAILED" in record["payload"]
+    assert verify_audit_integrity()["ok"]
+
+
+def test_a_payload_nested_beyond_measure_is_recorded_as_such() -> None:
+    deep: dict[str, Any] = {}
+    for _ in range(100_000):
+        deep = {"d": deep}
+    log_safety_event("odd", "arm-1", {"deep": deep})
+    (record,) = read_audit_log()
+    assert "SERIALISE_FAILED" in record["payload"]
+
+
+def test_a_link_in_place_of_the_log_is_not_followed_and_the_record_waits(
+    state_directory: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    target = tmp_path / "elsewhere"
+    target.write_text("")
+    (state_directory / NAME).symlink_to(target)
+    log_safety_event("emergency_stop", "arm-1", {"reason": "smoke"})
+    assert not flush_audit(0.2)
+    assert target.read_text() == ""
+    assert "smoke" in caplog.text
+    assert "CRITICAL" in caplog.text
+    (state_directory / NAME).unlink()
+    assert flush_audit(5)
+    assert read_audit_log()[0]["payload"] == {"reason": "smoke"}
+
+
+def test_logging_does_not_wait_while_another_process_holds_the_lock(state_directory: Path) -> None:
+    with (state_directory / "mesh_audit.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        log_safety_event("emergency_stop", "arm-1", {})
+        assert not flush_audit(0.1)
+    assert flush_audit(5)
+    assert len(read_audit_log()) == 1
+
+
+def test_many_threads_lose_nothing() -> None:
+    def write(peer: str) -> None:
+        for _ in range(50):
+            log_safety_event("e", peer, {})
+
+    threads = [threading.Thread(target=write, args=(f"arm-{n}",)) for n in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    found = verify_audit_integrity()
+    assert (found["total"], found["gaps"], found["ok"]) == (400, 0, True)
+
+
+def test_beyond_the_bound_the_oldest_records_give_way_to_one_that_counts_them(
+    state_directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(audit, "PENDING_MAX", 10)
+    (state_directory / NAME).symlink_to("/nonexistent/elsewhere")
+    for number in range(30):
+        log_safety_event("e", "arm-1", {"n": number})
+    assert not flush_audit(0.1)
+    (state_directory / NAME).unlink()
+    eventually(lambda: flush_audit(0.2))
+    records = read_audit_log()
+    lost = sum(each["payload"]["lost"] for each in records if each["event"] == "audit_records_lost")
+    assert lost + sum(each["event"] == "e" for each in records) == 30
+    assert records[-1]["payload"] == {"n": 29}
