@@ -7,10 +7,10 @@ import sys
 
 import psutil
 import pytest
-
 from fixtures.bare_caller import Caller
 from fixtures.echo_device import EchoDevice
 from fixtures.waiting import accepts, eventually, free_port, until
+
 from strands_robots.device_connect.backends import loopback_config, open_client
 
 AGENT = """

@@ -1,0 +1,139 @@
+"""What a link is made of."""
+
+import json
+
+import pytest
+
+from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
+from strands_robots.device_connect.backends.config import endpoints
+from strands_robots.utils import ValidationError
+
+VARIABLES = (
+    "MESSAGING_BACKEND",
+    "MESSAGING_URLS",
+    "MESSAGING_CREDENTIALS_FILE",
+    "MESSAGING_TLS_CA_FILE",
+    "MESSAGING_TLS_CERT_FILE",
+    "MESSAGING_TLS_KEY_FILE",
+    "NATS_URL",
+    "NATS_URLS",
+    "NATS_CREDENTIALS_FILE",
+    "ZENOH_CONNECT",
+    "ZENOH_LISTEN",
+    "STRANDS_DC_PORT",
+)
+
+
+@pytest.fixture(autouse=True)
+def environment(monkeypatch):
+    for name in VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    return monkeypatch
+
+
+def test_with_nothing_set_a_link_is_a_multicast_peer():
+    link = link_from_environment()
+    assert link.is_peer
+    assert link.uses_multicast
+    assert not link.authenticated
+    assert not link.loopback_only
+
+
+def test_a_zenoh_endpoint_makes_a_client(environment):
+    environment.setenv("ZENOH_CONNECT", "tcp/10.0.0.1:7447, tls/10.0.0.2:7447")
+    link = link_from_environment()
+    assert not link.is_peer
+    assert link.connect == ("tcp/10.0.0.1:7447", "tls/10.0.0.2:7447")
+    assert link.zenoh()["mode"] == "client"
+    assert link.zenoh()["listen"]["endpoints"] == []
+
+
+def test_a_nats_url_makes_a_nats_link_without_naming_the_backend(environment):
+    environment.setenv("NATS_URL", "nats://10.0.0.1:4222")
+    assert link_from_environment().transport == "nats"
+
+
+def test_a_listen_endpoint_makes_a_peer_that_listens_there(environment):
+    environment.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7000")
+    link = link_from_environment()
+    assert link.is_peer
+    assert link.listeners == ("tcp/127.0.0.1:7000",)
+
+
+def test_an_unknown_backend_is_refused_by_name(environment):
+    environment.setenv("MESSAGING_BACKEND", "mqtt")
+    with pytest.raises(ValidationError, match="mqtt"):
+        link_from_environment()
+
+
+def test_a_credentials_file_says_everything(environment, tmp_path):
+    file = tmp_path / "a.creds.json"
+    section = {"urls": ["tls/10.0.0.1:7447"], "tls": {"ca_pem": "-----BEGIN X", "cert_pem": "c", "key_pem": "k"}}
+    file.write_text(json.dumps({"device_id": "a", "tenant": "lab", "zenoh": section}))
+    environment.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
+    link = link_from_environment()
+    assert (link.tenant, link.connect, link.cert) == ("lab", ("tls/10.0.0.1:7447",), "c")
+    assert link.authenticated
+
+
+def test_a_nats_creds_file_is_read(environment, tmp_path):
+    file = tmp_path / "a.creds"
+    file.write_text(
+        "-----BEGIN NATS USER JWT-----\neyJ0\n------END NATS USER JWT------\n\n*** keep it secret ***\n"
+        "-----BEGIN USER NKEY SEED-----\nSUAC\n------END USER NKEY SEED------\n"
+    )
+    environment.setenv("NATS_CREDENTIALS_FILE", str(file))
+    environment.setenv("NATS_URL", "nats://10.0.0.1:4222")
+    link = link_from_environment()
+    assert (link.jwt, link.nkey_seed) == ("eyJ0", "SUAC")
+
+
+def test_a_missing_credentials_file_is_named(environment, tmp_path):
+    environment.setenv("MESSAGING_CREDENTIALS_FILE", str(tmp_path / "none.json"))
+    with pytest.raises(ValidationError, match=r"none\.json"):
+        link_from_environment()
+
+
+def test_a_loopback_link_stays_on_this_machine(environment):
+    environment.setenv("STRANDS_DC_PORT", "7555")
+    link = loopback_config()
+    assert link.loopback_only
+    assert link.meeting_point == "tcp/127.0.0.1:7555"
+    assert link.zenoh(meet=True)["listen"]["endpoints"] == ["tcp/127.0.0.1:0", "tcp/127.0.0.1:7555"]
+    assert link.zenoh()["connect"]["endpoints"] == ["tcp/127.0.0.1:7555"]
+    assert not link.zenoh()["scouting"]["multicast"]["enabled"]
+
+
+def test_a_peer_with_certificates_speaks_nothing_but_tls():
+    link = LinkConfig(mode="peer", ca="ca.pem", cert="c.pem", key="k.pem", listen=("tls/0.0.0.0:7447",))
+    assert link.zenoh()["transport"]["link"]["protocols"] == ["tls"]
+    assert link.zenoh()["transport"]["link"]["tls"]["enable_mtls"]
+    assert not link.loopback_only
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"transport": "mqtt"},
+        {"mode": "router"},
+        {"meet_port": 0},
+        {"meet_port": True},
+        {"cert": "c.pem", "ca": "ca.pem"},
+        {"cert": "c.pem", "key": "k.pem"},
+        {"jwt": "x"},
+    ],
+)
+def test_a_link_that_cannot_work_is_refused(fields):
+    with pytest.raises(ValidationError):
+        LinkConfig(**fields)
+
+
+def test_secrets_are_not_shown():
+    link = LinkConfig(ca="ca", cert="c", key="SECRET-KEY", jwt="SECRET-JWT", nkey_seed="SECRET-SEED")
+    assert "SECRET" not in repr(link)
+    assert "SECRET" not in link.fingerprint
+
+
+def test_every_spelling_of_the_framework_names_an_endpoint():
+    spelled = ["zenoh://", "zenoh://h:1", "zenoh+tls://h", "tcp/h:2", "h:3", "tls/h:4"]
+    assert endpoints(spelled) == ("tcp/h:1", "tls/h:7447", "tcp/h:2", "tcp/h:3", "tls/h:4")

@@ -1,0 +1,150 @@
+"""Our NATS backend against the real server, with the bare framework at the far side."""
+
+import asyncio
+import contextlib
+import json
+
+import pytest
+from device_connect_edge.messaging.exceptions import MessagingError
+from fixtures.bare_caller import Caller
+from fixtures.certificates import Authority
+from fixtures.echo_device import EchoDevice
+from fixtures.nats_credentials import NatsAccounts, credentials_file
+from fixtures.nats_server import NatsServer
+from fixtures.waiting import eventually_async, free_port, until
+
+from strands_robots.device_connect.backends import LinkConfig, link_from_environment, open_client
+
+
+def link_to(server, **fields):
+    return LinkConfig(transport="nats", connect=(server.url,), **fields)
+
+
+@pytest.fixture
+def server():
+    with NatsServer() as running:
+        yield running
+
+
+async def test_a_bare_agent_and_our_device_understand_each_other_over_nats(server):
+    with EchoDevice("arm-1", link_to(server)):
+        async with Caller("nats", servers=(server.url,)) as bare:
+            await bare.sees("arm-1")
+            assert (await bare.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
+            heard = await bare.hears("arm-1", "tick")
+            await bare.call("arm-1", "burst", {"count": 50, "hz": 1000})
+            await until(lambda: len(heard) == 50)
+            assert [each["n"] for each in heard] == list(range(50))
+
+
+async def test_our_client_and_a_bare_device_understand_each_other_over_nats(server):
+    bare = {"NATS_URL": server.url, "DEVICE_CONNECT_DISCOVERY_MODE": "d2d"}
+    with EchoDevice("arm-1", environment=bare):
+        async with Caller(client=await open_client(link_to(server))) as caller:
+            await caller.sees("arm-1")
+            assert (await caller.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
+
+
+async def test_a_quick_call_is_answered_while_a_slow_one_runs_on_nats(server):
+    with EchoDevice("arm-1", link_to(server)):
+        async with Caller("nats", servers=(server.url,)) as bare:
+            await bare.sees("arm-1")
+            slow = asyncio.ensure_future(bare.call("arm-1", "move", {"seconds": 1.0}))
+            await asyncio.sleep(0.1)
+            assert (await bare.call("arm-1", "stop"))["result"] == {"stopped": True}
+            assert not slow.done()
+            assert (await slow)["result"] == {"moved": True}
+
+
+async def test_an_event_the_server_would_refuse_is_dropped_and_the_next_ones_flow():
+    with NatsServer(max_payload=20_000) as server, EchoDevice("arm-1", link_to(server)):
+        async with Caller("nats", servers=(server.url,)) as bare:
+            await bare.sees("arm-1")
+            heard = await bare.hears("arm-1", "tick")
+            await bare.call("arm-1", "burst", {"count": 1, "size": 30_000})
+            await bare.call("arm-1", "burst", {"count": 3, "hz": 100})
+            await until(lambda: len(heard) == 3)
+
+
+async def test_a_result_the_server_would_refuse_is_answered_with_the_limit():
+    with NatsServer(max_payload=20_000) as server, EchoDevice("arm-1", link_to(server)):
+        async with Caller("nats", servers=(server.url,)) as bare:
+            await bare.sees("arm-1")
+            answer = await bare.call("arm-1", "large", {"size": 30_000})
+    assert answer["error"]["code"] == -32603
+    assert "20000" in answer["error"]["message"]
+
+
+async def test_a_device_answers_within_five_seconds_of_a_killed_server_coming_back(server):
+    with EchoDevice("arm-1", link_to(server)):
+        async with Caller("nats", servers=(server.url,)) as bare:
+            await bare.sees("arm-1")
+        server.kill()
+        await asyncio.sleep(1.0)
+        server.start()
+        async with Caller(client=await open_client(link_to(server))) as caller:
+
+            async def answered():
+                with contextlib.suppress(MessagingError):
+                    return (await caller.call("arm-1", "getStatus", wait_s=0.5)).get("result")
+
+            await eventually_async(answered, 5, "an answer after the restart")
+
+
+async def test_nobody_at_a_subject_is_told_at_once_on_nats(server):
+    async with Caller(client=await open_client(link_to(server))) as caller:
+        started = asyncio.get_running_loop().time()
+        with pytest.raises(MessagingError, match="nobody answers"):
+            await caller.call("nobody", "getStatus", wait_s=30)
+        assert asyncio.get_running_loop().time() - started < 5
+
+
+async def test_connecting_to_an_absent_server_ends():
+    link = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=1.0)
+    with pytest.raises(MessagingError, match="no NATS connection"):
+        async with asyncio.timeout(10):
+            await open_client(link)
+
+
+async def test_jwt_credentials_over_tls_admit_a_device_as_itself_alone(tmp_path, monkeypatch):
+    authority, accounts = Authority(tmp_path), NatsAccounts()
+    identity = authority.issue("nats")
+    with NatsServer(identity, accounts.server_lines) as server:
+        folder = tmp_path / "credentials"
+        folder.mkdir()
+        file = credentials_file(folder, "robot-a", accounts.device("robot-a"), url=server.url, identity=identity)
+        monkeypatch.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
+        link = link_from_environment()
+        monkeypatch.delenv("MESSAGING_CREDENTIALS_FILE")
+        assert link.transport == "nats"
+        assert link.authenticated
+
+        operator = accounts.operator()
+        credentials = {"jwt": operator.jwt, "nkey_seed": operator.nkey_seed}
+        tls = {"ca_file": str(identity.ca)}
+        with EchoDevice("robot-a", link):
+            async with Caller("nats", servers=(server.url,), tls=tls, credentials=credentials) as bare:
+                await bare.sees("robot-a")
+                assert (await bare.call("robot-a", "getStatus"))["result"]
+                heard = await bare.hears("robot-a", "emergencyStop")
+
+                intruder = accounts.device("robot-b")
+                client = await open_client(
+                    link_to(server, jwt=intruder.jwt, nkey_seed=intruder.nkey_seed, ca=str(identity.ca))
+                )
+                async with Caller(client=client) as other:
+                    spoofed = json.dumps({"jsonrpc": "2.0", "method": "emergencyStop", "params": {}}).encode()
+                    await other.client.publish("device-connect.default.robot-a.event.emergencyStop", spoofed)
+                    with pytest.raises(MessagingError):
+                        await other.call("robot-a", "getStatus", wait_s=0.5)
+                assert heard == []
+
+        with pytest.raises(MessagingError):
+            await open_client(link_to(server, ca=str(identity.ca), connect_timeout_s=1.0))
+
+
+async def test_a_server_of_another_authority_is_refused(tmp_path):
+    ours, theirs = Authority(tmp_path / "ours"), Authority(tmp_path / "theirs")
+    with NatsServer(theirs.issue("nats")) as server:
+        with pytest.raises(MessagingError, match="no NATS connection"):
+            await open_client(link_to(server, ca=str(ours.ca), connect_timeout_s=2.0))
