@@ -1,0 +1,87 @@
+"""Device Connect: a robot or a simulation as a device that agents find, drive and stop.
+
+::
+
+    from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
+
+    runtime = init_device_connect_sync(robot, peer_id="so100-lab-1")
+    ...
+    stop_device_connect(runtime)
+
+Everything here is imported when it is asked for: importing this package needs no extra and costs next to nothing.
+What stands on the framework needs the [device-connect] extra, and says so.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.device_connect.limits import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
+
+if TYPE_CHECKING:
+    from device_connect_edge import DeviceRuntime
+
+    from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
+    from strands_robots.device_connect.bringup import (
+        DuplicateDeviceError,
+        init_device_connect,
+        init_device_connect_sync,
+        stop_device_connect,
+    )
+    from strands_robots.device_connect.client import FleetClient
+    from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+    from strands_robots.device_connect.signals import StopSignal
+    from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+
+__all__ = [
+    "_LOOP_JOIN_TIMEOUT_S",
+    "DeviceRuntime",
+    "DuplicateDeviceError",
+    "FleetClient",
+    "LinkConfig",
+    "RobotDeviceDriver",
+    "SimulationDeviceDriver",
+    "StopSignal",
+    "init_device_connect",
+    "init_device_connect_sync",
+    "link_from_environment",
+    "loopback_config",
+    "stop_device_connect",
+]
+
+_HERE = "strands_robots.device_connect"
+_HOMES = {
+    "DeviceRuntime": "device_connect_edge",
+    "DuplicateDeviceError": f"{_HERE}.bringup",
+    "FleetClient": f"{_HERE}.client",
+    "LinkConfig": f"{_HERE}.backends",
+    "RobotDeviceDriver": f"{_HERE}.robot_driver",
+    "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
+    "StopSignal": f"{_HERE}.signals",
+    "init_device_connect": f"{_HERE}.bringup",
+    "init_device_connect_sync": f"{_HERE}.bringup",
+    "link_from_environment": f"{_HERE}.backends",
+    "loopback_config": f"{_HERE}.backends",
+    "stop_device_connect": f"{_HERE}.bringup",
+}
+_FRAMEWORK = ("device_connect_edge", "zenoh", "nats", "pydantic")
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        value = getattr(import_module(home), name)
+    except ModuleNotFoundError as exc:
+        if exc.name is None or exc.name.partition(".")[0] not in _FRAMEWORK:
+            raise
+        utils = import_module("strands_robots.utils")
+        raise utils.missing_extra("Device Connect", "device-connect") from exc
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -1,0 +1,355 @@
+"""What the device drivers share: the door that every RPC passes, the stop, and the device's live state.
+
+An RPC of a subclass asks :meth:`RobotDriver.move` or :meth:`RobotDriver.read` and returns what they return: an
+envelope, always. Robot verbs run on threads (:mod:`.workers`), never on the event loop; ``stop`` has threads that
+no motion and no read can take.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.drivers.decorators import get_rpc_source_device
+from device_connect_edge.types import DeviceStatus
+
+from strands_robots import settings
+from strands_robots.contract import RolloutEvent, TaskRobot, Unsubscribe, WorldRobot
+from strands_robots.device_connect.telemetry import RolloutPump, paced
+from strands_robots.device_connect.wire import jsonable
+from strands_robots.device_connect.workers import Lane, LaneFullError
+from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.safety.approval import Approval
+from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.gate import MotionRefused
+from strands_robots.safety.stopping import StopVerdict, explain, grade
+from strands_robots.utils import ValidationError, shown
+
+logger = logging.getLogger(__name__)
+
+MOVE_DEADLINE_S = 10.0
+"""Seconds in which a robot has to have started a motion; after that its permit is void."""
+
+READ_DEADLINE_S = 5.0
+"""Seconds in which a robot has to have answered a read."""
+
+MOVES_AT_ONCE, READS_AT_ONCE, STOPS_AT_ONCE = 2, 4, 8
+
+Call = Callable[[], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Activity:
+    """What a robot is doing now, as it is told in status, presence, heartbeat and ``stateUpdate``."""
+
+    busy: bool = False
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    fault: str = ""
+
+
+class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
+    """A robot as a device. Subclasses name the verbs and read the state.
+
+    Args:
+        robot: what is driven, behind its contract.
+        hardware: True where a motion needs the operator's approval besides the caller's authorization.
+    """
+
+    def __init__(
+        self,
+        robot: TaskRobot | WorldRobot,
+        *,
+        hardware: bool,
+        authorization: Authorization | None = None,
+        approval: Approval | None = None,
+    ) -> None:
+        super().__init__()
+        name = robot.tool_name_str
+        self.robot = robot
+        self.hardware = hardware
+        self.authorization = authorization or Authorization(hardware=hardware, robot=name)
+        self.approval = approval or Approval()
+        self.runtime: Any = None
+        self.moves = Lane("motion", MOVES_AT_ONCE)
+        self.reads = Lane("read", READS_AT_ONCE)
+        self.stops = Lane("stop", STOPS_AT_ONCE)
+        self.alarms = Lane("emergency stop", STOPS_AT_ONCE)
+        self.activity = Activity()
+        self.changed = asyncio.Event()
+        self._watchers: list[asyncio.Task[None]] = []
+        self._unsubscribe: Unsubscribe | None = None
+
+    # The state, told in one way everywhere.
+
+    def look(self) -> Activity:
+        """Ask the robot what it is doing. May block: runs on a thread."""
+        raise NotImplementedError
+
+    async def tell(self, activity: Activity) -> None:
+        """Emit the state events of ``activity``."""
+        raise NotImplementedError
+
+    async def tell_rollout(self, event: RolloutEvent) -> None:
+        """Emit what belongs to ``event``."""
+        raise NotImplementedError
+
+    @property
+    def status(self) -> DeviceStatus:
+        """Live availability: busy (score 1.0) while something runs, else idle (0.0)."""
+        activity = self.activity if self._watchers else self._look_now()
+        return DeviceStatus(**_status_fields(activity))
+
+    def heartbeat(self) -> dict[str, Any]:
+        """What every heartbeat carries besides the id and the time."""
+        return {**_status_fields(self.activity), "state": jsonable(self.activity.facts)}
+
+    def set_device(self, device: Any) -> None:
+        """Learn the runtime, which has this robot's id on the network."""
+        super().set_device(device)
+        self.runtime = device
+
+    @property
+    def peer_id(self) -> str:
+        """The device's id on the network; before it has one, the robot's own name."""
+        return str(getattr(self.runtime, "device_id", "") or self.robot.tool_name_str)
+
+    def set_event_callback(self, callback: Callable[[str, dict[str, Any]], Any]) -> None:
+        """Emit through ``callback`` on the loop of this call, from whatever thread or loop an event comes."""
+        home = asyncio.get_running_loop()
+
+        async def emit_at_home(name: str, payload: dict[str, Any]) -> None:
+            clean = jsonable(payload)
+            if asyncio.get_running_loop() is home:
+                await callback(name, clean)
+            else:
+                await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(callback(name, clean), home))
+
+        super().set_event_callback(emit_at_home)
+
+    async def connect(self) -> None:
+        """Start telling the state; the robot manages its own hardware connection."""
+        if self.runtime is None or self._watchers:
+            return
+        self.changed = asyncio.Event()
+        self.activity = await self._looked()
+        pump = RolloutPump(self.tell_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
+        self._unsubscribe = self.robot.subscribe(pump.observe)
+        self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
+
+    def watches(self) -> list[Any]:
+        """The coroutines that run while the device is connected."""
+        idle, busy = settings.number("STRANDS_DC_STATE_HZ"), settings.number("STRANDS_DC_STATE_BUSY_HZ")
+        return [paced(lambda: busy if self.activity.busy else idle, self._tell_state, self.changed)]
+
+    async def disconnect(self) -> None:
+        """Stop telling the state; the robot manages its own shutdown."""
+        watchers, self._watchers = self._watchers, []
+        if self._unsubscribe is not None:
+            self._unsubscribe()
+            self._unsubscribe = None
+        for watcher in watchers:
+            watcher.cancel()
+        await asyncio.gather(*watchers, return_exceptions=True)
+
+    async def refresh(self) -> Activity:
+        """Ask the robot again; the answer is what status and presence say from now on."""
+        activity = self.activity = await self._looked()
+        # The runtime announces this very mapping in its presence.
+        self.runtime.status.update(_status_fields(activity))
+        return activity
+
+    async def _tell_state(self) -> None:
+        activity = await self.refresh()
+        if not activity.fault:
+            await self.tell(activity)
+
+    async def _looked(self) -> Activity:
+        try:
+            return await self.reads.run(self.look, READ_DEADLINE_S)
+        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
+            fault = f"{type(exc).__name__}: {exc}"
+            if fault != self.activity.fault:
+                logger.warning("%s: its state cannot be read: %s", self.peer_id, fault)
+            return Activity(self.activity.busy, self.activity.facts, fault)
+
+    def _look_now(self) -> Activity:
+        try:
+            return self.reads.start(self.look).result(1.0)
+        except Exception as exc:  # noqa: BLE001 - a robot that cannot answer is shown with its fault
+            return Activity(fault=f"{type(exc).__name__}: {exc}")
+
+    # The door.
+
+    async def invoke(self, function_name: str, /, **params: Any) -> Any:
+        """Call an RPC by name; parameters that it does not have, or lacks, are refused by name."""
+        signature = self._signatures.get(function_name)
+        if signature is not None:
+            known = {name: value for name, value in params.items() if name != "source_device"}
+            try:
+                signature.bind(**known)
+            except TypeError as exc:
+                has = ", ".join(signature.parameters) or "no parameters"
+                return error(f"{function_name} takes {has}: {exc}.")
+        return await super().invoke(function_name, **params)
+
+    @cached_property
+    def _signatures(self) -> dict[str, inspect.Signature]:
+        methods = {definition.name: getattr(self, definition.name) for definition in self.functions}
+        return {name: inspect.signature(method) for name, method in methods.items()}
+
+    async def move(self, verb: str, prepare: Callable[[], Call]) -> Envelope:
+        """Start a motion: authorization, arguments, lockout, the operator's approval, then the robot's verb.
+
+        Args:
+            verb: the RPC's name, which is what callers and operators are allowed.
+            prepare: checks the arguments (raising :class:`ValidationError`) and gives the call.
+        """
+        caller = get_rpc_source_device()
+        return await self._guarded(verb, lambda: self._moved(verb, prepare, caller))
+
+    async def read(self, verb: str, call: Call) -> Envelope:
+        """Answer a question, to every caller."""
+        return await self._guarded(verb, lambda: self.reads.run(call, READ_DEADLINE_S))
+
+    async def _moved(self, verb: str, prepare: Callable[[], Call], caller: object) -> object:
+        refusal = self.authorization.motion(caller, verb)
+        if refusal is not None:
+            return error(refusal)
+        call = prepare()
+        try:
+            answer = await self.moves.run(lambda: self._start(verb, call), MOVE_DEADLINE_S)
+        except TimeoutError:
+            self.robot.gate.revoke()
+            raise
+        logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb, shown(caller))
+        return answer
+
+    def _start(self, verb: str, call: Call) -> object:
+        """The part of a motion that may touch a disk or a device: lockout, approval, the robot's verb."""
+        locked = self.robot.gate.refusal(verb)
+        if locked is not None:
+            return locked
+        if not self.hardware:
+            return call()
+        claim = self.approval.claim(verb, self.peer_id)
+        if claim is None:
+            return error(Approval.refusal(verb, self.peer_id))
+        answer: object = None
+        try:
+            answer = call()
+        finally:
+            if answer is None or is_error(answer):
+                claim.give_back()
+            else:
+                claim.spend()
+        return answer
+
+    async def _guarded(self, verb: str, work: Callable[[], Awaitable[object]]) -> Envelope:
+        try:
+            return _enveloped(verb, await work())
+        except ValidationError as exc:
+            return error(str(exc))
+        except MotionRefused as exc:
+            return _enveloped(verb, exc.envelope)
+        except LaneFullError as exc:
+            return error(f"{verb} refused: the robot has not yet answered earlier {exc} calls; try again later.")
+        except TimeoutError:
+            return error(f"The robot did not answer {verb} in time; what it may still start is void.")
+        except Exception:
+            logger.exception("%s: %s failed.", self.peer_id, verb)
+            return error(f"{verb} failed inside the device; its log has the details.")
+
+    # The stop.
+
+    def halt(self, reason: str) -> StopVerdict:
+        """Halt every motion source and wait for the verdict, at most the halt deadline. Callable from any thread."""
+        within = settings.number("STRANDS_HALT_DEADLINE_S")
+        try:
+            answer: object = self.stops.start(lambda: self.robot.halt(reason)).result(within)
+        except FutureTimeoutError:
+            return StopVerdict(not_stopped={self.peer_id: f"no answer in {within:g} s"}, elapsed_ms=within * 1000)
+        except LaneFullError:
+            self.robot.gate.revoke()
+            return StopVerdict(unknown={self.peer_id: "earlier stops are still unanswered"})
+        except Exception as exc:  # noqa: BLE001 - whatever a halt raises is graded
+            answer = exc
+        return answer if isinstance(answer, StopVerdict) else _graded(self.peer_id, answer)
+
+    async def halted(self, work: Callable[[], Envelope]) -> Envelope:
+        """Run a stop on threads of its own; the answer to the caller, which is never a refusal to try."""
+        within = 2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0
+        try:
+            return _enveloped("stop", await self.alarms.run(work, within))
+        except LaneFullError:
+            self.robot.gate.revoke()
+            return error(
+                "Earlier stops of this robot are still unanswered; its motion permits are revoked.", stopped=None
+            )
+        except TimeoutError:
+            return error(f"The robot did not answer the stop within {within:g} s.", stopped=False)
+        except Exception as exc:
+            logger.exception("%s: stop failed.", self.peer_id)
+            return error(f"stop failed inside the device: {type(exc).__name__}; its log has the details.", stopped=None)
+
+    def handle_estop(self, device_id: object, payload: object) -> StopVerdict | None:
+        """Act on an emergency stop: halt, and log what did not. None when it does not count. Any thread."""
+        if device_id == self.peer_id:
+            return None
+        refusal = self.authorization.estop(device_id)
+        if refusal is not None:
+            logger.warning("%s: emergency stop ignored: %s.", self.peer_id, refusal)
+            return None
+        why = payload.get("reason", "") if isinstance(payload, Mapping) else ""
+        verdict = self.halt(f"emergency stop of {device_id}: {shown(why)}")
+        told = verdict.envelope()
+        if verdict.stopped:
+            logger.warning(
+                "%s: halted by emergency stop of %s: %s", self.peer_id, device_id, told["content"][0]["text"]
+            )
+        else:
+            logger.critical("%s: EMERGENCY STOP of %s DID NOT STOP IT: %s", self.peer_id, device_id, told.get("reason"))
+        return verdict
+
+    async def on_estop(self, device_id: object, payload: object) -> None:
+        """:meth:`handle_estop` off the loop, on threads that nothing else takes."""
+        if device_id == self.peer_id:
+            return
+        try:
+            self.alarms.start(lambda: self.handle_estop(device_id, payload))
+        except LaneFullError:
+            if self.authorization.estop(device_id) is None:
+                self.robot.gate.revoke()
+                logger.critical("%s: emergency stop of %s while earlier stops are unanswered.", self.peer_id, device_id)
+
+
+def _status_fields(activity: Activity) -> dict[str, Any]:
+    return {
+        "availability": "busy" if activity.busy else "idle",
+        "busy_score": 1.0 if activity.busy else 0.0,
+        "error_state": activity.fault or None,
+    }
+
+
+def _graded(name: str, answer: object) -> StopVerdict:
+    outcome = grade(answer)
+    if outcome.stopped:
+        return StopVerdict(halted=(name,))
+    where = {name: explain(answer)}
+    return StopVerdict(unknown=where) if outcome.stopped is None else StopVerdict(not_stopped=where)
+
+
+def _enveloped(verb: str, answer: object) -> Envelope:
+    """A robot's answer as an envelope that JSON can carry."""
+    if not isinstance(answer, Mapping):
+        return error(f"The robot answered {verb} with {shown(answer)}, which nobody here understands.")
+    plain: Envelope = jsonable(answer)
+    if plain.get("status") in ("success", "error"):
+        return plain
+    return success(f"{verb} answered.", **{k: v for k, v in plain.items() if k not in ("content", "status")})

@@ -1,0 +1,309 @@
+"""Putting a robot on Device Connect and taking it off again."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import contextlib
+import json
+import logging
+import re
+import secrets
+import sys
+import threading
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from dataclasses import dataclass, field
+from typing import Any
+
+from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.messaging import MessagingError
+
+from strands_robots import settings
+from strands_robots.contract import WorldRobot
+from strands_robots.device_connect._compat import Runtime
+from strands_robots.device_connect.backends import LinkConfig, open_client
+from strands_robots.device_connect.base_driver import RobotDriver
+from strands_robots.device_connect.limits import BRINGUP_TIMEOUT_S, LOOP_JOIN_TIMEOUT_S, PROBE_TIMEOUT_S
+from strands_robots.device_connect.links import insecure_opt_in, link_for
+from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.utils import ValidationError, choice, device_id
+
+logger = logging.getLogger(__name__)
+
+
+class DuplicateDeviceError(RuntimeError):
+    """A device with the wanted id is live on this network and answered."""
+
+
+@dataclass(slots=True)
+class Host:
+    """Where a runtime lives."""
+
+    loop: asyncio.AbstractEventLoop
+    task: asyncio.Task[None]
+    thread: threading.Thread | None = None
+    wanted_off: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+_hosts: dict[Runtime, Host] = {}
+
+
+async def init_device_connect(  # noqa: PLR0917 - the documented signature
+    robot: Any,
+    peer_id: str | None = None,
+    peer_type: str = "robot",
+    messaging_url: str | None = None,
+    messaging_backend: str | None = None,
+    tenant: str = "default",
+    allow_insecure: bool | None = None,
+    *,
+    link: LinkConfig | None = None,
+    bringup_timeout: float = BRINGUP_TIMEOUT_S,
+) -> Runtime:
+    """Serve a robot or a simulation on Device Connect; returns when it can be found and called.
+
+    Args:
+        robot: a simulation, a robot, any object that ``contract.adapt`` accepts, or a ready ``DeviceDriver``.
+        peer_id: its id on the network, without dots; ``<tool_name>-<8 hex>`` by default.
+        peer_type: ``robot`` or ``sim``; settles what an object is that could be either.
+        messaging_url: ``nats://host:port`` or ``tcp/host:port``; the environment's by default. Zenoh without any
+            finds other devices by multicast on the local network.
+        messaging_backend: ``zenoh`` or ``nats``; by default what the URL or ``MESSAGING_BACKEND`` says.
+        tenant: devices and agents of other tenants neither see nor reach this one.
+        allow_insecure: True accepts a transport without authentication; None asks
+            ``DEVICE_CONNECT_ALLOW_INSECURE``; a string is refused.
+        link: says how to connect in full, instead of URL and backend. A link that stays on this machine
+            (``loopback_config()``) needs no ``allow_insecure``.
+        bringup_timeout: seconds until the device has to be callable.
+
+    Raises:
+        ValidationError: an argument out of its domain, or an unauthenticated transport without an opt-in.
+        DuplicateDeviceError: a live device has this id.
+        TimeoutError: not callable in time; nothing is left running.
+    """
+    choice("peer_type", peer_type, ("robot", "sim"))
+    reach = link_for(messaging_url, messaging_backend, tenant, link)
+    insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
+    driver = driver_for(robot, peer_type)
+    name = default_id(robot) if peer_id is None else device_id("peer_id", peer_id)
+    announceable(driver)
+    _keep_logging_to_the_application(name)
+    async with asyncio.timeout(bringup_timeout):
+        await refuse_duplicate(name, reach)
+        runtime = Runtime(
+            driver=driver,
+            device_id=name,
+            link=reach,
+            allow_insecure=insecure,
+            discovery=settings.raw("DEVICE_CONNECT_DISCOVERY_MODE").lower(),
+        )
+        if isinstance(driver, RobotDriver):
+            runtime.set_heartbeat_provider(driver.heartbeat)
+        task = asyncio.create_task(runtime.run(), name=f"device {name}")
+        try:
+            await runtime.wait_ready(bringup_timeout)
+        except BaseException:
+            await asyncio.shield(_put_down(runtime, task))
+            raise
+    _hosts[runtime] = Host(asyncio.get_running_loop(), task)
+    task.add_done_callback(lambda _: _ended(runtime, task))
+    return runtime
+
+
+def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
+    robot: Any,
+    peer_id: str | None = None,
+    peer_type: str = "robot",
+    messaging_url: str | None = None,
+    messaging_backend: str | None = None,
+    tenant: str = "default",
+    allow_insecure: bool | None = None,
+    *,
+    link: LinkConfig | None = None,
+    bringup_timeout: float = BRINGUP_TIMEOUT_S,
+) -> Runtime:
+    """:func:`init_device_connect` for programs without an event loop: the device lives on a thread of its own.
+
+    The arguments are the same. End it with :func:`stop_device_connect`; at the latest the interpreter's end does.
+
+    Raises:
+        Exception: what :func:`init_device_connect` raised; the thread is gone by then.
+        TimeoutError: not callable in time; the bring-up is cancelled and never comes online later.
+        RuntimeError: the bring-up ended without a runtime.
+    """
+    came_up: Future[Runtime | None] = Future()
+
+    async def serve() -> None:
+        runtime = await init_device_connect(
+            robot,
+            peer_id=peer_id,
+            peer_type=peer_type,
+            messaging_url=messaging_url,
+            messaging_backend=messaging_backend,
+            tenant=tenant,
+            allow_insecure=allow_insecure,
+            link=link,
+            bringup_timeout=bringup_timeout,
+        )
+        host = _hosts.get(runtime)
+        if host is None:
+            came_up.set_result(None)
+            return
+        host.thread = threading.current_thread()
+        # A caller who has given up must not get a device that nobody stops.
+        if not came_up.set_running_or_notify_cancel():
+            await runtime.shutdown()
+            return
+        came_up.set_result(runtime)
+        asked = asyncio.create_task(host.wanted_off.wait())
+        await asyncio.wait({host.task, asked}, return_when=asyncio.FIRST_COMPLETED)
+        await runtime.shutdown()
+
+    def live() -> None:
+        try:
+            with asyncio.Runner() as runner:
+                loops.append(runner.get_loop())
+                runner.run(serve())
+        except BaseException as exc:
+            if not came_up.done():
+                came_up.set_exception(exc)
+            elif not isinstance(exc, asyncio.CancelledError):
+                logger.exception("The device's thread ended.")
+
+    loops: list[asyncio.AbstractEventLoop] = []
+    thread = threading.Thread(target=live, name="device-connect", daemon=True)
+    thread.start()
+    try:
+        runtime = came_up.result(bringup_timeout + LOOP_JOIN_TIMEOUT_S)
+    except FutureTimeoutError as exc:
+        came_up.cancel()
+        if loops:
+            _cancel_everything(loops[0])
+        thread.join(LOOP_JOIN_TIMEOUT_S)
+        raise TimeoutError(f"The device was not up within {bringup_timeout:g} s; the bring-up is cancelled.") from exc
+    except BaseException:
+        thread.join(LOOP_JOIN_TIMEOUT_S)
+        raise
+    if runtime is None:
+        thread.join(LOOP_JOIN_TIMEOUT_S)
+        raise RuntimeError("The bring-up ended without a runtime.")
+    return runtime
+
+
+def stop_device_connect(runtime: Any, within: float = 10.0) -> None:
+    """Take a device off the network: its departure is announced, its link and its thread are closed.
+
+    Callable from any thread but the device's own loop; there, ``await runtime.shutdown()``. A device that is off
+    already is no error. The robot is not halted: ask ``robot.halt`` first where it may move.
+
+    Raises:
+        TimeoutError: not gone within ``within`` seconds.
+    """
+    host = _hosts.get(runtime)
+    if host is None:
+        return
+    if host.thread is None:
+        asyncio.run_coroutine_threadsafe(runtime.shutdown(), host.loop).result(within)
+        return
+    with contextlib.suppress(RuntimeError):  # the loop closed by itself a moment ago
+        host.loop.call_soon_threadsafe(host.wanted_off.set)
+    host.thread.join(within)
+    if host.thread.is_alive():
+        raise TimeoutError(f"The device did not leave the network within {within:g} s.")
+
+
+def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
+    """The driver of ``robot``: its own where it is one, else what the object is, else what ``peer_type`` says."""
+    if isinstance(robot, DeviceDriver):
+        return robot
+    simulation = getattr(sys.modules.get("strands_robots.simulation"), "Simulation", None)
+    if isinstance(simulation, type) and isinstance(robot, simulation):
+        return SimulationDeviceDriver(robot)
+    if isinstance(robot, WorldRobot) and not callable(getattr(robot, "start_task", None)):
+        return SimulationDeviceDriver(robot)
+    return SimulationDeviceDriver(robot) if peer_type == "sim" else RobotDeviceDriver(robot)
+
+
+def default_id(robot: Any) -> str:
+    """``<tool_name>-<8 hex>``, with whatever an id cannot hold replaced by a dash."""
+    name = getattr(robot, "tool_name_str", "") or getattr(robot, "device_type", "")
+    clean = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name))[:100].strip("-_") or "robot"
+    return f"{clean}-{secrets.token_hex(4)}"
+
+
+def announceable(driver: DeviceDriver) -> None:
+    """Refuse a driver whose description JSON cannot carry: nobody would ever discover it.
+
+    Raises:
+        ValidationError: naming the functions and events to mend.
+    """
+    capabilities = driver.capabilities
+    faults = []
+    for part in (*capabilities.functions, *capabilities.events):
+        try:
+            json.dumps(part.model_dump(), allow_nan=False)
+        except (TypeError, ValueError) as exc:
+            faults.append(f"{part.name} ({exc})")
+    if faults:
+        raise ValidationError(
+            f"{type(driver).__name__} cannot be announced, because JSON cannot carry a default or a label of: "
+            f"{', '.join(faults)}."
+        )
+
+
+async def refuse_duplicate(name: str, link: LinkConfig) -> None:
+    """Raise :class:`DuplicateDeviceError` when a device with this id answers within a second. A ghost does not."""
+    request = {"jsonrpc": "2.0", "id": "probe", "method": "requestRegistration", "params": {}}
+    client = await open_client(link)
+    try:
+        await client.request(
+            f"device-connect.{link.tenant}.{name}.cmd", json.dumps(request).encode(), timeout=PROBE_TIMEOUT_S
+        )
+    except MessagingError:
+        return
+    finally:
+        await client.close()
+    raise DuplicateDeviceError(
+        f"A device {name!r} is live in tenant {link.tenant!r} and answered; give this one another peer_id."
+    )
+
+
+async def _put_down(runtime: Runtime, task: asyncio.Task[None]) -> None:
+    await runtime.shutdown()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+def _ended(runtime: Runtime, task: asyncio.Task[None]) -> None:
+    _hosts.pop(runtime, None)
+    if not task.cancelled() and task.exception() is not None:
+        logger.error("Device %s went off the network: %s", runtime.device_id, task.exception())
+
+
+def _cancel_everything(loop: asyncio.AbstractEventLoop) -> None:
+    def cancel() -> None:
+        for task in asyncio.all_tasks(loop):
+            task.cancel()
+
+    with contextlib.suppress(RuntimeError):  # the loop closed by itself a moment ago
+        loop.call_soon_threadsafe(cancel)
+
+
+def _keep_logging_to_the_application(name: str) -> None:
+    """The framework writes to stderr by itself where its logger has no handler; the application decides instead."""
+    framework = logging.getLogger(f"device_connect_edge.device.{name}")
+    if not framework.handlers:
+        framework.addHandler(logging.NullHandler())
+
+
+@atexit.register
+def _leave_no_ghost() -> None:
+    for runtime, host in list(_hosts.items()):
+        if host.thread is None or not host.thread.is_alive():
+            continue
+        try:
+            stop_device_connect(runtime, within=3.0)
+        except TimeoutError:
+            logger.warning("Device %s could not announce its departure.", runtime.device_id)

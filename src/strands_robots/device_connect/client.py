@@ -1,0 +1,369 @@
+"""A fleet as seen from a program without an event loop: who is there, call, listen, stop.
+
+The command line and the agent tools use it. It says who it is (``source``), as every caller on Device Connect
+only says.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import queue
+import threading
+import uuid
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from device_connect_edge.messaging import MessagingError
+
+from strands_robots.device_connect.backends import LinkConfig, open_client
+from strands_robots.device_connect.limits import LOOP_JOIN_TIMEOUT_S
+from strands_robots.envelope import Envelope, error
+from strands_robots.safety.stopping import Outcome, explain, grade
+from strands_robots.utils import device_id, shown, text
+
+T = TypeVar("T")
+
+PROBE_EVERY_S = 0.25
+"""Between two probes while peers are collected: the first one may leave before every link is up."""
+
+SETTLED_S = 0.5
+"""Without a new peer after which a collection ends early, where at least one has answered."""
+
+EVENTS_MAX = 10_000
+"""Events that wait for a slow reader; then the oldest go."""
+
+
+class NoSuchDeviceError(LookupError):
+    """Nobody on this network answers to that id."""
+
+
+class NoAnswerError(TimeoutError):
+    """The device is announced and did not answer in time."""
+
+
+class CallRefusedError(RuntimeError):
+    """The device answered with a JSON-RPC error; ``code`` is the protocol's."""
+
+    def __init__(self, message: str, code: int = 0) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A device as it announces itself."""
+
+    id: str
+    type: str = ""
+    model: str = ""
+    status: Mapping[str, Any] = field(default_factory=dict)
+    functions: tuple[Mapping[str, Any], ...] = ()
+    events: tuple[str, ...] = ()
+    location: str = ""
+
+    @classmethod
+    def of(cls, presence: Mapping[str, Any]) -> Peer:
+        """What a presence message says; whatever it lacks is empty."""
+        identity, status = _object(presence, "identity"), _object(presence, "status")
+        capabilities = _object(presence, "capabilities")
+        functions = [each for each in capabilities.get("functions") or () if isinstance(each, Mapping)]
+        events = [each for each in capabilities.get("events") or () if isinstance(each, Mapping)]
+        return cls(
+            id=str(presence.get("device_id", "")),
+            type=str(identity.get("device_type", "")),
+            model=str(identity.get("model") or ""),
+            status=status,
+            functions=tuple(functions),
+            events=tuple(str(each.get("name", "")) for each in events),
+            location=str(status.get("location") or ""),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event as it arrived: whose, which, and what it carries. The sender's name is part of the topic only."""
+
+    device: str
+    name: str
+    payload: Mapping[str, Any]
+
+
+class FleetClient:
+    """One connection to one tenant; use it as a context manager.
+
+    Args:
+        link: how to reach the fleet; ``loopback_config()`` for this machine, ``link_from_environment()`` else.
+        source: the caller's name that goes with every call; letters, digits, ``_`` and ``-``.
+
+    Raises:
+        MessagingError: on entering, when the network was not reached within the link's deadline.
+    """
+
+    def __init__(self, link: LinkConfig, source: str = "strands-robots") -> None:
+        self.link = link
+        self.source = device_id("source", source)
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="fleet-client", daemon=True)
+        self._messaging: Any = None
+        self._seen: dict[str, Peer] = {}
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        try:
+            self._messaging = self._wait(open_client(self.link), self.link.connect_timeout_s + 1.0)
+            self._wait(self._subscribe("*.presence", self._on_presence), 5.0)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the network; the loop and its thread end."""
+        if self._loop.is_closed():
+            return
+        if self._messaging is not None:
+            messaging, self._messaging = self._messaging, None
+            self._wait(messaging.close(), LOOP_JOIN_TIMEOUT_S)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(LOOP_JOIN_TIMEOUT_S)
+        if not self._thread.is_alive():
+            self._loop.close()
+
+    def peers(self, timeout: float = 2.0) -> list[Peer]:
+        """Who answers a probe, sorted by id; waits until nobody new has come for half a second.
+
+        Args:
+            timeout: seconds to wait for the first answer, and for all of them.
+        """
+        return self._wait(self._collect(timeout), timeout + 1.0)
+
+    def call(
+        self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0
+    ) -> Envelope:
+        """Call a function of a device; what it answers.
+
+        Raises:
+            NoSuchDeviceError: nobody answers to ``device``.
+            NoAnswerError: it is there and did not answer within ``timeout`` seconds.
+            CallRefusedError: it refused the call as such: an unknown function, a malformed message.
+            MessagingError: the network cannot carry the call.
+        """
+        return self._wait(self._call(device, function, dict(params or {}), timeout), timeout + 3.0)
+
+    def events(
+        self, device: str = "*", timeout: float | None = None, ready: threading.Event | None = None
+    ) -> Iterator[Event]:
+        """Events of one device, or of all, as they come.
+
+        Args:
+            device: an id, or ``*``.
+            timeout: seconds without an event after which the iteration ends; None waits for ever.
+            ready: set once events are heard.
+        """
+        arrived: queue.Queue[Event] = queue.Queue(EVENTS_MAX)
+        with self.subscription(device, lambda event: _push(arrived, event)):
+            if ready is not None:
+                ready.set()
+            while True:
+                try:
+                    yield arrived.get(timeout=timeout)
+                except queue.Empty:
+                    return
+
+    def subscription(self, device: str, callback: Callable[[Event], None]) -> Subscription:
+        """Tell ``callback`` of every event until the subscription is closed. It runs on the client's own thread:
+        it must return at once and may not raise."""
+        who = device if device == "*" else device_id("device", device)
+
+        async def arrived(data: bytes, subject: str, reply: str | None) -> None:
+            event = _event(data, subject)
+            if event is not None:
+                callback(event)
+
+        return Subscription(self, self._wait(self._subscribe(f"{who}.event.*", arrived), 5.0))
+
+    def stop(self, device: str, timeout: float = 5.0) -> Envelope:
+        """Stop a device: ``stop``, or ``stopMotion`` where it has that. Its own envelope, an error when unanswered.
+
+        ``stopped`` is true only for an affirmative answer.
+        """
+        return self._wait(self._stop(device, timeout), 2 * timeout + 4.0)
+
+    def stop_all(self, timeout: float = 5.0) -> dict[str, Envelope]:
+        """Stop every device that can be seen, all at once; what each answered, by id."""
+        peers = [peer.id for peer in self.peers() if _stop_verb(peer)]
+
+        async def all_of_them() -> dict[str, Envelope]:
+            answers = await asyncio.gather(*(self._stop(peer, timeout) for peer in peers))
+            return dict(zip(peers, answers, strict=True))
+
+        return self._wait(all_of_them(), 2 * timeout + 4.0)
+
+    def run(self, work: Coroutine[Any, Any, T], within: float) -> T:
+        """Run a coroutine on the client's loop and wait for it."""
+        return self._wait(work, within)
+
+    def _wait(self, work: Coroutine[Any, Any, T], within: float) -> T:
+        done: Future[T] = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return done.result(within)
+        except BaseException:
+            done.cancel()
+            raise
+
+    def _subject(self, rest: str) -> str:
+        return f"device-connect.{self.link.tenant}.{rest}"
+
+    async def _subscribe(self, rest: str, callback: Callable[[bytes, str, str | None], Any]) -> Any:
+        return await self._messaging.subscribe_with_subject(self._subject(rest), callback, subscribe_only=True)
+
+    async def _on_presence(self, data: bytes, subject: str, reply: str | None) -> None:
+        try:
+            said = json.loads(data)
+        except ValueError:
+            return
+        # The topic is what access rules guard, so it outranks what the message calls itself.
+        name = _parts(subject)[2]
+        if not isinstance(said, Mapping) or said.get("device_id") != name:
+            return
+        if said.get("departing"):
+            self._seen.pop(name, None)
+        else:
+            self._seen[name] = Peer.of(said)
+
+    async def _probe(self) -> None:
+        await self._messaging.publish(self._subject("discovery.probe"), b'{"probe": true}')
+
+    async def _collect(self, within: float) -> list[Peer]:
+        loop = asyncio.get_running_loop()
+        self._seen.clear()
+        began = changed = loop.time()
+        count = 0
+        while loop.time() < began + within:
+            await self._probe()
+            await asyncio.sleep(min(PROBE_EVERY_S, within))
+            if len(self._seen) != count:
+                count, changed = len(self._seen), loop.time()
+            elif count and loop.time() - changed >= SETTLED_S:
+                break
+        return [self._seen[name] for name in sorted(self._seen)]
+
+    async def _call(self, device: str, function: str, params: dict[str, Any], within: float) -> Envelope:
+        who, verb = device_id("device", device), text("function", function, longest=100)
+        request = {
+            "jsonrpc": "2.0",
+            "id": uuid.uuid4().hex,
+            "method": verb,
+            "params": {**params, "_dc_meta": {"source_device": self.source, "source_type": "client"}},
+        }
+        encoded = json.dumps(request, allow_nan=False).encode()
+        try:
+            data = await self._messaging.request(self._subject(f"{who}.cmd"), encoded, timeout=within)
+        except MessagingError as exc:
+            raise await self._why(who, within, exc) from exc
+        return _answer(who, verb, data)
+
+    async def _why(self, device: str, within: float, exc: Exception) -> Exception:
+        """What an unanswered call means: nobody there, somebody who does not answer, or a network that fails."""
+        if not self._messaging.is_connected:
+            return exc
+        if any(peer.id == device for peer in await self._collect(1.0)):
+            return NoAnswerError(f"{device} is announced and did not answer within {within:g} s ({exc}).")
+        return NoSuchDeviceError(f"No device {device!r} in tenant {self.link.tenant!r}.")
+
+    async def _stop(self, device: str, within: float) -> Envelope:
+        try:
+            answer = await self._call(device, "stop", {}, within)
+        except CallRefusedError as exc:
+            if exc.code != -32601:
+                return error(str(exc), stopped=None)
+            try:
+                answer = await self._call(device, "stopMotion", {}, within)
+            except (LookupError, TimeoutError, RuntimeError, MessagingError) as other:
+                return error(str(other), stopped=None)
+        except (LookupError, TimeoutError, MessagingError) as exc:
+            return error(str(exc), stopped=None)
+        if grade(answer) is Outcome.STOPPED:
+            return answer
+        return answer if answer.get("status") == "error" else error(explain(answer), stopped=None, answer=answer)
+
+
+class Subscription:
+    """Events of a device, until closed; a context manager."""
+
+    def __init__(self, client: FleetClient, handle: Any) -> None:
+        self._client, self._handle = client, handle
+
+    def close(self) -> None:
+        """Hear no more."""
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            self._client.run(handle.unsubscribe(), 5.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _object(presence: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = presence.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _stop_verb(peer: Peer) -> str | None:
+    names = {str(each.get("name", "")) for each in peer.functions}
+    return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
+
+
+def _parts(subject: str) -> list[str]:
+    found = subject.split("/" if "/" in subject else ".")
+    return found if len(found) > 3 else ["", "", "", ""]
+
+
+def _event(data: bytes, subject: str) -> Event | None:
+    parts = _parts(subject)
+    try:
+        said = json.loads(data)
+    except ValueError:
+        return None
+    payload = said.get("params") if isinstance(said, Mapping) else None
+    return Event(parts[2], parts[-1], payload if isinstance(payload, Mapping) else {})
+
+
+def _push(arrived: queue.Queue[Event], event: Event) -> None:
+    while True:
+        try:
+            arrived.put_nowait(event)
+        except queue.Full:
+            arrived.get_nowait()
+        else:
+            return
+
+
+def _answer(device: str, function: str, data: bytes) -> Envelope:
+    try:
+        said = json.loads(data)
+    except ValueError:
+        said = None
+    if not isinstance(said, Mapping):
+        raise CallRefusedError(f"{device} answered {function} with {shown(data)}, which is no JSON-RPC.")
+    problem = said.get("error")
+    if problem is not None:
+        told = problem if isinstance(problem, Mapping) else {"message": problem}
+        code = told.get("code")
+        raise CallRefusedError(str(told.get("message", "")), code if isinstance(code, int) else 0)
+    result = said.get("result")
+    return dict(result) if isinstance(result, Mapping) else {"result": result}

@@ -1,0 +1,10 @@
+"""Deadlines of the bring-up, in seconds."""
+
+BRINGUP_TIMEOUT_S = 20.0
+"""In which a device has to be callable and announced; a broker that is starting has time to come up."""
+
+LOOP_JOIN_TIMEOUT_S = 5.0
+"""For which a failed or stopped bring-up waits for its thread to end."""
+
+PROBE_TIMEOUT_S = 1.0
+"""In which a device that already has the wanted id has to answer."""

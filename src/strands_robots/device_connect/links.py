@@ -1,0 +1,94 @@
+"""Which link a device gets, and whether it may be used without anybody proving who he is."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from strands_robots import settings
+from strands_robots.device_connect.backends import LinkConfig, link_from_environment
+from strands_robots.device_connect.backends.config import endpoints
+from strands_robots.utils import ValidationError, choice, device_id, shown, text
+
+logger = logging.getLogger(__name__)
+
+
+def link_for(
+    messaging_url: str | None, messaging_backend: str | None, tenant: str, link: LinkConfig | None
+) -> LinkConfig:
+    """The link that the arguments of ``init_device_connect`` describe.
+
+    Raises:
+        ValidationError: an argument out of its domain, or a ``link`` beside a URL or a backend.
+    """
+    device_id("tenant", tenant)
+    if messaging_backend is not None:
+        choice("messaging_backend", messaging_backend, ("zenoh", "nats"))
+    if link is not None:
+        if messaging_url is not None or messaging_backend is not None:
+            raise ValidationError("link says everything; give no messaging_url and no messaging_backend beside it.")
+        return link if tenant in ("default", link.tenant) else replace(link, tenant=tenant)
+    if messaging_url is None:
+        found = link_from_environment(tenant, messaging_backend)
+        if found.transport == "nats" and not found.connect:
+            raise ValidationError("nats needs a server: give messaging_url or set NATS_URL.")
+        return found
+    url = text("messaging_url", messaging_url, longest=500)
+    transport = messaging_backend or transport_of(url)
+    base = link_from_environment(tenant, transport)
+    return replace(base, connect=endpoints([url]) if transport == "zenoh" else (url,), listen=(), multicast=None)
+
+
+def transport_of(url: str) -> str:
+    """The transport that a URL names: ``nats://`` and ``tls://`` are NATS, ``tcp/``, ``tls/`` and ``zenoh://`` Zenoh.
+
+    Raises:
+        ValidationError: none of these.
+    """
+    word = url.lower()
+    if word.startswith(("nats://", "tls://")):
+        return "nats"
+    if word.startswith(("zenoh://", "zenoh+tls://", "tcp/", "tls/", "udp/", "quic/")):
+        return "zenoh"
+    raise ValidationError(
+        f"messaging_url must be nats://host:port, tls://host:port or tcp/host:port, not {shown(url)}."
+    )
+
+
+def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bool) -> bool:
+    """Whether the device runs on a link without authentication; a warning is logged whenever it does.
+
+    Args:
+        allow_insecure: the caller's word; None leaves it to ``DEVICE_CONNECT_ALLOW_INSECURE``.
+        stated: the caller gave this link himself; where it stays on this machine, that counts as the opt-in.
+
+    Raises:
+        ValidationError: ``allow_insecure`` is no boolean, or nobody opted in.
+    """
+    if allow_insecure is not None and not isinstance(allow_insecure, bool):
+        raise ValidationError(
+            f"allow_insecure must be True, False or None, not {shown(allow_insecure)}; "
+            "spellings belong to DEVICE_CONNECT_ALLOW_INSECURE."
+        )
+    if link.authenticated:
+        return False
+    opted_in = settings.boolean("DEVICE_CONNECT_ALLOW_INSECURE") if allow_insecure is None else allow_insecure
+    if opted_in:
+        logger.warning(
+            "INSECURE TRANSPORT: nobody proves who he is and nothing is encrypted. Whoever reaches %s can drive and "
+            "read this robot. Not for production.",
+            ", ".join(link.connect) or ("the local network" if link.uses_multicast else "this machine"),
+        )
+        return True
+    if allow_insecure is None and stated and link.loopback_only:
+        logger.warning(
+            "No authentication on 127.0.0.1: every program on this machine can drive and read this robot, "
+            "nobody outside it can."
+        )
+        return True
+    raise ValidationError(
+        "This transport is not authenticated: either opt in with allow_insecure=True "
+        "(or DEVICE_CONNECT_ALLOW_INSECURE=true), or give certificates (MESSAGING_TLS_CA_FILE, "
+        "MESSAGING_TLS_CERT_FILE, MESSAGING_TLS_KEY_FILE) or credentials (MESSAGING_CREDENTIALS_FILE).",
+        "INSECURE_TRANSPORT",
+    )

@@ -1,0 +1,197 @@
+"""A robot with one body as a device: ``execute``, ``stop`` and reads, and the events of its tasks."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from device_connect_edge.types import DeviceIdentity
+
+from strands_robots.contract import RolloutEvent, adapt
+from strands_robots.device_connect.base_driver import Activity, Call, RobotDriver
+from strands_robots.device_connect.declare import Labels, emit, on, rpc
+from strands_robots.device_connect.wire import numbers, record
+from strands_robots.safety.approval import Approval
+from strands_robots.safety.authorization import Authorization
+from strands_robots.utils import ValidationError, identifier, number, text, whole
+
+DURATION_MAX_S = 3600.0
+"""Longest task in seconds, the bound of both networks."""
+
+RUNNING = frozenset({"running", "starting", "connecting"})
+"""Task states in which a robot may move."""
+
+
+def task_arguments(
+    authorization: Authorization, instruction: object, policy_provider: object, duration: object
+) -> tuple[str, str, float]:
+    """The checked arguments of ``execute``. Raises :class:`ValidationError` naming the first that is out of domain."""
+    checked = text("instruction", instruction), identifier("policy_provider", policy_provider)
+    seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
+    refusal = authorization.provider(checked[1])
+    if refusal is not None:
+        raise ValidationError(refusal, "POLICY_TYPE_NOT_ALLOWED")
+    return (*checked, seconds)
+
+
+class RobotDeviceDriver(RobotDriver):
+    """A robot arm or vehicle that runs tasks by instruction. Start one with execute, end it with stop.
+
+    Args:
+        robot: a :class:`~strands_robots.contract.TaskRobot`, or any object that ``contract.adapt`` makes one.
+    """
+
+    device_type = "strands_robot"
+    labels: ClassVar[Labels] = {"category": "robot"}
+
+    def __init__(
+        self,
+        robot: Any,
+        *,
+        hardware: bool = True,
+        authorization: Authorization | None = None,
+        approval: Approval | None = None,
+    ) -> None:
+        task_robot = adapt(robot)
+        super().__init__(task_robot, hardware=hardware, authorization=authorization, approval=approval)
+        self.task_robot = task_robot
+        self._model = task_robot.tool_name_str
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Who this device is; ``model`` is the robot's own name."""
+        return DeviceIdentity(
+            device_type=self.device_type,
+            manufacturer="strands-robots",
+            model=self._model,
+            description=f"Robot {self._model}",
+        )
+
+    @rpc(labels={"direction": "write", "safety": "critical"})
+    async def execute(
+        self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
+    ) -> dict[str, Any]:
+        """Start a task on the robot and return at once; follow it with getStatus or the taskComplete event.
+
+        Args:
+            instruction: What to do, in plain language, 1 to 2000 characters
+            policy_provider: Policy that decides the actions, such as mock, remote or lerobot_local
+            duration: Longest time the task may take, in seconds, above 0 and at most 3600
+            policy_port: TCP port of the policy's server, 1 to 65535; 0 for the provider's own
+        """
+
+        def prepare() -> Call:
+            what, provider, seconds = task_arguments(self.authorization, instruction, policy_provider, duration)
+            port = whole("policy_port", policy_port, low=0, high=65535)
+            return lambda: self.task_robot.start_task(
+                what, policy_provider=provider, duration=seconds, policy_port=port
+            )
+
+        return await self.move("execute", prepare)
+
+    @rpc(labels={"direction": "write", "safety": "critical"})
+    async def stop(self) -> dict[str, Any]:
+        """Stop everything that moves the robot now; the answer says whether it stopped."""
+        return await self.halted(lambda: self.halt("stop").envelope())
+
+    @rpc(labels={"direction": "read"})
+    async def getStatus(self) -> dict[str, Any]:
+        """What the robot is doing: task state, instruction and steps so far."""
+        return await self.read("getStatus", self.task_robot.get_task_status)
+
+    @rpc(labels={"direction": "read"})
+    async def getFeatures(self) -> dict[str, Any]:
+        """What the robot senses and what it can be told: its observation and action features."""
+        return await self.read("getFeatures", self.task_robot.get_features)
+
+    @rpc(labels={"direction": "read"})
+    async def getState(self) -> dict[str, Any]:
+        """Joint positions by name, in the robot's own units, and the task."""
+        return await self.read("getState", self.task_robot.get_state)
+
+    @emit()
+    async def taskStarted(self, instruction: str, policy_provider: str) -> None:
+        """A task began.
+
+        Args:
+            instruction: What the robot was told
+            policy_provider: Policy that decides the actions
+        """
+
+    @emit()
+    async def taskComplete(
+        self, instruction: str, steps: int, duration: float, state: str = "completed", error: str = ""
+    ) -> None:
+        """A task ended.
+
+        Args:
+            instruction: What the robot was told
+            steps: Steps executed
+            duration: Seconds from its start to its end
+            state: How it ended: completed, stopped or error
+            error: What went wrong, when state is error
+        """
+
+    @emit(labels={"modality": "motion"})
+    async def streamStep(self, step: int, observation: dict[str, Any], action: dict[str, Any]) -> None:
+        """One step of the running task.
+
+        Args:
+            step: Number of the step
+            observation: Joint positions by name, numbers only
+            action: What the policy told the joints, by name
+        """
+
+    @emit()
+    async def stateUpdate(self, task_status: str = "", instruction: str = "", step_count: int = 0) -> None:
+        """What the robot is doing, told at a steady rate.
+
+        Args:
+            task_status: State of the current or last task
+            instruction: What the robot was told
+            step_count: Steps so far
+        """
+
+    @emit(labels={"safety": "critical"})
+    async def emergencyStop(self, reason: str = "") -> None:
+        """This device calls for an emergency stop.
+
+        Args:
+            reason: Why
+        """
+
+    @on(event_name="emergencyStop")
+    async def onEmergencyStop(self, device_id: str, event_name: str, payload: dict[str, Any]) -> None:
+        """Halt on the emergency stop of an allowed source."""
+        await self.on_estop(device_id, payload)
+
+    def look(self) -> Activity:
+        """The task's state."""
+        facts = record(self.task_robot.get_task_status())
+        state = str(facts.get("task_status", "")).lower()
+        told = {
+            "task_status": state,
+            "instruction": str(facts.get("instruction", "")),
+            "step_count": int(numbers(facts).get("step_count", 0)),
+        }
+        return Activity(state in RUNNING, told)
+
+    async def tell(self, activity: Activity) -> None:
+        """Emit ``stateUpdate``."""
+        await self.stateUpdate(**activity.facts)
+
+    async def tell_rollout(self, event: RolloutEvent) -> None:
+        """Emit ``taskStarted``, ``streamStep`` or ``taskComplete``."""
+        if event.kind == "started":
+            await self.taskStarted(instruction=event.instruction, policy_provider=event.policy)
+        elif event.kind == "step":
+            await self.streamStep(step=event.step, observation=numbers(event.observation), action=numbers(event.action))
+        else:
+            await self.taskComplete(
+                instruction=event.instruction,
+                steps=event.step,
+                duration=event.elapsed_s,
+                state=event.state,
+                error=event.error,
+            )
+        if event.kind != "step":
+            self.changed.set()

@@ -1,0 +1,111 @@
+"""From the robot's control thread and its state to the device's events, each at its own rate."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+
+from strands_robots.contract import RolloutEvent
+
+logger = logging.getLogger(__name__)
+
+PENDING_MAX = 2000
+"""Steps that may wait for the event loop (40 s of one robot at 50 Hz); starts and ends always wait."""
+
+BURST = 5.0
+"""Steps that may follow one another at once after a pause, so that jitter of a steady loop loses none."""
+
+
+class Throttle:
+    """At most ``hz`` passes a second for each key, with bursts of :data:`BURST` after a pause."""
+
+    def __init__(self, hz: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._hz = hz
+        self._clock = clock
+        self._tokens: dict[str, tuple[float, float]] = {}
+
+    def passes(self, key: str) -> bool:
+        """True when one more may pass now."""
+        now = self._clock()
+        tokens, since = self._tokens.get(key, (BURST, now))
+        tokens = min(BURST, tokens + (now - since) * self._hz)
+        passing = tokens >= 1.0
+        self._tokens[key] = (tokens - 1.0 if passing else tokens, now)
+        return passing
+
+    def forget(self, key: str) -> None:
+        """Drop what is known of ``key``."""
+        self._tokens.pop(key, None)
+
+
+class RolloutPump:
+    """Carries rollout events from control threads to one coroutine on the loop, in order.
+
+    Args:
+        deliver: awaited once for each event.
+        stream_hz: steps of one robot that pass in a second; starts and ends all pass.
+    """
+
+    def __init__(self, deliver: Callable[[RolloutEvent], Awaitable[None]], stream_hz: float) -> None:
+        self._deliver = deliver
+        self._throttle = Throttle(stream_hz)
+        self._waiting: deque[RolloutEvent] = deque()
+        self._lock = threading.Lock()
+        self._loop = asyncio.get_running_loop()
+        self._some = asyncio.Event()
+        self._dropped = 0
+
+    def observe(self, event: RolloutEvent) -> None:
+        """The observer that a robot calls from its control thread: returns at once and never raises."""
+        with self._lock:
+            if event.kind == "step":
+                if not self._throttle.passes(event.robot):
+                    return
+                if len(self._waiting) >= PENDING_MAX:
+                    self._dropped += 1
+                    return
+            elif event.kind == "finished":
+                self._throttle.forget(event.robot)
+            self._waiting.append(event)
+        with contextlib.suppress(RuntimeError):  # the loop closed before the robot noticed
+            self._loop.call_soon_threadsafe(self._some.set)
+
+    async def run(self) -> None:
+        """Deliver until cancelled."""
+        while True:
+            await self._some.wait()
+            self._some.clear()
+            while self._waiting:
+                with self._lock:
+                    event = self._waiting.popleft()
+                    dropped, self._dropped = self._dropped, 0
+                if dropped:
+                    logger.warning("%d streamStep events were dropped: the event loop is behind.", dropped)
+                await self._deliver(event)
+
+
+async def paced(hz: Callable[[], float], act: Callable[[], Awaitable[None]], wake: asyncio.Event | None = None) -> None:
+    """Await ``act`` at ``hz()`` times a second until cancelled, and at once when ``wake`` is set.
+
+    The beat is kept: what comes late is followed on time, and missed beats are left out, never made up for.
+    """
+    loop = asyncio.get_running_loop()
+    due = loop.time()
+    while True:
+        await act()
+        now = loop.time()
+        due = max(due + 1.0 / hz(), now)
+        if wake is None:
+            await asyncio.sleep(due - now)
+            continue
+        try:
+            await asyncio.wait_for(wake.wait(), due - now)
+        except TimeoutError:
+            continue
+        wake.clear()
+        due = loop.time()
