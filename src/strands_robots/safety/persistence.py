@@ -1,0 +1,164 @@
+"""Lockouts on disk: one small file for all robots of this machine, so that a restart unlocks nothing.
+
+A robot is kept under a key that outlives the process (see :func:`hardware_key`); a robot without one, an unnamed
+simulation, is not kept. Whoever cannot tell what the file says locks: a robot whose record is unreadable comes up
+under the overflow epoch, which an operator at the machine clears.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from strands_robots.safety.approval import state_dir
+from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Hold, LockoutState
+from strands_robots.safety.resume import is_epoch
+
+logger = logging.getLogger(__name__)
+
+VERSION = 1
+LOCK_WAIT_S = 0.5
+FILE_MAX_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What a robot comes up with: its holds, and the ids of stops that it has seen."""
+
+    state: LockoutState = field(default_factory=LockoutState)
+    seen: tuple[str, ...] = ()
+
+
+def hardware_key(kind: str, stable_id: str) -> str:
+    """The key of real hardware: its kind beside a serial port id, a host, a calibration id or an id on disk."""
+    return f"hardware:{kind}:{stable_id}"
+
+
+def simulation_key(peer_id: str) -> str:
+    """The key of a simulation that was given a peer id."""
+    return f"simulation:{peer_id}"
+
+
+class LockoutStore:
+    """The file ``lockouts.json`` in ``directory`` (default: the state directory, asked at each use)."""
+
+    def __init__(self, directory: Path | None = None) -> None:
+        self._directory = directory
+
+    @property
+    def path(self) -> Path:
+        """Where the lockouts are."""
+        return (self._directory or state_dir()) / "lockouts.json"
+
+    def load(self, key: str) -> Kept:
+        """What was kept under ``key``; nothing when there is no record, locked when it cannot be read."""
+        try:
+            record = self._read().get(key)
+            return Kept() if record is None else _kept(record)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as exc:
+            logger.critical("%s cannot be read (%s): %s comes up locked.", self.path, exc, key)
+            hold = Hold(OVERFLOW, "this machine", "the lockout file is unreadable", time.time())
+            return Kept(LockoutState(overflow=hold))
+
+    def load_all(self) -> dict[str, Kept]:
+        """Every record, by key.
+
+        Raises:
+            OSError, ValueError: the file cannot be read or is no record of lockouts.
+        """
+        try:
+            return {key: _kept(record) for key, record in self._read().items()}
+        except (KeyError, TypeError, AttributeError) as exc:
+            raise ValueError(f"{self.path} holds no record of lockouts: {exc!r}") from exc
+
+    def save(self, kept: Mapping[str, Kept]) -> None:
+        """Put these records on the disk beside those of other processes; returns when they are there.
+
+        Raises:
+            OSError: not written; TimeoutError (one of its kinds) when another process holds the file.
+        """
+        path = self.path
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with _locked(path.with_name("lockouts.lock")):
+            try:
+                records = self._read()
+            except ValueError:
+                # What is unreadable is kept aside for a person; robots that rely on it are locked in memory.
+                path.replace(path.with_suffix(".unreadable"))
+                records = {}
+            records.update({key: _record(each) for key, each in kept.items()})
+            _replace(path, {"v": VERSION, "robots": records})
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return {}
+        with os.fdopen(descriptor, "rb") as file:
+            data = json.loads(file.read(FILE_MAX_BYTES))
+        if not isinstance(data, dict) or data.get("v") != VERSION or not isinstance(data.get("robots"), dict):
+            raise ValueError("not a record of lockouts")
+        robots: dict[str, Any] = data["robots"]
+        return robots
+
+
+def _record(kept: Kept) -> dict[str, Any]:
+    overflow = asdict(kept.state.overflow) if kept.state.overflow else None
+    return {"holds": [asdict(hold) for hold in kept.state.holds], "overflow": overflow, "seen": list(kept.seen)}
+
+
+def _kept(record: Mapping[str, Any]) -> Kept:
+    holds = tuple(_hold(each) for each in record["holds"])
+    overflow = _hold(record["overflow"]) if record["overflow"] is not None else None
+    if len(holds) > MAX_EPOCHS or len({hold.epoch for hold in holds}) != len(holds):
+        raise ValueError("more epochs than a robot holds, or one of them twice")
+    seen = tuple(each for each in record["seen"] if is_epoch(each))
+    return Kept(LockoutState(holds, overflow), seen)
+
+
+def _hold(data: Mapping[str, Any]) -> Hold:
+    hold = Hold(data["epoch"], data["source"], data["reason"], float(data["at"]))
+    if not all(isinstance(part, str) for part in (hold.epoch, hold.source, hold.reason)):
+        raise ValueError("a hold whose fields are not text")
+    return hold
+
+
+def _replace(path: Path, data: dict[str, Any]) -> None:
+    draft = path.with_suffix(".draft")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+    with os.fdopen(os.open(draft, flags, 0o600), "wb") as file:
+        file.write(json.dumps(data, separators=(",", ":")).encode())
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)
+    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        deadline = time.monotonic() + LOCK_WAIT_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= deadline:
+                    raise TimeoutError(f"{path} is held by another process") from None
+                time.sleep(0.005)
+        yield
+    finally:
+        os.close(descriptor)
