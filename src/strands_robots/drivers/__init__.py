@@ -1,0 +1,1 @@
+"""Native drivers: robots that are reached without LeRobot."""

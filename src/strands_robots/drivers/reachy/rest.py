@@ -1,0 +1,221 @@
+"""The daemon's REST interface: one client, exact errors, short time limits.
+
+Importable with the standard library alone; ``httpx`` is loaded by the first request. The daemon has no
+authentication: whoever reaches its port is master of the motors.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import socket
+import threading
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.utils import ValidationError, choice, dial_host_error, missing_extra, number, port, shown
+
+if TYPE_CHECKING:
+    import httpx
+
+CONNECT_S = 2.0
+READ_S = 5.0
+METHODS = ("GET", "POST", "PUT", "DELETE")
+
+
+class DaemonError(RuntimeError):
+    """A request that did not do what it asked. ``status`` is the HTTP status, 0 when there was no answer."""
+
+    def __init__(self, message: str, status: int = 0) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class DaemonUnreachable(DaemonError):  # noqa: N818 - the name says the state
+    """No connection, no answer in time, or a connection lost."""
+
+
+class DaemonRefused(DaemonError):  # noqa: N818
+    """400, 403, 405 or 422: the request itself is not accepted."""
+
+
+class DaemonUnknown(DaemonError):  # noqa: N818
+    """404: no such path, move or data set."""
+
+
+class DaemonBusy(DaemonError):  # noqa: N818
+    """409: the daemon does something else, or cannot do this on this robot."""
+
+
+class DaemonFault(DaemonError):  # noqa: N818
+    """500 and the like: the request failed inside the daemon, which says no more."""
+
+
+class BackendDown(DaemonError):  # noqa: N818
+    """503: the daemon answers but drives no robot; it is stopped, failed or not started."""
+
+
+_KINDS: dict[int, type[DaemonError]] = {
+    400: DaemonRefused,
+    403: DaemonRefused,
+    404: DaemonUnknown,
+    405: DaemonRefused,
+    409: DaemonBusy,
+    422: DaemonRefused,
+    503: BackendDown,
+}
+
+
+def checked_host(value: object) -> str:
+    """A bare hostname or IP literal. Raises :class:`ValidationError`."""
+    reason = dial_host_error(value)
+    if reason is not None:
+        raise ValidationError(reason)
+    return str(value)
+
+
+def dialled(host: str) -> str:
+    """The name to put in a URL: since 1.12 the daemon answers only to IPs, localhost and ``*.local``.
+
+    Any other name is resolved here, so that the Host header is an IP. Raises :class:`DaemonUnreachable`.
+    """
+    bare = host.strip("[]")
+    try:
+        literal = ipaddress.ip_address(bare)
+    except ValueError:
+        if bare == "localhost" or bare.rstrip(".").endswith(".local"):
+            return bare
+        try:
+            found = socket.getaddrinfo(bare, None, type=socket.SOCK_STREAM)
+        except OSError as exc:
+            raise DaemonUnreachable(f"{host} has no address: {exc}.") from exc
+        literal = ipaddress.ip_address(found[0][4][0])
+    return f"[{literal}]" if literal.version == 6 else str(literal)
+
+
+class RestClient:
+    """Requests to one daemon over kept-alive connections. Thread-safe.
+
+    Args:
+        host: bare hostname or IP literal.
+        api_port: TCP port of the daemon.
+        read_s: seconds to wait for an answer.
+
+    Raises:
+        ValidationError: a host or port that cannot be dialled.
+    """
+
+    def __init__(self, host: str, api_port: int = 8000, *, read_s: float = READ_S) -> None:
+        self.host = checked_host(host)
+        self.port = port("api_port", api_port)
+        self._read_s = read_s
+        self._lock = threading.Lock()
+        self._client: httpx.Client | None = None
+
+    def get(self, path: str, within_s: float | None = None) -> Any:
+        """The decoded body of a GET. Raises :class:`DaemonError`."""
+        return self.request("GET", path, within_s=within_s)
+
+    def post(self, path: str, body: dict[str, Any] | None = None, within_s: float | None = None) -> Any:
+        """The decoded body of a POST. Raises :class:`DaemonError`."""
+        return self.request("POST", path, body, within_s=within_s)
+
+    def request(self, method: str, path: str, body: Any = None, *, within_s: float | None = None) -> Any:
+        """One request and its decoded JSON; ``within_s`` replaces the client's time limits.
+
+        Raises:
+            DaemonError: by kind: unreachable, refused, unknown, busy, backend down, fault.
+        """
+        httpx = _httpx()
+        client = self._open()
+        try:
+            limit = client.timeout if within_s is None else max(0.01, within_s)
+            answer = client.request(method, path, json=body, timeout=limit)
+        except (httpx.HTTPError, httpx.InvalidURL, OSError) as exc:
+            self.close()
+            what = str(exc) or type(exc).__name__
+            raise DaemonUnreachable(f"{self.host}:{self.port} did not answer {method} {path}: {what}.") from exc
+        if answer.status_code >= 500:
+            # After a 500 the daemon resets the kept-alive connection under the next request.
+            self.close(client)
+        if not answer.is_success:
+            kind = _KINDS.get(answer.status_code, DaemonFault)
+            raise kind(f"{method} {path}: {_detail(answer)}", answer.status_code)
+        try:
+            return answer.json()
+        except ValueError as exc:
+            raise DaemonFault(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
+
+    def close(self, client: httpx.Client | None = None) -> None:
+        """Drop the connections; the next request opens new ones. With ``client`` only if that one is still in use."""
+        with self._lock:
+            if client is not None and client is not self._client:
+                return
+            current, self._client = self._client, None
+        if current is not None:
+            current.close()
+
+    def _open(self) -> httpx.Client:
+        with self._lock:
+            if self._client is None:
+                httpx = _httpx()
+                self._client = httpx.Client(
+                    base_url=f"http://{dialled(self.host)}:{self.port}",
+                    timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
+                    # A robot is on the local network: a proxy of the environment is not asked.
+                    trust_env=False,
+                )
+            return self._client
+
+
+def api(  # noqa: PLR0917 - the documented order
+    host: str, api_port: int, path: str, method: str = "GET", data: Any = None, timeout: float = READ_S
+) -> Any:
+    """One request over a connection of its own; never raises for what happens on the wire.
+
+    Args:
+        host: bare hostname or IP literal of the daemon.
+        api_port: its TCP port, 8000 by default on a robot.
+        path: with its query, such as ``/api/daemon/status``.
+        method: GET, POST, PUT or DELETE.
+        data: sent as JSON where it is not None.
+        timeout: seconds to wait for an answer.
+
+    Returns:
+        The decoded JSON body, or ``{"error": sentence, "status_code": status}`` for a bad argument, an HTTP error, a
+        lost connection (status 0) or a missing extra.
+    """
+    client = None
+    try:
+        client = RestClient(host, api_port, read_s=number("timeout", timeout, above=0, high=600))
+        return client.request(choice("method", method, METHODS), _path(path), data)
+    except (ValidationError, DaemonError, ImportError, TypeError, ValueError) as exc:
+        return {"error": str(exc), "status_code": exc.status if isinstance(exc, DaemonError) else 0}
+    finally:
+        if client is not None:
+            client.close()
+
+
+def _path(path: object) -> str:
+    if not isinstance(path, str) or not path.startswith("/") or not path.isascii() or not path.isprintable():
+        raise ValidationError(f"path must be printable ASCII and start with '/', not {shown(path)}.")
+    return path
+
+
+def _httpx() -> Any:
+    try:
+        import httpx  # noqa: PLC0415 - optional, loaded by the first request
+    except ImportError as exc:
+        raise missing_extra("Reachy Mini", "reachy") from exc
+    return httpx
+
+
+def _detail(answer: httpx.Response) -> str:
+    """The daemon's own words: ``detail`` as text, the first of a validation list, or the bare body."""
+    try:
+        detail = json.loads(answer.text).get("detail")
+    except (ValueError, AttributeError):
+        detail = answer.text
+    if isinstance(detail, list) and detail and isinstance(detail[0], dict):
+        where = ".".join(str(part) for part in detail[0].get("loc", ()))
+        detail = f"{where}: {detail[0].get('msg', '')}"
+    return f"{answer.status_code} {detail if isinstance(detail, str) else shown(detail)}"
