@@ -22,8 +22,12 @@ QUEUED_BATCHES = 16
 # What a receiver puts together from fragments at most, in bytes; Zenoh's own default is 1 GiB.
 MAX_MESSAGE_BYTES = 64 * 2**20
 
-# Zenoh waits this long for room before it drops a message, in microseconds; the caller is an event loop.
-WAIT_BEFORE_DROP_US = 50
+# What Zenoh does when a peer does not read, in microseconds. An event is dropped after a wait that an event loop can
+# bear, one of many fragments, which goes out on a thread, after a longer one. Calls and replies are not dropped: they
+# have a queue of their own, which only a peer that stopped reading ever fills, and such a peer loses its link.
+WAIT_BEFORE_DROP_US = 500
+WAIT_BEFORE_DROP_FRAGMENTS_US = 1_000_000
+WAIT_BEFORE_CLOSE_US = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +174,13 @@ class LinkConfig:
                     "tx": {
                         "queue": {
                             "size": {"data": QUEUED_BATCHES, "interactive_high": QUEUED_BATCHES},
-                            "congestion_control": {"drop": {"wait_before_drop": WAIT_BEFORE_DROP_US}},
+                            "congestion_control": {
+                                "drop": {
+                                    "wait_before_drop": WAIT_BEFORE_DROP_US,
+                                    "max_wait_before_drop_fragments": WAIT_BEFORE_DROP_FRAGMENTS_US,
+                                },
+                                "block": {"wait_before_close": WAIT_BEFORE_CLOSE_US},
+                            },
                         }
                     },
                     "rx": {"max_message_size": MAX_MESSAGE_BYTES},

@@ -35,20 +35,17 @@ from .zenoh_intake import Handle, Intake
 
 logger = logging.getLogger(__name__)
 
-LARGE_BYTES = 2**19
-"""From here on a message goes out on a thread, with patience: cut into many fragments it would hold up the loop."""
+LARGE_BYTES = 2**16
+"""From here on, which is more than one batch, a message goes out on a thread: it may wait for room."""
 
 REPLY_TTL_S = 60.0
 """Seconds a query outside a command waits for its reply before it is given up."""
 
 _REPLY = "_strands_reply/"
 
-_QUICK = {
-    "congestion_control": zenoh.CongestionControl.DROP,
-    "priority": zenoh.Priority.INTERACTIVE_HIGH,
-    "express": True,
-}
-_PATIENT = {"congestion_control": zenoh.CongestionControl.BLOCK}
+# A queue of its own beside telemetry. Not express: each express message takes a whole batch of that queue.
+_CALL = {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
+_EVENT = {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA}
 
 
 def key_of(subject: str) -> str:
@@ -122,9 +119,9 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
         shared = self._session()
         try:
             if len(data) < LARGE_BYTES:
-                shared.session.put(key_of(subject), data)
+                shared.session.put(key_of(subject), data, **_EVENT)
             else:
-                await on_a_thread(partial(shared.session.put, key_of(subject), data, **_PATIENT))
+                await on_a_thread(partial(shared.session.put, key_of(subject), data, **_EVENT))
         except zenoh.ZError as error:
             raise PublishError(f"cannot publish on {subject}: {error}") from error
 
@@ -226,7 +223,7 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
                 failure.append(reply.err.payload.to_bytes()[:200].decode(errors="replace"))
 
         token: Any = zenoh.CancellationToken()
-        options: dict[str, Any] = dict(_QUICK if len(data) < LARGE_BYTES else _PATIENT)
+        options: dict[str, Any] = dict(_CALL)
         if self._link.is_peer:
             options["target"] = zenoh.QueryTarget.ALL
         options["consolidation"] = zenoh.ConsolidationMode.NONE
@@ -324,7 +321,7 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
         if len(data) < LARGE_BYTES:
             answer_query(query, data)
         else:
-            await on_a_thread(partial(answer_query, query, data, _PATIENT))
+            await on_a_thread(partial(answer_query, query, data))
 
     def _on_link(self, linked: bool) -> None:
         self.hand_over(self._tell, linked)
@@ -338,10 +335,10 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             task.add_done_callback(self._tasks.discard)
 
 
-def answer_query(query: Any, data: bytes, options: dict[str, Any] | None = None) -> None:
+def answer_query(query: Any, data: bytes) -> None:
     """Reply and let go of the query, which tells the caller that no more comes."""
     with contextlib.suppress(zenoh.ZError):  # the caller's link is gone; nobody is left to tell
-        query.reply(query.key_expr, data, **(_QUICK if options is None else options))
+        query.reply(query.key_expr, data, **_CALL)
     query.drop()
 
 
