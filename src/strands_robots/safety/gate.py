@@ -29,20 +29,34 @@ class MotionRefused(RuntimeError):  # noqa: N818 - a refusal, not a fault
         self.envelope = envelope
 
 
-class Permit:
-    """Leave to move, until the next halt."""
+class PermitVoidError(RuntimeError):
+    """The permit was void when the write came: the motion was stopped in between, and nothing was written."""
 
-    __slots__ = ("_gate", "_generation", "verb")
+
+class Permit:
+    """Leave to move, until the next halt or until whoever started the motion withdraws it."""
+
+    __slots__ = ("_gate", "_generation", "_withdrawn", "verb")
 
     def __init__(self, gate: MotionGate, generation: int, verb: str) -> None:
         self._gate = gate
         self._generation = generation
+        self._withdrawn = False
         self.verb = verb
 
     @property
     def valid(self) -> bool:
-        """False for ever once the robot was halted or locked."""
-        return self._gate.generation == self._generation
+        """False for ever once the robot was halted or locked, or this permit withdrawn."""
+        return not (self._withdrawn or self.revoked)
+
+    @property
+    def revoked(self) -> bool:
+        """True for ever once the whole robot was halted or locked: whoever did that also freezes it."""
+        return self._gate.generation != self._generation
+
+    def withdraw(self) -> None:
+        """Void this permit alone: one motion stops, the robot stays free."""
+        self._withdrawn = True
 
 
 class MotionGate:
@@ -78,3 +92,7 @@ class MotionGate:
     def revoke(self) -> None:
         """Void every permit given so far."""
         self._generation = next(self._numbers)
+
+
+class CommandVoidError(RuntimeError):
+    """The permit was void when a write came: the robot was halted in between, and nothing was written."""

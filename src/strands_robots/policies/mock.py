@@ -1,0 +1,86 @@
+"""A policy without a mind: smooth motion inside the joint ranges, the same every time."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import random
+from collections.abc import Mapping
+from typing import Any
+
+from strands_robots.policies.actions import numbers
+from strands_robots.policies.base import Action, Ranges
+from strands_robots.utils import ValidationError, number, whole
+
+logger = logging.getLogger(__name__)
+
+
+class MockPolicy:
+    """Every joint follows a sum of two slow sines around the middle of its range, faded in from where it is.
+
+    Motion is a function of the seed, the instruction, the start position and the count of steps, so a run can be
+    repeated exactly. It begins at the present position with zero velocity and acceleration. A joint without a
+    finite range stays where it is.
+
+    Args:
+        seed: any integer; another seed or another instruction is another motion.
+        amplitude: part of each half range that is used, above 0 and at most 1.
+        hz: control rate the steps are counted in; the motion is that much slower when the loop is slower.
+        fade_s: seconds until the motion has left the start position for good.
+    """
+
+    uses_cameras = False
+
+    def __init__(self, seed: int = 0, amplitude: float = 0.5, hz: float = 50.0, fade_s: float = 2.0) -> None:
+        self._seed = whole("seed", seed)
+        self._amplitude = number("amplitude", amplitude, above=0, high=1)
+        self._dt = 1 / number("hz", hz, low=0.1, high=2000)
+        self._fade_s = number("fade_s", fade_s, above=0, high=60)
+        self._ranges: Ranges = {}
+        self._waves: dict[str, tuple[float, float, float, float]] = {}
+        self._start: dict[str, float] | None = None
+        self._step = 0
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        self._ranges = {k: (low, high) for k, (low, high) in ranges.items() if math.isfinite(high - low)}
+        still = [key for key in ranges if key not in self._ranges]
+        if not self._ranges:
+            raise ValidationError("the mock policy needs a robot with at least one action key of finite range.")
+        if still:
+            logger.info("The mock policy leaves %s where they are: they have no range.", ", ".join(still))
+        digest = hashlib.blake2b(f"{self._seed}|{instruction}".encode(), digest_size=8).digest()
+        dice = random.Random(int.from_bytes(digest))
+        self._waves = {
+            key: (dice.uniform(0.15, 0.3), dice.uniform(0, math.tau), dice.uniform(0.35, 0.6), dice.uniform(0, math.tau))
+            for key in sorted(self._ranges)
+        }
+        self._start = None
+        self._step = 0
+
+    def act(self, observation: Mapping[str, Any]) -> Action:
+        if self._start is None:
+            seen = numbers(observation)
+            self._start = {key: min(max(seen.get(key, (a + b) / 2), a), b) for key, (a, b) in self._ranges.items()}
+        seconds = self._step * self._dt
+        share = smooth_step(seconds / self._fade_s)
+        self._step += 1
+        return {
+            key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges
+        }
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+    def _wave(self, key: str, seconds: float) -> float:
+        low, high = self._ranges[key]
+        slow, slow_phase, fast, fast_phase = self._waves[key]
+        swing = 0.7 * math.sin(math.tau * slow * seconds + slow_phase)
+        swing += 0.3 * math.sin(math.tau * fast * seconds + fast_phase)
+        return (low + high) / 2 + self._amplitude * (high - low) / 2 * swing
+
+
+def smooth_step(part: float) -> float:
+    """0 before 0, 1 after 1, between them the quintic without a jump of velocity or acceleration."""
+    x = min(max(part, 0.0), 1.0)
+    return x * x * x * (x * (6 * x - 15) + 10)

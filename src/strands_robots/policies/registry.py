@@ -1,0 +1,79 @@
+"""Policies by name: ours, and what other packages register under the entry-point group."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from strands_robots.policies.base import Policy
+from strands_robots.utils import ValidationError, shown
+
+ENTRY_POINT_GROUP = "strands_robots.policies"
+"""Each entry is a callable that takes keyword options and returns a :class:`Policy`."""
+
+ALIASES = {"lerobot": "lerobot_local"}
+
+_OURS = {
+    "mock": ("strands_robots.policies.mock", "MockPolicy"),
+    "remote": ("strands_robots.policies.remote", "RemotePolicy"),
+    "lerobot_local": ("strands_robots.policies.lerobot_local", "LeRobotPolicy"),
+}
+
+
+def policy_names() -> tuple[str, ...]:
+    """Every provider that :func:`create_policy` knows by its own name: ours first, then the plug-ins'."""
+    return (*_OURS, *(name for name in sorted(_plug_ins()) if name not in _OURS))
+
+
+def resolve_provider(provider: object) -> str:
+    """The registered name behind ``provider``, its alias resolved.
+
+    Raises:
+        ValidationError: no such provider; the sentence names the near ones.
+    """
+    names = policy_names()
+    name = ALIASES.get(provider, provider) if isinstance(provider, str) else ""
+    if name in names:
+        return name
+    near = difflib.get_close_matches(str(name), names, n=3)
+    hint = f" Did you mean {' or '.join(near)}?" if near else ""
+    raise ValidationError(f"policy_provider must be one of {', '.join(names)}, not {shown(provider)}.{hint}")
+
+
+def create_policy(provider: str, **options: Any) -> Policy:
+    """A policy of ``provider``; cheap, because loading and connecting happen in its ``reset``.
+
+    An option left at its neutral value, such as ``policy_port=0``, is the provider's own default; the
+    port is offered only to providers that take one.
+
+    Raises:
+        ValidationError: no such provider, or an option outside its domain.
+        MissingExtraError: the provider needs an extra that is not installed.
+    """
+    name = resolve_provider(provider)
+    if not options.get("policy_port"):
+        options.pop("policy_port", None)
+    factory = _factory(name)
+    try:
+        policy = factory(**options)
+    except TypeError as exc:
+        raise ValidationError(f"policy_provider {name} cannot be made with {shown(sorted(options))}: {exc}.") from exc
+    if not isinstance(policy, Policy):
+        raise ValidationError(f"policy_provider {name} gave {shown(policy)}, which lacks reset, act or close.")
+    return policy
+
+
+def _factory(name: str) -> Callable[..., Any]:
+    if name in _OURS:
+        module, attribute = _OURS[name]
+        ours: Callable[..., Any] = getattr(import_module(module), attribute)
+        return ours
+    foreign: Callable[..., Any] = _plug_ins()[name].load()
+    return foreign
+
+
+def _plug_ins() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
