@@ -83,6 +83,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         self.alarms = Lane("emergency stop", STOPS_AT_ONCE)
         self.activity = Activity()
         self.changed = asyncio.Event()
+        self._rolling: set[str] = set()
         self._watchers: list[asyncio.Task[None]] = []
         self._unsubscribe: Unsubscribe | None = None
 
@@ -139,14 +140,15 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             return
         self.changed = asyncio.Event()
         self.activity = await self._looked()
-        pump = RolloutPump(self.tell_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
+        pump = RolloutPump(self._on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
         self._unsubscribe = self.robot.subscribe(pump.observe)
         self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
 
     def watches(self) -> list[Any]:
         """The coroutines that run while the device is connected."""
         idle, busy = settings.number("STRANDS_DC_STATE_HZ"), settings.number("STRANDS_DC_STATE_BUSY_HZ")
-        return [paced(lambda: busy if self.activity.busy else idle, self._tell_state, self.changed)]
+        # A robot may tell that a rollout began before its own status says so.
+        return [paced(lambda: busy if self.activity.busy or self._rolling else idle, self._tell_state, self.changed)]
 
     async def disconnect(self) -> None:
         """Stop telling the state; the robot manages its own shutdown."""
@@ -157,6 +159,15 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         for watcher in watchers:
             watcher.cancel()
         await asyncio.gather(*watchers, return_exceptions=True)
+
+    async def _on_rollout(self, event: RolloutEvent) -> None:
+        if event.kind == "started":
+            self._rolling.add(event.robot)
+        elif event.kind == "finished":
+            self._rolling.discard(event.robot)
+        await self.tell_rollout(event)
+        if event.kind != "step":
+            self.changed.set()
 
     async def refresh(self) -> Activity:
         """Ask the robot again; the answer is what status and presence say from now on."""

@@ -11,7 +11,7 @@ import json
 import queue
 import threading
 import uuid
-from collections.abc import Callable, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Generator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -161,7 +161,7 @@ class FleetClient:
 
     def events(
         self, device: str = "*", timeout: float | None = None, ready: threading.Event | None = None
-    ) -> Iterator[Event]:
+    ) -> Generator[Event, None, None]:
         """Events of one device, or of all, as they come.
 
         Args:

@@ -6,11 +6,35 @@ import logging
 from dataclasses import replace
 
 from strands_robots import settings
-from strands_robots.device_connect.backends import LinkConfig, link_from_environment
+from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
 from strands_robots.device_connect.backends.config import endpoints
 from strands_robots.utils import ValidationError, choice, device_id, shown, text
 
 logger = logging.getLogger(__name__)
+
+
+_NAMES_A_NETWORK = (
+    "MESSAGING_URLS",
+    "MESSAGING_CREDENTIALS_FILE",
+    "NATS_URL",
+    "NATS_URLS",
+    "NATS_CREDENTIALS_FILE",
+    "ZENOH_CONNECT",
+    "ZENOH_LISTEN",
+)
+
+
+def usual_link(tenant: str | None = None, port: int | None = None) -> LinkConfig:
+    """The link of a command or a tool that was told none: the network that the environment names, else this machine.
+
+    Args:
+        tenant: ``TENANT`` by default.
+        port: the loopback port where local robots meet; giving it means this machine alone.
+    """
+    whose = tenant or settings.raw("TENANT")
+    if port is None and any(settings.is_set(name) for name in _NAMES_A_NETWORK):
+        return link_from_environment(whose)
+    return loopback_config(port, whose)
 
 
 def link_for(

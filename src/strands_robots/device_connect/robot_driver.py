@@ -193,5 +193,3 @@ class RobotDeviceDriver(RobotDriver):
                 state=event.state,
                 error=event.error,
             )
-        if event.kind != "step":
-            self.changed.set()

@@ -17,7 +17,7 @@ from strands_robots.device_connect.wire import numbers, record
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
-from strands_robots.safety.stopping import halt_each
+from strands_robots.safety.stopping import explain, halt_each
 from strands_robots.utils import ValidationError, shown, text, whole
 
 STEPS_MAX = 100_000
@@ -261,8 +261,6 @@ class SimulationDeviceDriver(RobotDriver):
                 state=event.state,
                 error=event.error,
             )
-        if event.kind != "step":
-            self.changed.set()
 
     def _start_policy(self, asked: str, instruction: str, provider: str, seconds: float) -> Envelope:
         robots = self.world.list_robots()
@@ -276,11 +274,16 @@ class SimulationDeviceDriver(RobotDriver):
 
     def _stop_all(self) -> Envelope:
         """Each rollout by its own verb, then everything else that moves; one answer for all."""
-        running = [str(row.get("robot", "")) for row in self.world.list_policies_running()]
+        running: list[str] = []
+        unlisted: dict[str, str] = {}
+        try:
+            running = [str(row.get("robot", "")) for row in self.world.list_policies_running()]
+        except Exception as exc:  # noqa: BLE001 - a world that changes under the stop is halted as a whole below
+            unlisted = {"rollouts": explain(exc)}
         rollouts = halt_each({name: _stopping(self.world, name) for name in running})
         rest = self.halt("stop")
         stopped = [*rollouts.halted, *(name for name in rest.halted if name not in running)]
-        refused = {**rollouts.not_stopped, **rollouts.unknown, **rest.not_stopped, **rest.unknown}
+        refused = {**unlisted, **rollouts.not_stopped, **rollouts.unknown, **rest.not_stopped, **rest.unknown}
         fields = {"stopped": stopped, "not_stopped": sorted(refused), "reasons": refused}
         if refused:
             said = "; ".join(f"{name}: {why}" for name, why in refused.items())

@@ -104,7 +104,9 @@ async def paced(hz: Callable[[], float], act: Callable[[], Awaitable[None]], wak
             await asyncio.sleep(due - now)
             continue
         try:
-            await asyncio.wait_for(wake.wait(), due - now)
+            # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the event.
+            async with asyncio.timeout(due - now):
+                await wake.wait()
         except TimeoutError:
             continue
         wake.clear()

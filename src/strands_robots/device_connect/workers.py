@@ -115,4 +115,6 @@ class Lane:
                 answer.set_exception(exc)
 
         self.start(call).add_done_callback(hand_over)
-        return await asyncio.wait_for(answer, within)
+        # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
+        async with asyncio.timeout(within):
+            return await answer

@@ -1,0 +1,123 @@
+"""Which link a device gets, and whether it may be used without authentication."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.certificates import Authority
+
+from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.device_connect.links import insecure_opt_in, link_for
+from strands_robots.utils import ValidationError
+
+
+@pytest.fixture(autouse=True)
+def bare_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (
+        *("DEVICE_CONNECT_ALLOW_INSECURE", "MESSAGING_BACKEND", "MESSAGING_URLS", "NATS_URL", "NATS_URLS"),
+        *("ZENOH_CONNECT", "ZENOH_LISTEN", "MESSAGING_CREDENTIALS_FILE", "NATS_CREDENTIALS_FILE"),
+        *("MESSAGING_TLS_CA_FILE", "MESSAGING_TLS_CERT_FILE", "MESSAGING_TLS_KEY_FILE"),
+    ):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_zenoh_without_a_url_finds_peers_by_multicast() -> None:
+    link = link_for(None, "zenoh", "default", None)
+    assert link.is_peer
+    assert link.uses_multicast
+    assert link == link_for(None, None, "default", None)
+
+
+@pytest.mark.parametrize(
+    ("url", "backend", "transport"),
+    [
+        ("nats://127.0.0.1:4222", None, "nats"),
+        ("tls://broker:4222", None, "nats"),
+        ("tcp/127.0.0.1:7447", None, "zenoh"),
+        ("zenoh://127.0.0.1:7447", None, "zenoh"),
+        ("tcp/127.0.0.1:7447", "zenoh", "zenoh"),
+    ],
+)
+def test_a_url_names_its_transport(url: str, backend: str | None, transport: str) -> None:
+    link = link_for(url, backend, "lab", None)
+    assert link.transport == transport
+    assert link.tenant == "lab"
+    assert len(link.connect) == 1
+
+
+def test_an_explicit_url_outranks_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/10.0.0.1:7447")
+    assert link_for("tcp/127.0.0.1:1", None, "default", None).connect == ("tcp/127.0.0.1:1",)
+    assert link_for(None, None, "default", None).connect == ("tcp/10.0.0.1:7447",)
+
+
+def test_nats_without_a_server_is_refused() -> None:
+    with pytest.raises(ValidationError, match="messaging_url"):
+        link_for(None, "nats", "default", None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("http://x", None, "default", None), "messaging_url"),
+        (("", None, "default", None), "messaging_url"),
+        ((None, "mqtt", "default", None), "messaging_backend"),
+        ((None, None, "a.b", None), "tenant"),
+        ((None, None, "", None), "tenant"),
+        ((None, None, "*", None), "tenant"),
+        (("nats://x", None, "default", LinkConfig()), "link"),
+    ],
+)
+def test_an_argument_out_of_its_domain_is_refused_by_name(arguments: tuple[Any, ...], named: str) -> None:
+    with pytest.raises(ValidationError, match=named):
+        link_for(*arguments)
+
+
+def test_without_an_opt_in_an_open_transport_is_refused_with_both_ways_out() -> None:
+    with pytest.raises(ValidationError) as refused:
+        insecure_opt_in(None, LinkConfig(), stated=False)
+    for way in ("allow_insecure=True", "DEVICE_CONNECT_ALLOW_INSECURE=true", "MESSAGING_TLS_CA_FILE", "CREDENTIALS"):
+        assert way in str(refused.value)
+
+
+@pytest.mark.parametrize("word", ["true", "false", "", 1, 0, 1.0, []])
+def test_only_a_boolean_or_none_opts_in(word: Any) -> None:
+    with pytest.raises(ValidationError, match="allow_insecure"):
+        insecure_opt_in(word, LinkConfig(), stated=False)
+
+
+def test_an_opt_in_is_a_prominent_warning(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert insecure_opt_in(True, LinkConfig(), stated=False)
+    assert "INSECURE" in caplog.text
+    monkeypatch.setenv("DEVICE_CONNECT_ALLOW_INSECURE", "true")
+    assert insecure_opt_in(None, LinkConfig(), stated=False)
+    with pytest.raises(ValidationError):
+        insecure_opt_in(False, LinkConfig(), stated=False)
+
+
+def test_an_unknown_spelling_is_the_safe_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_ALLOW_INSECURE", "yepp")
+    with pytest.raises(ValidationError):
+        insecure_opt_in(None, LinkConfig(), stated=False)
+
+
+def test_a_stated_link_that_stays_on_this_machine_is_the_opt_in_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    assert insecure_opt_in(None, loopback_config(7000), stated=True)
+    assert "127.0.0.1" in caplog.text
+    with pytest.raises(ValidationError):
+        insecure_opt_in(None, loopback_config(7000), stated=False)
+    with pytest.raises(ValidationError):
+        insecure_opt_in(False, loopback_config(7000), stated=True)
+    with pytest.raises(ValidationError):
+        insecure_opt_in(None, LinkConfig(listen=("tcp/0.0.0.0:7447",)), stated=True)
+
+
+def test_certificates_need_no_opt_in(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    robot = Authority(tmp_path).issue("robot-1")
+    link = LinkConfig(ca=str(robot.ca), cert=str(robot.cert), key=str(robot.key))
+    assert not insecure_opt_in(None, link, stated=False)
+    assert caplog.text == ""

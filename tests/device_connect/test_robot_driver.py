@@ -1,0 +1,370 @@
+"""A robot with one body as a device, without a network."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.driver_bench import DriverBench
+from fixtures.toy_robots import ToyRobot
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from strands_robots.device_connect import base_driver
+from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.envelope import error, success
+from strands_robots.safety.approval import Approval, Grants, state_dir
+from strands_robots.safety.authorization import Authorization
+from strands_robots.utils import ValidationError
+
+LISTS: dict[str, tuple[str, ...]] = {"DEVICE_CONNECT_RPC_ALLOW": ("operator",)}
+
+
+@pytest.fixture
+def robot() -> Iterator[ToyRobot]:
+    toy = ToyRobot()
+    yield toy
+    toy.close()
+
+
+def drive(robot: Any, approved: bool = True, **lists: tuple[str, ...]) -> RobotDeviceDriver:
+    allow = {**LISTS, **lists}
+    return RobotDeviceDriver(
+        robot,
+        authorization=Authorization(hardware=True, read_list=lambda name: allow.get(name, ()), robot="bench-1"),
+        approval=Approval(lambda _: ("execute",) if approved else (), lambda: False),
+    )
+
+
+async def test_execute_starts_a_task_and_returns_at_once(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        began = time.monotonic()
+        answer = await bench.call("execute", instruction="wave", duration=0.3)
+        assert answer["status"] == "success"
+        assert time.monotonic() - began < 0.25
+        assert (await bench.call("getStatus"))["task_status"] == "running"
+        await bench.until(lambda: bench.of("taskComplete"))
+        assert bench.of("taskStarted")[0]["instruction"] == "wave"
+        assert bench.of("taskComplete")[0]["steps"] == robot.rollouts["toy"].steps
+
+
+async def test_stop_ends_the_task_for_every_caller(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        for caller in ("operator", "stranger", None, {"no": "name"}):
+            await bench.call("execute", instruction="wave")
+            answer = await bench.call("stop", caller)
+            assert answer["status"] == "success"
+            assert answer["halted"] == ["toy"]
+            assert answer["stopped"] is True
+
+
+async def test_a_stop_that_did_not_happen_is_an_error_that_says_so(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.call("execute", instruction="wave", duration=20)
+        robot.stubborn = True
+        answer = await bench.call("stop")
+        assert answer["status"] == "error"
+        assert answer["stopped"] is False
+        assert "toy" in answer["not_stopped"]
+
+
+async def test_nothing_to_stop_is_a_success(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        assert (await bench.call("stop"))["stopped"] is True
+
+
+@pytest.mark.parametrize("caller", [None, "stranger", "Operator", "", 7, ["operator"], {"a": 1}])
+async def test_only_an_allowed_caller_moves_hardware(robot: ToyRobot, caller: object) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        answer = await bench.call("execute", caller, instruction="wave")
+        assert answer["status"] == "error"
+        assert "DEVICE_CONNECT_RPC_ALLOW" in answer["reason"]
+        assert robot.rollouts == {}
+        assert (await bench.call("getState", caller))["status"] == "success"
+
+
+async def test_hardware_needs_the_operators_approval_besides(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot, approved=False)) as bench:
+        answer = await bench.call("execute", instruction="wave")
+        assert "operator approval" in answer["reason"]
+        assert "execute@bench-1" in answer["reason"]
+
+
+async def test_a_grant_is_spent_by_a_motion_and_not_by_a_refusal(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot, approved=False)) as bench:
+        Grants(state_dir() / "grants").grant("execute", "bench-1")
+        refused = [
+            await bench.call("execute", "stranger", instruction="wave"),
+            await bench.call("execute", instruction=""),
+            await bench.call("execute", instruction="wave", policy_provider="no_such"),
+        ]
+        assert [answer["status"] for answer in refused] == ["error"] * 3
+        assert (await bench.call("execute", instruction="wave", duration=0.1))["status"] == "success"
+        await bench.call("stop")
+        assert "operator approval" in (await bench.call("execute", instruction="wave"))["reason"]
+
+
+async def test_a_locked_robot_refuses_and_still_answers(robot: ToyRobot) -> None:
+    class Locked:
+        def refusal(self, verb: str) -> Any:
+            return error(f"{verb} refused: locked by epoch abc")
+
+    robot.gate.attach(Locked())
+    async with DriverBench(drive(robot)) as bench:
+        assert "epoch abc" in (await bench.call("execute", instruction="wave"))["reason"]
+        assert (await bench.call("getStatus"))["status"] == "success"
+        assert (await bench.call("stop"))["stopped"] is True
+
+
+async def test_a_closed_list_of_providers_closes_the_others(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot, STRANDS_MESH_POLICY_TYPE_ALLOW=("lerobot_local",))) as bench:
+        answer = await bench.call("execute", instruction="wave")
+        assert "STRANDS_MESH_POLICY_TYPE_ALLOW" in answer["reason"]
+
+
+WRONG: dict[str, list[Any]] = {
+    "instruction": ["", "  ", "x" * 2001, "a\nb", "\x00", "\ud800", None, 1, True, [], {}],
+    "policy_provider": ["", "a b", "../x", "x" * 200, None, 1, []],
+    "duration": [0, -1, 3600.1, math.nan, math.inf, -math.inf, True, "30", None, [], 10**400],
+    "policy_port": [-1, 65536, 1.0, True, "80", None, math.nan, 10**100],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in WRONG.items() for v in values])
+async def test_an_argument_out_of_its_domain_is_refused_by_name(robot: ToyRobot, name: str, value: Any) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        answer = await bench.call("execute", **{"instruction": "wave", name: value})
+        assert answer["status"] == "error"
+        assert name in answer["reason"]
+        assert robot.rollouts == {}
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["instruction", "policy_provider", "duration", "policy_port", "self", "function_name", "x"]),
+        st.recursive(
+            st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=50),
+            lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+            max_leaves=5,
+        ),
+    )
+)
+@hypothesis_settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_whatever_is_sent_the_answer_is_an_envelope(params: dict[str, Any]) -> None:
+    toy = ToyRobot()
+
+    async def call() -> dict[str, Any]:
+        return await DriverBench(drive(toy)).call("execute", **params)
+
+    answer = asyncio.run(call())
+    toy.close()
+    assert answer["status"] in ("success", "error")
+    assert (answer["status"] == "success") == bool(toy.rollouts)
+
+
+@pytest.mark.parametrize("params", [{}, {"instruction": "wave", "speed": 3}, {"self": 1, "instruction": "wave"}])
+async def test_missing_and_extra_parameters_are_refused_by_name(robot: ToyRobot, params: dict[str, Any]) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        answer = await bench.call("execute", **params)
+        assert answer["reason"].startswith("execute takes instruction, policy_provider, duration, policy_port")
+
+
+async def test_an_exception_is_an_envelope_without_its_detail(
+    robot: ToyRobot, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail() -> None:
+        raise OSError("secret path")
+
+    robot.before["start_task"] = fail
+    async with DriverBench(drive(robot)) as bench:
+        answer = await bench.call("execute", instruction="wave")
+    assert answer["status"] == "error"
+    assert "secret" not in str(answer)
+    assert "secret path" in caplog.text
+
+
+async def test_an_answer_in_a_shape_nobody_knows_is_an_error(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot, "start_task", lambda *_, **__: "ok")
+    async with DriverBench(drive(robot)) as bench:
+        assert (await bench.call("execute", instruction="wave"))["status"] == "error"
+
+
+async def test_a_stop_is_answered_while_motion_and_reads_block(robot: ToyRobot) -> None:
+    let_go = threading.Event()
+    robot.before = {"start_task": let_go.wait, "get_state": let_go.wait}
+    async with DriverBench(drive(robot)) as bench:
+        blocked = [asyncio.create_task(bench.call("execute", instruction="wave")) for _ in range(5)]
+        blocked += [asyncio.create_task(bench.call("getState")) for _ in range(9)]
+        await asyncio.sleep(0.05)
+        began = time.monotonic()
+        assert (await bench.call("stop"))["stopped"] is True
+        assert time.monotonic() - began < 0.5
+        let_go.set()
+        answers = await asyncio.gather(*blocked)
+    refused = [answer for answer in answers if "has not yet answered" in answer.get("reason", "")]
+    assert len(refused) == 14 - base_driver.MOVES_AT_ONCE - base_driver.READS_AT_ONCE + 1 or len(refused) >= 8
+
+
+async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base_driver, "MOVE_DEADLINE_S", 0.1)
+    let_go = threading.Event()
+    robot.before["start_task"] = let_go.wait
+    async with DriverBench(drive(robot)) as bench:
+        generation = robot.gate.generation
+        answer = await bench.call("execute", instruction="wave")
+        assert "in time" in answer["reason"]
+        assert robot.gate.generation > generation
+        let_go.set()
+
+
+async def test_a_halt_without_an_answer_is_reported_as_not_stopped(
+    robot: ToyRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    let_go = threading.Event()
+    robot.before["halt"] = let_go.wait
+    async with DriverBench(drive(robot)) as bench:
+        answer = await bench.call("stop")
+        assert answer["stopped"] is False
+        assert "no answer in 0.1 s" in answer["reason"]
+        let_go.set()
+
+
+async def test_an_emergency_stop_of_an_allowed_source_halts(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot, DEVICE_CONNECT_ESTOP_ALLOW=("safety-*",))) as bench:
+        await bench.call("execute", instruction="wave")
+        for source in ("stranger", "Safety-1", "", "bench-1"):
+            await bench.driver.onEmergencyStop(source, "emergencyStop", {"reason": "test"})
+        await asyncio.sleep(0.1)
+        assert robot.rollouts["toy"].running
+        await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {"reason": "test"})
+        await bench.until(lambda: not robot.rollouts["toy"].running)
+
+
+async def test_without_a_list_every_named_source_stops_whatever_the_rpc_list_says(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.call("execute", instruction="wave")
+        await bench.driver.onEmergencyStop("anybody", "emergencyStop", {})
+        await bench.until(lambda: not robot.rollouts["toy"].running)
+
+
+def test_a_robot_that_did_not_stop_is_named_at_critical(robot: ToyRobot, caplog: pytest.LogCaptureFixture) -> None:
+    driver = drive(robot)
+    robot.start_task("wave", duration=20)
+    robot.stubborn = True
+    with caplog.at_level(logging.CRITICAL):
+        verdict = driver.handle_estop("safety-1", {"reason": "smoke"})
+    assert verdict is not None
+    assert verdict.stopped is False
+    assert "toy" in caplog.text
+    assert "safety-1" in caplog.text
+
+
+@pytest.mark.parametrize("payload", [None, [], "x", {"reason": object()}])
+def test_an_emergency_stop_counts_whatever_its_payload_is(robot: ToyRobot, payload: object) -> None:
+    verdict = drive(robot).handle_estop("safety-1", payload)
+    assert verdict is not None
+    assert verdict.stopped is True
+
+
+async def test_status_presence_and_heartbeat_tell_what_the_robot_does(robot: ToyRobot) -> None:
+    driver = drive(robot)
+    assert driver.status.availability == "idle"
+    robot.start_task("wave", duration=20)
+    assert driver.status.availability == "busy"
+    async with DriverBench(driver) as bench:
+        await bench.until(lambda: bench.runtime.status.get("availability") == "busy")
+        beat = driver.heartbeat()
+        assert beat["busy_score"] == 1.0
+        assert beat["state"]["instruction"] == "wave"
+        await bench.call("stop")
+        await bench.until(lambda: bench.runtime.status["availability"] == "idle")
+
+
+async def test_a_robot_whose_state_cannot_be_read_says_so(robot: ToyRobot) -> None:
+    def fail() -> None:
+        raise OSError("bus is gone")
+
+    robot.before["get_task_status"] = fail
+    async with DriverBench(drive(robot)) as bench:
+        await bench.until(lambda: "bus is gone" in str(bench.runtime.status.get("error_state")))
+        robot.before.clear()
+        await bench.until(lambda: bench.runtime.status["error_state"] is None)
+
+
+async def test_every_step_of_a_50_hz_task_is_told_in_order(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.call("execute", instruction="wave", duration=1.0)
+        await bench.until(lambda: bench.of("taskComplete"))
+        steps = [event["step"] for event in bench.of("streamStep")]
+        assert steps == list(range(1, robot.rollouts["toy"].steps + 1))
+
+
+async def test_a_faster_loop_is_told_at_50_hz(robot: ToyRobot) -> None:
+    robot.hz = 400
+    async with DriverBench(drive(robot)) as bench:
+        await bench.call("execute", instruction="wave", duration=1.0)
+        await bench.until(lambda: bench.of("taskComplete"))
+        assert 40 <= len(bench.of("streamStep")) <= 56
+
+
+async def test_state_is_told_ten_times_a_second_while_busy_and_once_while_idle(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.call("execute", instruction="wave", duration=1.0)
+        await bench.until(lambda: bench.of("taskComplete"))
+        busy = [e for e in bench.of("stateUpdate") if e["task_status"] == "running"]
+        assert 8 <= len(busy) <= 13
+        before = len(bench.of("stateUpdate"))
+        await asyncio.sleep(1.2)
+        assert 1 <= len(bench.of("stateUpdate")) - before <= 3
+
+
+async def test_no_event_carries_a_number_that_json_cannot(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.driver.streamStep(step=1, observation={"a": math.nan}, action={})
+        assert bench.of("streamStep")[0]["observation"] == {"a": None}
+
+
+async def test_a_foreign_thread_may_emit(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await asyncio.to_thread(lambda: asyncio.run(bench.driver.emergencyStop(reason="from a thread")))
+        assert bench.of("emergencyStop")[0]["reason"] == "from a thread"
+
+
+async def test_any_object_with_the_four_verbs_is_a_robot() -> None:
+    class Foreign:
+        tool_name_str = "foreign"
+        stopped = 0
+
+        def start_task(self, instruction: str, **_: Any) -> Any:
+            return success("started")
+
+        def stop_task(self) -> Any:
+            self.stopped += 1
+            return success("stopped", stopped=True)
+
+        def get_task_status(self) -> Any:
+            return {"task_status": "idle"}
+
+        def get_features(self) -> Any:
+            return {"observation_features": {"a": float}, "action_features": {}}
+
+    foreign = Foreign()
+    async with DriverBench(drive(foreign)) as bench:
+        assert (await bench.call("execute", instruction="wave"))["status"] == "success"
+        assert (await bench.call("stop"))["stopped"] is True
+        assert foreign.stopped == 1
+        assert (await bench.call("getStatus"))["task_status"] == "idle"
+        assert (await bench.call("getFeatures"))["status"] == "success"
+
+
+def test_an_object_that_is_no_robot_is_refused_by_what_it_lacks() -> None:
+    with pytest.raises(ValidationError, match="start_task"):
+        RobotDeviceDriver(object())

@@ -1,0 +1,172 @@
+"""A simulated world as a device, without a network."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.driver_bench import DriverBench
+from fixtures.toy_robots import ToyWorld
+
+from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.envelope import error
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import ValidationError
+
+
+@pytest.fixture(autouse=True)
+def open_lists(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DEVICE_CONNECT_RPC_ALLOW", "DEVICE_CONNECT_ESTOP_ALLOW", "STRANDS_MESH_POLICY_TYPE_ALLOW"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def world() -> Iterator[ToyWorld]:
+    toy = ToyWorld()
+    yield toy
+    toy.close()
+
+
+async def test_execute_without_a_robot_takes_the_first_and_names_it(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        answer = await bench.call("execute", None, instruction="wave")
+        assert answer["status"] == "success"
+        assert answer["robot_name"] == "left"
+        assert world.rollouts["left"].running
+
+
+async def test_execute_moves_the_robot_it_names(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        assert (await bench.call("execute", instruction="wave", robot_name="right"))["robot_name"] == "right"
+        assert list(world.rollouts) == ["right"]
+
+
+@pytest.mark.parametrize("name", ["middle", "Left", "x" * 129, "a\n", 1, None, True, []])
+async def test_a_robot_that_is_not_there_is_refused_by_name(world: ToyWorld, name: Any) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        answer = await bench.call("execute", instruction="wave", robot_name=name)
+        assert "robot_name" in answer["reason"]
+        assert world.rollouts == {}
+
+
+async def test_an_empty_world_has_nothing_to_execute() -> None:
+    async with DriverBench(SimulationDeviceDriver(ToyWorld(robots=()))) as bench:
+        assert "no robot" in (await bench.call("execute", instruction="wave"))["reason"]
+
+
+@pytest.mark.parametrize("steps", [0, -1, 100_001, 1.0, True, "5", None, math.nan, 10**400])
+async def test_a_number_of_steps_out_of_its_domain_is_refused(world: ToyWorld, steps: Any) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        assert "n_steps" in (await bench.call("step", n_steps=steps))["reason"]
+        assert world.step_count == 0
+
+
+async def test_step_and_reset_act(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        assert (await bench.call("step", n_steps=7))["status"] == "success"
+        assert (await bench.call("getStatus"))["step_count"] == 7
+        assert (await bench.call("reset"))["status"] == "success"
+        assert (await bench.call("getStatus"))["step_count"] == 0
+
+
+@pytest.mark.parametrize("verb", ["execute", "step", "reset"])
+async def test_a_set_list_closes_the_simulation_too(
+    world: ToyWorld, verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "operator")
+    params = {"instruction": "wave"} if verb == "execute" else {}
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        assert (await bench.call(verb, None, **params))["status"] == "error"
+        assert (await bench.call(verb, "operator", **params))["status"] == "success"
+
+
+async def test_stop_names_what_stopped(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        for name in ("left", "right"):
+            await bench.call("execute", instruction="wave", robot_name=name)
+        answer = await bench.call("stop")
+        assert answer["status"] == "success"
+        assert sorted(answer["stopped"]) == ["left", "right"]
+        assert answer["not_stopped"] == []
+        assert "left" in answer["content"][0]["text"]
+
+
+async def test_stop_of_a_still_simulation_is_an_affirmative_nothing(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        answer = await bench.call("stop")
+        assert (answer["status"], answer["stopped"], answer["not_stopped"]) == ("success", [], [])
+
+
+async def test_stop_names_what_did_not_stop_beside_what_did(world: ToyWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    stop = world.stop_policy
+    monkeypatch.setattr(world, "stop_policy", lambda name: error("its loop hangs") if name == "left" else stop(name))
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        for name in ("left", "right"):
+            await bench.call("execute", instruction="wave", robot_name=name)
+        answer = await bench.call("stop")
+        assert answer["status"] == "error"
+        assert "right" in answer["stopped"]
+        assert answer["not_stopped"] == ["left"]
+        assert "its loop hangs" in answer["reason"]
+
+
+async def test_a_world_torn_down_under_a_stop_is_an_error_and_not_an_exception(
+    world: ToyWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def changed() -> list[dict[str, Any]]:
+        raise RuntimeError("dictionary changed size during iteration")
+
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        await bench.call("execute", instruction="wave")
+        monkeypatch.setattr(world, "list_policies_running", changed)
+        answer = await bench.call("stop")
+        assert answer["status"] == "error"
+        assert not world.rollouts["left"].running
+
+
+async def test_an_emergency_stop_halts_everything_and_names_what_goes_on(
+    world: ToyWorld, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    verdict = StopVerdict(halted=("left",), not_stopped={"teleoperation": "its loop hangs"})
+    monkeypatch.setattr(world, "halt", lambda reason="": verdict)
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        with caplog.at_level(logging.CRITICAL):
+            await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {})
+            await bench.until(lambda: "teleoperation" in caplog.text)
+
+
+async def test_policies_are_told_from_their_start_to_their_end(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        await bench.call("execute", instruction="wave", duration=0.4)
+        await bench.until(lambda: bench.of("policyComplete"))
+        started, ended = bench.of("policyStarted")[0], bench.of("policyComplete")[0]
+        assert (started["robot_name"], started["instruction"], started["policy_provider"]) == ("left", "wave", "mock")
+        assert (ended["robot_name"], ended["state"]) == ("left", "completed")
+        assert [e["step"] for e in bench.of("streamStep")] == list(range(1, ended["steps"] + 1))
+
+
+async def test_every_robot_is_observed_ten_times_a_second(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        await asyncio.sleep(1.05)
+        for name in ("left", "right"):
+            seen = [e for e in bench.of("observationUpdate") if e["robot_name"] == name]
+            assert 9 <= len(seen) <= 12
+            assert set(seen[0]["joints"]) == {"pan", "lift", "elbow"}
+
+
+async def test_state_names_the_running_policies(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        await bench.call("execute", instruction="wave")
+        await bench.until(lambda: any(e["running_policies"] for e in bench.of("stateUpdate")))
+        running = next(e["running_policies"] for e in bench.of("stateUpdate") if e["running_policies"])
+        assert running["left"]["instruction"] == "wave"
+        assert bench.runtime.status["availability"] == "busy"
+
+
+def test_an_object_that_is_no_world_is_refused_by_what_it_lacks() -> None:
+    with pytest.raises(ValidationError, match="list_robots"):
+        SimulationDeviceDriver(object())
