@@ -1,0 +1,19 @@
+"""Tools for agents. Importing this package needs no extra; a tool is loaded when it is asked for."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from strands_robots.tools.robot_mesh import robot_mesh
+
+__all__ = ["robot_mesh"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # The tool takes the place of the module of the same name, which the import has just put here.
+    tool = globals()[name] = getattr(import_module(f"{__name__}.{name}"), name)
+    return tool

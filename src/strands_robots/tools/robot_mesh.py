@@ -1,0 +1,65 @@
+"""``robot_mesh``: the one tool with which an agent finds robots, drives them and stops them.
+
+::
+
+    from strands import Agent
+    from strands_robots.tools import robot_mesh
+
+    Agent(tools=[robot_mesh])("Which robots are there? Let the arm wave.")
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from strands_robots.envelope import error
+from strands_robots.tools import networks
+from strands_robots.utils import ValidationError, choice, device_id, missing_extra, number, text
+
+try:
+    from strands import tool
+except ModuleNotFoundError as exc:
+    if (exc.name or "").partition(".")[0] != "strands":
+        raise
+    raise missing_extra("robot_mesh", "agent") from exc
+
+ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop")
+
+DURATION_MAX_S = 3600.0
+
+
+@tool
+def robot_mesh(
+    action: str,
+    target: str = "",
+    instruction: str = "",
+    policy_provider: str = "mock",
+    duration: float = 30.0,
+) -> dict[str, Any]:
+    """Find robots, tell them what to do, ask what they do, and stop them.
+
+    A robot that does not answer, or does not confirm that it stopped, is an error: never take it as standing still.
+
+    Args:
+        action: peers lists the robots; tell gives one an instruction and returns once it has begun; status asks what
+            one is doing; stop stops one, or all without a target; emergency_stop stops all at once.
+        target: The robot's id, as peers lists it. Needed by tell and status.
+        instruction: What to do, in plain language, 1 to 2000 characters. For emergency_stop: the reason.
+        policy_provider: Policy that decides the robot's actions, such as mock, remote or lerobot_local.
+        duration: Longest time the motion may take, in seconds, above 0 and at most 3600.
+    """
+    try:
+        wanted = choice("action", action, ACTIONS)
+        who = device_id("target", target) if target or wanted in ("tell", "status") else ""
+        if wanted == "tell":
+            what = text("instruction", instruction)
+            provider = text("policy_provider", policy_provider, longest=100)
+            seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
+            return networks.network().tell(who, what, provider, seconds)
+        if wanted == "emergency_stop":
+            return networks.network().emergency_stop(text("instruction", instruction, empty=True))
+    except ValidationError as refused:
+        return error(str(refused))
+    if wanted == "stop":
+        return networks.network().stop(who)
+    return networks.network().status(who) if wanted == "status" else networks.network().peers()

@@ -1,0 +1,79 @@
+"""A real ``strands.Agent`` with the real tool, a real network on loopback, and a toy world."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+
+import pytest
+from fixtures.scripted_model import ScriptedModel, Use, tool_results
+from fixtures.toy_robots import ToyWorld
+from fixtures.waiting import eventually, free_port
+from strands import Agent
+
+from strands_robots import settings
+from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.tools import robot_mesh
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[ToyWorld]:
+    """One toy world, served on a loopback port that the tool uses too."""
+    for setting in settings.declared():
+        monkeypatch.delenv(setting.name, raising=False)
+    monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
+    toy = ToyWorld("toys", robots=("left",))
+    runtime = init_device_connect_sync(toy, peer_id="toys", link=loopback_config())
+    try:
+        yield toy
+    finally:
+        toy.close()
+        stop_device_connect(runtime)
+
+
+def results(*uses: Use) -> list[dict[str, object]]:
+    model = ScriptedModel([*uses, "That is all."])
+    agent = Agent(model=model, tools=[robot_mesh], callback_handler=None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        agent("go")
+    return tool_results(agent.messages)
+
+
+def test_an_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
+    told = results(
+        Use("robot_mesh", {"action": "peers"}),
+        Use("robot_mesh", {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20}),
+        Use("robot_mesh", {"action": "status", "target": "toys"}),
+        Use("robot_mesh", {"action": "stop", "target": "toys"}),
+    )
+    assert [each["status"] for each in told] == ["success"] * 4
+    assert "toys" in str(told[0]["content"])
+    assert "wave" in str(told[2]["content"])
+    assert world.list_policies_running() == []
+    assert world.writes
+
+
+def test_an_emergency_stop_reaches_every_robot_and_names_it(world: ToyWorld) -> None:
+    told = results(
+        Use("robot_mesh", {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20}),
+        Use("robot_mesh", {"action": "emergency_stop", "instruction": "smoke"}),
+    )
+    assert told[1]["status"] == "success"
+    assert "toys" in str(told[1]["content"])
+    eventually(lambda: not world.list_policies_running(), what="the toy world stands still")
+
+
+def test_a_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None:
+    world.start_policy("left", "wave", duration=20)
+    world.stubborn = True
+    (told,) = results(Use("robot_mesh", {"action": "stop"}))
+    assert told["status"] == "error"
+    assert "DID NOT STOP: toys" in str(told["content"])
+
+
+def test_silence_is_an_error(world: ToyWorld) -> None:
+    asked = [Use("robot_mesh", {"action": action, "target": "nobody"}) for action in ("stop", "status")]
+    for told in results(*asked):
+        assert told["status"] == "error"
+        assert "nobody" in str(told["content"])

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.tools import networks, robot_mesh
+from strands_robots.tools.networks import DeviceConnect, NativeMesh, verdict_of
+
+
+class FakeNetwork:
+    """Writes down what it was asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+
+    def peers(self) -> Envelope:
+        return self._did("peers")
+
+    def tell(self, *asked: Any) -> Envelope:
+        return self._did("tell", *asked)
+
+    def status(self, target: str) -> Envelope:
+        return self._did("status", target)
+
+    def stop(self, target: str) -> Envelope:
+        return self._did("stop", target)
+
+    def emergency_stop(self, reason: str) -> Envelope:
+        return self._did("emergency_stop", reason)
+
+    def _did(self, *asked: Any) -> Envelope:
+        self.asked.append(asked)
+        return success("done")
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeNetwork:
+    there = FakeNetwork()
+    monkeypatch.setattr(networks, "network", lambda: there)
+    return there
+
+
+def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
+    robot_mesh(action="peers")
+    robot_mesh(action="tell", target="arm-1", instruction="wave", duration=2)
+    robot_mesh(action="status", target="arm-1")
+    robot_mesh(action="stop", target="arm-1")
+    robot_mesh(action="stop")
+    robot_mesh(action="emergency_stop", instruction="smoke")
+    assert fake.asked == [
+        ("peers",),
+        ("tell", "arm-1", "wave", "mock", 2.0),
+        ("status", "arm-1"),
+        ("stop", "arm-1"),
+        ("stop", ""),
+        ("emergency_stop", "smoke"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("asked", "named"),
+    [
+        ({"action": "dance"}, "action"),
+        ({"action": "tell", "instruction": "wave"}, "target"),
+        ({"action": "tell", "target": "arm/1", "instruction": "wave"}, "target"),
+        ({"action": "tell", "target": "arm-1"}, "instruction"),
+        ({"action": "tell", "target": "arm-1", "instruction": "a\x00b"}, "instruction"),
+        ({"action": "tell", "target": "arm-1", "instruction": "wave", "duration": float("nan")}, "duration"),
+        ({"action": "tell", "target": "arm-1", "instruction": "wave", "duration": 1e9}, "duration"),
+        ({"action": "tell", "target": "arm-1", "instruction": "wave", "policy_provider": ""}, "policy_provider"),
+        ({"action": "status"}, "target"),
+        ({"action": "stop", "target": "arm 1"}, "target"),
+    ],
+)
+def test_an_argument_out_of_its_domain_is_refused_by_name(fake: FakeNetwork, asked: dict[str, Any], named: str) -> None:
+    answer = robot_mesh(**asked)
+    assert answer["status"] == "error"
+    assert named in answer["reason"]
+    assert fake.asked == []
+
+
+def test_one_silent_robot_makes_a_stop_an_error_that_names_it() -> None:
+    answer = verdict_of({"a": success("ok", stopped=True), "b": error("no answer in 5 s", stopped=None)})
+    assert answer["status"] == "error"
+    assert answer["silent"] == ["b"]
+    assert answer["stopped"] is None
+    assert "b" in answer["reason"]
+
+
+def test_one_moving_robot_outranks_a_silent_one() -> None:
+    answer = verdict_of(
+        {
+            "a": success("ok", stopped=True),
+            "b": error("no answer", stopped=None),
+            "c": error("the bus is wedged", stopped=False),
+        }
+    )
+    assert answer["stopped"] is False
+    assert answer["not_stopped"] == ["c"]
+    assert "DID NOT STOP: c" in answer["reason"]
+
+
+def test_a_stop_that_reaches_nobody_is_an_error() -> None:
+    assert verdict_of({})["status"] == "error"
+
+
+def test_only_affirmative_answers_are_a_stop() -> None:
+    assert verdict_of({"a": success("ok"), "b": success("ok", stopped=["arm"])})["status"] == "success"
+    assert verdict_of({"a": {"result": "hm"}})["status"] == "error"
+
+
+@pytest.mark.parametrize("word", ["off", "OFF", "0", "false"])
+def test_with_device_connect_off_the_native_mesh_answers_for_itself(monkeypatch: pytest.MonkeyPatch, word: str) -> None:
+    monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", word)
+    assert isinstance(networks.network(), NativeMesh)
+    for asked in ({"action": "peers"}, {"action": "stop"}, {"action": "emergency_stop"}):
+        answer = robot_mesh(**asked)
+        assert answer["status"] == "error"
+        assert "native mesh" in answer["reason"]
+
+
+@pytest.mark.parametrize("word", ["auto", "on", "", "maybe"])
+def test_device_connect_is_the_usual_network(monkeypatch: pytest.MonkeyPatch, word: str) -> None:
+    monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", word)
+    assert isinstance(networks.network(), DeviceConnect)
+
+
+def test_a_network_that_leaves_this_machine_needs_an_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NATS_URL", "nats://192.0.2.1:4222")
+    monkeypatch.delenv("DEVICE_CONNECT_ALLOW_INSECURE", raising=False)
+    answer = robot_mesh(action="stop", target="arm-1")
+    assert answer["status"] == "error"
+    assert "allow_insecure" in answer["reason"]
+    assert answer["stopped"] is None
+
+
+def test_the_package_of_tools_loads_no_agent_framework() -> None:
+    code = "import sys, strands_robots.tools; assert not {'strands', 'zenoh', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_without_strands_agents_one_sentence_names_the_extra() -> None:
+    code = (
+        "import sys; sys.modules['strands'] = None\n"
+        "try:\n    from strands_robots.tools import robot_mesh\n"
+        "except ImportError as exc:\n    print(exc)"
+    )
+    told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert "strands-robots[agent]" in told
+    assert len(told.splitlines()) == 1
