@@ -76,3 +76,5 @@ def outcome(screen: Screen, body: Callable[[], None]) -> Exit:
 def _quiet_libraries() -> None:
     """Keep the libraries' reports of routine events off the terminal; warnings still get through."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    # The framework warns of extras that nothing here uses.
+    logging.getLogger("device_connect_edge").setLevel(logging.ERROR)

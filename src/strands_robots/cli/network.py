@@ -16,17 +16,6 @@ from strands_robots.utils import missing_extra
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
 
-_STATED = (
-    "MESSAGING_URLS",
-    "MESSAGING_CREDENTIALS_FILE",
-    "NATS_URL",
-    "NATS_URLS",
-    "NATS_CREDENTIALS_FILE",
-    "ZENOH_CONNECT",
-    "ZENOH_LISTEN",
-)
-"""Variables of the framework that name a network; with none of them set a command stays on this machine."""
-
 _NEEDS = (
     "Leaving this machine needs proof of who is who: certificates (--tls-ca, --tls-cert, --tls-key), "
     "credentials (--credentials FILE) or --insecure, which lets anybody on that network drive the robot."
@@ -95,11 +84,9 @@ class Network:
                     tenant=stated.tenant,
                 )
             return reached
-        if self.port is None and any(settings.is_set(name) for name in _STATED):
-            environment: LinkConfig = backends.link_from_environment(tenant)
-            return environment
-        loopback: LinkConfig = backends.loopback_config(self.port, tenant)
-        return loopback
+        from strands_robots.device_connect.links import usual_link  # noqa: PLC0415 - loaded when a network is used
+
+        return usual_link(tenant, self.port)
 
     def _secured(self, link: LinkConfig) -> LinkConfig:
         return replace(

@@ -1,0 +1,5 @@
+"""``python -m strands_robots.cli``, for processes that start one another without a script folder on the path."""
+
+from strands_robots.cli import main
+
+main()
