@@ -92,7 +92,3 @@ class MotionGate:
     def revoke(self) -> None:
         """Void every permit given so far."""
         self._generation = next(self._numbers)
-
-
-class CommandVoidError(RuntimeError):
-    """The permit was void when a write came: the robot was halted in between, and nothing was written."""
