@@ -1,8 +1,9 @@
-"""One policy on one body at a steady rate, with an honest stop.
+"""One control loop: a policy drives a body at a steady rate until its time is over, it is done, or it is stopped.
 
-A rollout holds a :class:`~strands_robots.safety.gate.Permit`; the body checks it under the lock of each write, so
-that nothing is written after a halt's verdict. Ticks have absolute deadlines: the rate does not drift, and a tick
-that was missed is dropped, never made up in a burst.
+The lock discipline of every write: a body sends an action only while the permit it is given is valid, and looks at
+that under the same lock as the write. Whoever stops a motion voids the permit first and then passes that lock once;
+from then on nothing is written. A rollout that ends in any other way than a halt leaves the body on hold, so the
+last action never goes on by itself.
 """
 
 from __future__ import annotations
@@ -11,259 +12,279 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from typing import Any, Literal, Protocol
 
 from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
-from strands_robots.policies.base import Action, Policy, Task
-from strands_robots.safety.gate import CommandVoidError, Permit
+from strands_robots.policies.actions import checked_action, numbers
+from strands_robots.policies.base import Action, Policy, Ranges
+from strands_robots.safety.gate import Permit, PermitVoidError
 
 logger = logging.getLogger(__name__)
 
-JOIN_S = 1.0
-"""How long a stop waits for the loop to end before it says that it did not."""
+State = Literal["idle", "running", "completed", "stopped", "error"]
+
+STOP_JOIN_S = 2.0
+"""How long :meth:`Rollout.stop` waits for the loop by default."""
 
 
 class Body(Protocol):
-    """What a rollout drives: one robot's observations and actions, by name, in its own units."""
+    """What a rollout or a teleoperation drives: one arm, one base."""
 
     name: str
 
     @property
-    def bounds(self) -> Mapping[str, tuple[float, float]]:
-        """Lowest and highest command of each action key, infinite where nobody knows."""
+    def bounds(self) -> Ranges:
+        """Range of every action key, in the body's own units."""
 
-    def get_observation(self) -> Mapping[str, Any]:
-        """Positions by joint name; images and other things may be among them."""
+    def get_observation(self) -> dict[str, Any]:
+        """Everything the body sees; may hold images."""
 
-    def send_action(self, action: Mapping[str, float], permit: Permit) -> Mapping[str, float]:
-        """Write and return what was really sent. Raises CommandVoidError, having written nothing, without leave."""
+    def get_joints(self) -> dict[str, float]:
+        """The numbers of an observation, read without touching a camera."""
 
-    def hold(self, permit: Permit) -> None:
-        """Freeze where it is now. Writes nothing when ``permit`` is void: then a halt holds already."""
+    def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
+        """Write ``action``; the answer is what was really sent.
+
+        Raises:
+            PermitVoidError: ``permit`` is void, looked at under the write's own lock; nothing was written.
+        """
+
+    def hold(self, permit: Permit | None = None) -> None:
+        """Freeze where it is now; nothing when ``permit`` was revoked, for then the halt freezes it."""
+
+    def running(self) -> AbstractContextManager[None]:
+        """Held while a loop drives the body."""
 
 
-class Ticker(Protocol):
-    """Time, so that a test may own it."""
-
-    def now(self) -> float:
-        """Seconds that only go forward."""
-
-    def wait(self, event: threading.Event, seconds: float) -> bool:
-        """Wait for ``event`` at most ``seconds``; true when it was set."""
-
-
-class MonotonicTicker:
-    """The machine's own clock."""
+class Clock:
+    """Monotonic time, and waiting until a moment of it; a test gives its own."""
 
     def now(self) -> float:
         return time.monotonic()
 
-    def wait(self, event: threading.Event, seconds: float) -> bool:
-        return event.wait(seconds) if seconds > 0 else event.is_set()
+    def wait(self, until: float, stop: threading.Event) -> None:
+        """Return at ``until``, or at once when ``stop`` is set."""
+        left = until - time.monotonic()
+        if left > 0:
+            stop.wait(left)
 
 
 class Observers:
-    """Who is told of rollout events. An observer that raises is logged and told again next time."""
+    """Who is told of rollout events. One that raises is logged, once for each kind of error, and stays."""
 
     def __init__(self) -> None:
-        self._observers: tuple[Observer, ...] = ()
         self._lock = threading.Lock()
+        self._observers: tuple[Observer, ...] = ()
+        self._logged: set[tuple[int, str]] = set()
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Tell ``observer`` from now on; the returned callable ends it."""
+        """Tell ``observer`` of every event until the returned callable is called; a second call of it does nothing."""
         with self._lock:
             self._observers = (*self._observers, observer)
+        once = threading.Lock()
 
         def unsubscribe() -> None:
-            with self._lock:
-                self._observers = tuple(each for each in self._observers if each is not observer)
+            if once.acquire(blocking=False):
+                with self._lock:
+                    left = list(self._observers)
+                    left.remove(observer)
+                    self._observers = tuple(left)
 
         return unsubscribe
 
     def tell(self, event: RolloutEvent) -> None:
-        """Tell everybody, in the order in which they came."""
+        """Tell everybody, in the calling thread."""
         for observer in self._observers:
             try:
                 observer(event)
-            except Exception:
-                logger.exception("An observer of %s failed at a %s event.", event.robot, event.kind)
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What a rollout is to do: ``duration`` in seconds, ``hz`` actions a second."""
-
-    instruction: str
-    policy_name: str
-    duration: float
-    hz: float
+            except Exception as exc:
+                mark = (id(observer), type(exc).__name__)
+                if mark not in self._logged:
+                    self._logged.add(mark)
+                    logger.exception("An observer of %s raised and goes on being told.", event.robot)
 
 
 class Rollout:
-    """Runs once. ``state`` is running, completed, stopped or error; ``error`` says why in the last case."""
+    """One run of one policy on one body, on a thread of its own. It is used once.
+
+    Args:
+        body: what is driven.
+        policy: who decides; closed at the end.
+        permit: leave to move. Revoked by a halt, withdrawn by :meth:`stop`.
+        instruction: what the policy is told.
+        policy_name: how the policy is called in events and answers.
+        duration: seconds, or None for no end.
+        hz: control rate. Ticks are at absolute times; one that is missed is dropped, never made up in a burst.
+        observers: who is told of events.
+        clock: the time the loop keeps.
+    """
 
     def __init__(
         self,
         body: Body,
         policy: Policy,
-        plan: Plan,
-        permit: Permit,
         *,
-        tell: Callable[[RolloutEvent], None] = lambda event: None,
-        ticker: Ticker | None = None,
+        permit: Permit,
+        instruction: str = "",
+        policy_name: str = "policy",
+        duration: float | None = None,
+        hz: float = 50.0,
+        observers: Observers | None = None,
+        clock: Clock | None = None,
     ) -> None:
-        self.body = body
-        self.plan = plan
-        self.state = "running"
+        self.instruction = instruction
+        self.policy_name = policy_name
+        self.duration = duration
+        self.state: State = "idle"
         self.error = ""
-        self.step = 0
+        self.step_count = 0
+        self.missed_ticks = 0
+        self._body = body
         self._policy = policy
         self._permit = permit
-        self._tell = tell
-        self._ticker = ticker or MonotonicTicker()
-        self._stop = threading.Event()
-        self._begun = self._ticker.now()
+        self._period = 1 / hz
+        self._observers = observers or Observers()
+        self._clock = clock or Clock()
+        self._ending = threading.Event()
+        self._began: float | None = None
         self._ended: float | None = None
-        self._thread = threading.Thread(target=self._run, name=f"rollout-{body.name}", daemon=True)
+        self._thread = threading.Thread(target=self.run, name=f"rollout-{body.name}", daemon=True)
+
+    @property
+    def robot(self) -> str:
+        """The name of the body."""
+        return self._body.name
 
     @property
     def running(self) -> bool:
-        """True until the loop has ended for good: only so long can it still write."""
-        return self._ended is None
+        """True from :meth:`start` until the loop's thread has ended, whatever it was told."""
+        return self.state == "running" or self._thread.is_alive()
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds since the start, up to the end."""
-        return (self._ticker.now() if self._ended is None else self._ended) - self._begun
+        """Seconds since it began, or that it took."""
+        if self._began is None:
+            return 0.0
+        return (self._clock.now() if self._ended is None else self._ended) - self._began
 
-    def start(self) -> Rollout:
-        """Begin; returns at once."""
+    def row(self) -> dict[str, Any]:
+        """The rollout as a row of ``list_policies_running``."""
+        return {
+            "robot": self.robot,
+            "instruction": self.instruction,
+            "policy": self.policy_name,
+            "step": self.step_count,
+            "elapsed_s": round(self.elapsed_s, 3),
+        }
+
+    def start(self) -> None:
+        """Run on the rollout's own thread; returns at once."""
+        self.state = "running"
         self._thread.start()
-        return self
 
-    def request_stop(self) -> None:
-        """Ask the loop to end after the write that may be in flight; returns at once."""
-        self._stop.set()
-
-    def stop(self, timeout: float = JOIN_S) -> bool:
-        """Ask the loop to end and wait for it, ``timeout`` seconds at most. False when it outlived that."""
-        self.request_stop()
-        return self.wait(timeout)
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait for the end. False when it has not come within ``timeout`` seconds."""
-        if self._thread is not threading.current_thread() and self._thread.ident is not None:
+    def join(self, timeout: float | None = None) -> bool:
+        """Wait for the end; True when the loop has ended."""
+        if self._thread.ident is not None and threading.current_thread() is not self._thread:
             self._thread.join(timeout)
         return not self.running
 
-    def status(self) -> dict[str, Any]:
-        """The rollout as a row for people and agents."""
-        return {
-            "robot": self.body.name,
-            "instruction": self.plan.instruction,
-            "policy": self.plan.policy_name,
-            "state": self.state,
-            "step": self.step,
-            "elapsed_s": round(self.elapsed_s, 3),
-            "duration": self.plan.duration,
-            "error": self.error,
-        }
+    def request_stop(self) -> None:
+        """Void the permit and wake the loop; returns at once."""
+        self._permit.withdraw()
+        self._ending.set()
 
-    def _run(self) -> None:
-        self._emit("started")
+    def stop(self, timeout: float = STOP_JOIN_S) -> bool:
+        """Stop, and tell the truth: False when the loop has not ended within ``timeout`` seconds.
+
+        A loop that outlives it, in a policy that computes or on a bus that hangs, sends no action any more.
+        """
+        self.request_stop()
+        return self.join(timeout)
+
+    def run(self) -> None:
+        """The loop, in the calling thread."""
+        self.state = "running"
+        self._began = self._clock.now()
+        state: State = "stopped"
         try:
-            self.state = self._loop()
-        except CommandVoidError:
-            self.state = "stopped"
+            with self._body.running():
+                self._tell("started")
+                try:
+                    bounds = dict(self._body.bounds)
+                    self._policy.reset(self.instruction, bounds)
+                    state = self._loop(bounds)
+                except PermitVoidError:
+                    state = "stopped"
+                except Exception as exc:
+                    state, self.error = "error", f"{type(exc).__name__}: {exc}"
+                    logger.exception("The rollout of %s on %s failed; it holds.", self.policy_name, self.robot)
+                state = self._hold(state)
         except Exception as exc:
-            logger.exception("The rollout of %s on %s failed.", self.plan.policy_name, self.body.name)
-            self.error = f"{type(exc).__name__}: {exc}"
-            self.state = "error"
+            state, self.error = "error", f"{type(exc).__name__}: {exc}"
+            logger.exception("The rollout of %s on %s could not run.", self.policy_name, self.robot)
         finally:
-            self._rest()
-            self._ended = self._ticker.now()
-            self._emit("finished")
+            self._finish(state)
 
-    def _loop(self) -> str:
-        self._policy.reset(Task(self.plan.instruction, self.body.bounds, self.plan.hz))
-        waiting: deque[Action] = deque()
-        for _ in self._ticks():
-            if not self._permit.valid:
-                return "stopped"
-            observation = self.body.get_observation()
-            if not waiting:
-                waiting.extend(self._policy.act(observation))
-            if not waiting:
+    def _loop(self, bounds: Ranges) -> State:
+        started = self._clock.now()
+        chunk: deque[Action] = deque()
+        tick = 0
+        while self._permit.valid:
+            # A duration begins with the first tick: loading a policy is not part of it.
+            if self.duration is not None and self._clock.now() - started >= self.duration:
                 return "completed"
-            sent = self.body.send_action(waiting.popleft(), self._permit)
-            self.step += 1
-            self._emit("step", numbers(observation), sent)
-        return "stopped" if self._stop.is_set() else "completed"
+            observation = self._observe()
+            if not chunk:
+                decided = self._policy.act(observation)
+                if decided is None:
+                    return "completed"
+                chunk.extend([decided] if isinstance(decided, Mapping) else decided)
+            if chunk:
+                sent = self._body.send_action(checked_action(chunk.popleft(), bounds), self._permit)
+                self.step_count += 1
+                self._tell("step", observation=numbers(observation), action=numbers(sent))
+            tick = self._next(tick, started)
+            self._clock.wait(started + tick * self._period, self._ending)
+        return "stopped"
 
-    def _ticks(self) -> Iterator[None]:
-        """One turn a control period until the duration is over or a stop is asked for."""
-        period = 1 / self.plan.hz
-        begun = due = self._ticker.now()
-        while not self._stop.is_set() and self._ticker.now() - begun < self.plan.duration:
-            yield
-            due += period
-            late = self._ticker.now() - due
-            if late > 0:
-                due += int(late / period) * period
-            if self._ticker.wait(self._stop, due - self._ticker.now()):
-                return
+    def _next(self, tick: int, started: float) -> int:
+        late = int((self._clock.now() - started) / self._period) - tick
+        self.missed_ticks += max(late, 0)
+        return tick + 1 + max(late, 0)
 
-    def _rest(self) -> None:
-        """Leave nothing running: neither the last action nor what the policy took."""
-        endings: dict[str, Callable[[], None]] = {
-            "hold": lambda: self.body.hold(self._permit),
-            "close its policy": self._policy.close,
-        }
-        for what, action in endings.items():
-            try:
-                action()
-            except Exception as exc:
-                logger.exception("%s could not %s after a rollout.", self.body.name, what)
-                self.error = self.error or f"could not {what}: {type(exc).__name__}: {exc}"
-                self.state = "error"
+    def _observe(self) -> dict[str, Any]:
+        return self._body.get_observation() if self._policy.uses_cameras else dict(self._body.get_joints())
 
-    def _emit(
-        self,
-        kind: Literal["started", "step", "finished"],
-        observation: Mapping[str, float] | None = None,
-        action: Mapping[str, float] | None = None,
-    ) -> None:
-        self._tell(
+    def _hold(self, state: State) -> State:
+        try:
+            self._body.hold(self._permit)
+        except Exception as exc:  # noqa: BLE001 - a body may raise anything; the rollout ends in error and says it
+            logger.critical("%s could not be put on hold after its rollout: %s", self.robot, exc)
+            self.error = f"{self.error + '; ' if self.error else ''}hold failed: {type(exc).__name__}: {exc}"
+            return "error"
+        return state
+
+    def _finish(self, state: State) -> None:
+        self._permit.withdraw()
+        try:
+            self._policy.close()
+        except Exception:
+            logger.exception("The policy %s of %s raised when closed.", self.policy_name, self.robot)
+        self._ended = self._clock.now()
+        self.state = state
+        self._tell("finished", state=state, error=self.error)
+
+    def _tell(self, kind: Literal["started", "step", "finished"], **more: Any) -> None:
+        self._observers.tell(
             RolloutEvent(
-                kind,
-                self.body.name,
-                self.plan.instruction,
-                self.plan.policy_name,
-                self.step,
-                self.elapsed_s,
-                self.state,
-                self.error,
-                observation or {},
-                action or {},
+                kind=kind,
+                robot=self.robot,
+                instruction=self.instruction,
+                policy=self.policy_name,
+                step=self.step_count,
+                elapsed_s=self.elapsed_s,
+                **more,
             )
         )
-
-
-def numbers(observation: Mapping[str, Any]) -> dict[str, float]:
-    """The scalars of an observation as floats; images, text and booleans are left out."""
-    found: dict[str, float] = {}
-    for key, value in observation.items():
-        if isinstance(value, bool | str | bytes) or _shape(value):
-            continue
-        try:
-            found[key] = float(value)
-        except (TypeError, ValueError):
-            continue
-    return found
-
-
-def _shape(value: Any) -> tuple[int, ...]:
-    shape: tuple[int, ...] = getattr(value, "shape", ())
-    return shape

@@ -28,7 +28,7 @@ def numbers(observation: Mapping[str, object]) -> dict[str, float]:
     """The finite numbers of an observation: no images, no flags, no text."""
     found: dict[str, float] = {}
     for key, value in observation.items():
-        if isinstance(value, bool) or getattr(value, "ndim", 0):
+        if isinstance(value, bool) or getattr(value, "ndim", 0) != 0:
             continue
         scalar = value.item() if hasattr(value, "item") else value
         if isinstance(scalar, int | float) and not isinstance(scalar, bool) and math.isfinite(scalar):

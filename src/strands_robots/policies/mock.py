@@ -52,7 +52,12 @@ class MockPolicy:
         digest = hashlib.blake2b(f"{self._seed}|{instruction}".encode(), digest_size=8).digest()
         dice = random.Random(int.from_bytes(digest))
         self._waves = {
-            key: (dice.uniform(0.15, 0.3), dice.uniform(0, math.tau), dice.uniform(0.35, 0.6), dice.uniform(0, math.tau))
+            key: (
+                dice.uniform(0.15, 0.3),
+                dice.uniform(0, math.tau),
+                dice.uniform(0.35, 0.6),
+                dice.uniform(0, math.tau),
+            )
             for key in sorted(self._ranges)
         }
         self._start = None
@@ -65,9 +70,7 @@ class MockPolicy:
         seconds = self._step * self._dt
         share = smooth_step(seconds / self._fade_s)
         self._step += 1
-        return {
-            key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges
-        }
+        return {key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges}
 
     def close(self) -> None:
         """Nothing to free."""

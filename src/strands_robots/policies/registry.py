@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -46,17 +47,16 @@ def resolve_provider(provider: object) -> str:
 def create_policy(provider: str, **options: Any) -> Policy:
     """A policy of ``provider``; cheap, because loading and connecting happen in its ``reset``.
 
-    An option left at its neutral value, such as ``policy_port=0``, is the provider's own default; the
-    port is offered only to providers that take one.
+    ``policy_port=0`` is the provider's own default, and a port is given only to a provider that takes one.
 
     Raises:
         ValidationError: no such provider, or an option outside its domain.
         MissingExtraError: the provider needs an extra that is not installed.
     """
     name = resolve_provider(provider)
-    if not options.get("policy_port"):
-        options.pop("policy_port", None)
     factory = _factory(name)
+    if not options.get("policy_port") or not _takes(factory, "policy_port"):
+        options.pop("policy_port", None)
     try:
         policy = factory(**options)
     except TypeError as exc:
@@ -73,6 +73,11 @@ def _factory(name: str) -> Callable[..., Any]:
         return ours
     foreign: Callable[..., Any] = _plug_ins()[name].load()
     return foreign
+
+
+def _takes(factory: Callable[..., Any], option: str) -> bool:
+    parameters = inspect.signature(factory).parameters.values()
+    return any(p.name == option or p.kind is p.VAR_KEYWORD for p in parameters)
 
 
 def _plug_ins() -> dict[str, EntryPoint]:
