@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.drivers.reachy.feed import FRESH_S, Feed
-from strands_robots.drivers.reachy.links import Link, PubSub, key_prefix
+from strands_robots.drivers.reachy.links import ZENOH_PORT, Link, PubSub, key_prefix
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonUnknown, DaemonUnreachable, RestClient
 from strands_robots.drivers.reachy.transport import (
     APP_LOCK_SINCE,
@@ -22,7 +22,7 @@ from strands_robots.drivers.reachy.transport import (
     DaemonInfo,
     make_link,
 )
-from strands_robots.utils import ValidationError, choice
+from strands_robots.utils import ValidationError, choice, port
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +51,7 @@ class Connection:
         prefix: of the Zenoh keys; the default gives way to the robot's own name.
         transport: ``auto`` for what the daemon speaks, or a link's name.
         session: a pub/sub object for the Zenoh link in place of a session of its own.
+        zenoh_port: where a daemon before 1.5 listens for it.
     """
 
     def __init__(
@@ -61,17 +62,18 @@ class Connection:
         prefix: str = DEFAULT_PREFIX,
         transport: str = "auto",
         session: PubSub | None = None,
+        zenoh_port: int = ZENOH_PORT,
     ) -> None:
         self.rest = RestClient(host, api_port)
         self.stop_rest = RestClient(host, api_port)
         self.hub_rest = RestClient(host, api_port, read_s=10.0)
-        self._poll_rest = RestClient(host, api_port)
         self.host, self.port = self.rest.host, self.rest.port
         self._prefix = key_prefix(prefix)
         self._transport = choice("transport", transport, TRANSPORTS)
-        self._session = session
+        self._session, self._zenoh_port = session, port("zenoh_port", zenoh_port)
         self.feed = Feed()
         self.connects = 0
+        # Asked over the stop's own connection, which is thereby open and warm when a stop comes.
         self.polled = Poll()
         self._info: DaemonInfo | None = None
         self._link: Link | None = None
@@ -98,7 +100,7 @@ class Connection:
         self._drop()
         if thread is not None and thread is not threading.current_thread():
             thread.join(5.0)
-        for client in (self.rest, self.stop_rest, self.hub_rest, self._poll_rest):
+        for client in (self.rest, self.stop_rest, self.hub_rest):
             client.close()
 
     def wait(self, within_s: float) -> bool:
@@ -172,12 +174,18 @@ class Connection:
             self._drop()
 
     def _join(self) -> None:
-        info = self._info = DaemonInfo.of(self._poll_rest.get(STATUS_PATH))
+        info = self._info = DaemonInfo.of(self.rest.get(STATUS_PATH))
         if info.state not in ("running", ""):
             raise DaemonError(f"the daemon is {info.state}{': ' + info.error if info.error else ''}")
         self.feed.clear()
         link = make_link(
-            info, self.host, self.port, prefix=self._prefix, transport=self._transport, session=self._session
+            info,
+            self.host,
+            self.port,
+            prefix=self._prefix,
+            transport=self._transport,
+            session=self._session,
+            zenoh_port=self._zenoh_port,
         )
         self._link = link
         link.open(self.feed.take)
@@ -215,16 +223,17 @@ class Connection:
     def _poll(self) -> None:
         info = self._info
         holder = self._holder(info) if info is not None else ""
-        self.polled = Poll(holder, running_moves(self._poll_rest.get(RUNNING_PATH)), time.monotonic())
+        # Asked over the stop's own connection, which is thereby open and warm when a stop comes.
+        self.polled = Poll(holder, running_moves(self.stop_rest.get(RUNNING_PATH)), time.monotonic())
 
     def _holder(self, info: DaemonInfo) -> str:
         """Which application holds the robot: the lock where the daemon has one, and the managed app."""
         if info.since(APP_LOCK_SINCE):
-            lock = self._poll_rest.get(LOCK_PATH)
+            lock = self.rest.get(LOCK_PATH)
             if isinstance(lock, dict) and lock.get("state") not in ("free", None):
                 return str(lock.get("holder_name") or lock["state"])
         try:
-            app = self._poll_rest.get(APP_PATH)
+            app = self.rest.get(APP_PATH)
         except DaemonUnknown:
             return ""
         if isinstance(app, dict) and app.get("state") in ("starting", "running", "stopping"):

@@ -18,7 +18,7 @@ from strands_robots.drivers.reachy.envelope import (
 )
 from strands_robots.drivers.reachy.feed import FRESH_S
 from strands_robots.drivers.reachy.library import Library
-from strands_robots.drivers.reachy.links import PubSub
+from strands_robots.drivers.reachy.links import ZENOH_PORT, PubSub
 from strands_robots.drivers.reachy.motion import Motions, head_distance
 from strands_robots.drivers.reachy.motors import Motors
 from strands_robots.drivers.reachy.rest import DaemonUnreachable
@@ -46,6 +46,7 @@ class ReachyDriver:
         automatic_body_yaw: let the daemon turn the body along with the head; without it head and body may be at most
             65 degrees apart.
         session: a pub/sub object for the Zenoh link in place of a session of its own.
+        zenoh_port: where a daemon before 1.5 listens for it.
 
     Raises:
         ValidationError: an argument outside its domain.
@@ -63,9 +64,12 @@ class ReachyDriver:
         transport: str = "auto",
         automatic_body_yaw: bool = True,
         session: PubSub | None = None,
+        zenoh_port: int = ZENOH_PORT,
     ) -> None:
         self._automatic = flag("automatic_body_yaw", automatic_body_yaw)
-        self.connection = Connection(host, api_port, prefix=prefix, transport=transport, session=session)
+        self.connection = Connection(
+            host, api_port, prefix=prefix, transport=transport, session=session, zenoh_port=zenoh_port
+        )
         self.gate = MotionGate()
         self.motions = Motions(self.connection, self.gate, self.tool_name_str, automatic_body_yaw=self._automatic)
         self.motors = Motors(self.connection, self.motions)

@@ -10,6 +10,7 @@ import ipaddress
 import json
 import socket
 import threading
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.utils import ValidationError, choice, dial_host_error, missing_extra, number, port, shown
@@ -109,7 +110,7 @@ class RestClient:
         self.port = port("api_port", api_port)
         self._read_s = read_s
         self._lock = threading.Lock()
-        self._client: httpx.Client | None = None
+        self._pool: _Pool | None = None
 
     def get(self, path: str, within_s: float | None = None) -> Any:
         """The decoded body of a GET. Raises :class:`DaemonError`."""
@@ -126,17 +127,19 @@ class RestClient:
             DaemonError: by kind: unreachable, refused, unknown, busy, backend down, fault.
         """
         httpx = _httpx()
-        client = self._open()
+        pool = self._enter()
         try:
-            limit = client.timeout if within_s is None else max(0.01, within_s)
-            answer = client.request(method, path, json=body, timeout=limit)
+            limit = pool.client.timeout if within_s is None else max(0.01, within_s)
+            answer = pool.client.request(method, path, json=body, timeout=limit)
+            if answer.status_code >= 500:
+                # After a 500 the daemon resets the kept-alive connection under the next request.
+                self._retire(pool)
         except (httpx.HTTPError, httpx.InvalidURL, OSError) as exc:
-            self.close()
+            self._retire(pool)
             what = str(exc) or type(exc).__name__
             raise DaemonUnreachable(f"{self.host}:{self.port} did not answer {method} {path}: {what}.") from exc
-        if answer.status_code >= 500:
-            # After a 500 the daemon resets the kept-alive connection under the next request.
-            self.close(client)
+        finally:
+            self._leave(pool)
         if not answer.is_success:
             kind = _KINDS.get(answer.status_code, DaemonFault)
             raise kind(f"{method} {path}: {_detail(answer)}", answer.status_code)
@@ -145,26 +148,48 @@ class RestClient:
         except ValueError as exc:
             raise DaemonFault(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
 
-    def close(self, client: httpx.Client | None = None) -> None:
-        """Drop the connections; the next request opens new ones. With ``client`` only if that one is still in use."""
-        with self._lock:
-            if client is not None and client is not self._client:
-                return
-            current, self._client = self._client, None
-        if current is not None:
-            current.close()
+    def close(self) -> None:
+        """Drop the connections, those in use when their requests end; the next request opens new ones."""
+        pool = self._pool
+        if pool is not None:
+            self._retire(pool)
+            self._leave(pool, 0)
 
-    def _open(self) -> httpx.Client:
+    def _enter(self) -> _Pool:
         with self._lock:
-            if self._client is None:
+            if self._pool is None:
                 httpx = _httpx()
-                self._client = httpx.Client(
-                    base_url=f"http://{dialled(self.host)}:{self.port}",
-                    timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
-                    # A robot is on the local network: a proxy of the environment is not asked.
-                    trust_env=False,
+                self._pool = _Pool(
+                    httpx.Client(
+                        base_url=f"http://{dialled(self.host)}:{self.port}",
+                        timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
+                        # A robot is on the local network: a proxy of the environment is not asked.
+                        trust_env=False,
+                    )
                 )
-            return self._client
+            self._pool.users += 1
+            return self._pool
+
+    def _retire(self, pool: _Pool) -> None:
+        with self._lock:
+            if self._pool is pool:
+                self._pool = None
+
+    def _leave(self, pool: _Pool, users: int = 1) -> None:
+        """A retired pool is closed by its last user: a failed poll must not cut off a stop that is under way."""
+        with self._lock:
+            pool.users -= users
+            over = pool.users == 0 and pool is not self._pool
+        if over:
+            pool.client.close()
+
+
+@dataclass(eq=False)
+class _Pool:
+    """Kept-alive connections and the number of requests that use them now."""
+
+    client: httpx.Client
+    users: int = 0
 
 
 def api(  # noqa: PLR0917 - the documented order

@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from strands_robots.drivers.reachy.links import Link, PubSub, WebSocketLink, ZenohLink, key_prefix
+from strands_robots.drivers.reachy.links import ZENOH_PORT, Link, PubSub, WebSocketLink, ZenohLink, key_prefix
 from strands_robots.drivers.reachy.rest import DaemonFault
 from strands_robots.utils import ValidationError, shown
 
@@ -84,12 +84,19 @@ class DaemonInfo:
 
 
 def make_link(
-    info: DaemonInfo, host: str, api_port: int, *, prefix: str, transport: str = "auto", session: PubSub | None = None
+    info: DaemonInfo,
+    host: str,
+    api_port: int,
+    *,
+    prefix: str,
+    transport: str = "auto",
+    session: PubSub | None = None,
+    zenoh_port: int = ZENOH_PORT,
 ) -> Link:
     """The link for a daemon, not yet open; ``transport`` other than auto overrides the rule."""
     kind = info.link if transport == "auto" else transport
     if kind == "zenoh":
-        return ZenohLink(host, info.prefix(prefix), session=session)
+        return ZenohLink(host, info.prefix(prefix), session=session, zenoh_port=zenoh_port)
     return WebSocketLink(
         host, api_port, full_target=info.since(FULL_TARGET_SINCE), can_stop=info.since(STOP_MOVE_SINCE)
     )
