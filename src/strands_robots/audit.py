@@ -9,6 +9,7 @@ and tried again until it can; :data:`PENDING_MAX` of them are held.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import logging
 import queue
 import stat
@@ -28,6 +29,7 @@ logger = logging.getLogger(__name__)
 
 PENDING_MAX = 10_000
 RETRY_S = 1.0
+LOST = "audit_records_lost"
 FLUSH_S = 2.0
 
 
@@ -50,7 +52,11 @@ def log_safety_event(event_type: str, peer_id: str, payload: dict[str, Any]) -> 
 
 def flush_audit(timeout: float = FLUSH_S) -> bool:
     """True when every record handed over so far is on the disk; waits ``timeout`` seconds at most."""
-    return _WRITER.flush(timeout)
+    if not _WRITER.used:
+        return True
+    done = threading.Event()
+    _WRITER.put(_journal_key(), done)
+    return done.wait(timeout)
 
 
 def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
@@ -90,91 +96,99 @@ def _time(record: dict[str, Any]) -> float:
     return float(ts) if isinstance(ts, int | float) else 0.0
 
 
+class _Pending:
+    """Records of one journal that are not on the disk yet, and who waits for them."""
+
+    def __init__(self, key: _Key) -> None:
+        self.directory = key[0]
+        self.journal = _journal(key)
+        self.entries: deque[Entry] = deque()
+        self.waiting: list[threading.Event] = []
+        self.failing = False
+        self._told = 0
+
+    def write(self) -> None:
+        """Put everything on the disk, or keep it and say so."""
+        self._shed()
+        batch = list(self.entries)
+        try:
+            if batch:
+                self.journal.append(batch)
+        except Exception as exc:  # noqa: BLE001 - whatever stops the record is reported, and the record is kept
+            self._complain(exc)
+            return
+        if self.failing:
+            logger.warning("The safety audit in %s is written again.", self.directory)
+        self.failing, self._told = False, 0
+        self.entries.clear()
+        for done in self.waiting:
+            done.set()
+        self.waiting.clear()
+        if batch:
+            _warn_of_readers(self.directory)
+
+    def _complain(self, exc: Exception) -> None:
+        if not self.failing:
+            logger.critical("The safety audit in %s cannot be written: %s. Records are kept.", self.directory, exc)
+        self.failing = True
+        for entry in list(self.entries)[self._told :]:
+            logger.critical("Audit not on disk: %s %s %s", entry.event, entry.peer_id, shown(entry.payload))
+        self._told = len(self.entries)
+
+    def _shed(self) -> None:
+        lost = len(self.entries) - PENDING_MAX
+        if lost <= 0:
+            return
+        counted = 1
+        for _ in range(lost + 1):
+            gone = self.entries.popleft()
+            counted += gone.payload["lost"] - 1 if gone.event == LOST else 0
+        self.entries.appendleft(Entry(time.time(), LOST, "audit", {"lost": lost + counted}))
+        self._told = min(self._told, len(self.entries))
+
+
 class _Writer:
-    """The thread that owns the journal. Everything reaches it through one queue that is never full."""
+    """The thread that owns the journals. Everything reaches it through one queue that is never full."""
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[tuple[_Key, Entry] | threading.Event] = queue.SimpleQueue()
-        self._pending: deque[tuple[_Key, Entry]] = deque()
-        self._waiting: list[threading.Event] = []
-        self._journals: dict[_Key, Journal] = {}
+        self._queue: queue.SimpleQueue[tuple[_Key, Entry | threading.Event]] = queue.SimpleQueue()
+        self._pending: dict[_Key, _Pending] = {}
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._failing = False
 
-    def put(self, key: _Key, entry: Entry) -> None:
-        self._queue.put((key, entry))
-        self._ensure()
-
-    def flush(self, timeout: float) -> bool:
-        if self._thread is None and self._queue.empty():
-            return True
-        done = threading.Event()
-        self._queue.put(done)
-        self._ensure()
-        return done.wait(timeout)
-
-    def _ensure(self) -> None:
+    def put(self, key: _Key, item: Entry | threading.Event) -> None:
+        """Hand over a record, or an event to set when all before it are on the disk."""
+        self._queue.put((key, item))
         # A fork leaves the child with the object and without the thread.
-        if self._thread is not None and self._thread.is_alive():
-            return
-        with self._starting:
-            if self._thread is None or not self._thread.is_alive():
-                self._thread = threading.Thread(target=self._run, name="safety-audit", daemon=True)
-                self._thread.start()
+        if self._thread is None or not self._thread.is_alive():
+            with self._starting:
+                if self._thread is None or not self._thread.is_alive():
+                    self._thread = threading.Thread(target=self._run, name="safety-audit", daemon=True)
+                    self._thread.start()
+
+    @property
+    def used(self) -> bool:
+        """True once anything was handed over."""
+        return self._thread is not None
 
     def _run(self) -> None:
         while True:
             self._take()
-            while self._pending:
-                key = self._pending[0][0]
-                batch = [entry for each, entry in self._pending if each == key]
-                if not self._write(key, batch):
-                    break
-                self._pending = deque(item for item in self._pending if item[0] != key)
-            if not self._pending:
-                for done in self._waiting:
-                    done.set()
-                self._waiting.clear()
+            for pending in self._pending.values():
+                if pending.entries or pending.waiting:
+                    pending.write()
 
     def _take(self) -> None:
-        try:
-            item = self._queue.get(timeout=RETRY_S if self._pending else None)
+        unwritten = any(pending.entries for pending in self._pending.values())
+        with contextlib.suppress(queue.Empty):  # everything was taken, or it is time to try again
+            key, item = self._queue.get(timeout=RETRY_S if unwritten else None)
             while True:
-                if isinstance(item, threading.Event):
-                    self._waiting.append(item)
+                pending = self._pending.setdefault(key, _Pending(key))
+                if isinstance(item, Entry):
+                    pending.entries.append(item)
                 else:
-                    self._pending.append(item)
-                item = self._queue.get_nowait()
-        except queue.Empty:
-            self._shed()
-
-    def _shed(self) -> None:
-        lost = len(self._pending) - PENDING_MAX
-        if lost <= 0:
-            return
-        key = self._pending[0][0]
-        for _ in range(lost + 1):
-            self._pending.popleft()
-        self._pending.appendleft((key, Entry(time.time(), "audit_records_lost", "audit", {"lost": lost + 1})))
-
-    def _write(self, key: _Key, batch: list[Entry]) -> bool:
-        journal = self._journals.setdefault(key, _journal(key))
-        try:
-            journal.append(batch)
-        except Exception as exc:  # noqa: BLE001 - whatever stops the record is reported, and the record is kept
-            if not self._failing:
-                logger.critical("The safety audit in %s cannot be written: %s. Records are kept.", key[0], exc)
-            self._failing = True
-            for entry in batch[-1:]:
-                logger.critical("Audit not on disk: %s %s %s", entry.event, entry.peer_id, shown(entry.payload))
-            return False
-        if self._failing:
-            logger.warning("The safety audit in %s is written again.", key[0])
-            self._failing = False
-        else:
-            _warn_of_readers(key[0])
-        return True
+                    pending.waiting.append(item)
+                key, item = self._queue.get_nowait()
 
 
 _told: set[Path] = set()

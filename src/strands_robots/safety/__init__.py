@@ -1,1 +1,28 @@
-"""The safety plane: who may move a robot, whether it stopped, and what keeps it still."""
+"""The safety plane: who may stop, what is locked, what was halted, and the record of it.
+
+How a robot and its network enter it::
+
+    from strands_robots.safety.plane import plane
+    from strands_robots.safety.persistence import hardware_key, simulation_key
+
+    entry = plane().register("arm-1", robot, key=hardware_key("so101", port_id))   # before it can move
+    ...
+    entry.close()                                                                   # the lockout on disk stays
+
+``robot`` needs ``halt(reason)`` and a ``gate``; registering attaches the robot's lockout to the gate, so that every
+``gate.permit`` is refused while it is locked. ``key`` is None for a simulation that was given no peer id.
+
+How an emergency stop enters it, from whatever road::
+
+    from strands_robots.safety.decision import Decision
+
+    order = Decision().order(source_device_id, params, road="runtime")     # StopOrder, or a Refused that says why
+    if isinstance(order, StopOrder):
+        reports = await asyncio.to_thread(plane().emergency_stop, order)   # waits for every verdict
+
+    plane().emergency_stop(StopOrder(new_epoch(), "arm-1", "button"))      # this process's own stop
+
+``begin`` is the same without the wait. The same epoch by a second road halts nothing twice. A resume is
+``entry.resume(assertion)``; ``plane().lockouts()`` says who is locked; ``plane().checkin.fields(time.monotonic())``
+is what ``getStatus`` shows of the dead-man check-in.
+"""

@@ -1,0 +1,64 @@
+"""Threads that stand ready to halt: one a robot, so that a robot whose halt blocks holds up no other."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+
+from strands_robots.contract import Haltable
+from strands_robots.safety.stopping import StopVerdict, explain, grade
+
+Answered = Callable[[StopVerdict], None]
+
+
+def halt_of(robot: Haltable, robot_id: str, reason: str) -> StopVerdict:
+    """The robot's verdict on its own halt; whatever else it answers or raises is graded."""
+    try:
+        answer: object = robot.halt(reason)
+    except Exception as exc:  # noqa: BLE001 - a halt that raises is a robot that may be moving, and is named so
+        answer = exc
+    if isinstance(answer, StopVerdict):
+        return answer
+    outcome = grade(answer)
+    if outcome.stopped:
+        return StopVerdict((robot_id,))
+    if outcome.stopped is None:
+        return StopVerdict(unknown={robot_id: explain(answer)})
+    return StopVerdict(not_stopped={robot_id: explain(answer)})
+
+
+class HaltWorker:
+    """A daemon thread that waits for its robot's next halt. A new one is made ready when a halt has got stuck."""
+
+    def __init__(self, robot: Haltable, robot_id: str) -> None:
+        self._robot = robot
+        self._robot_id = robot_id
+        self._jobs: queue.SimpleQueue[tuple[str, Answered] | None] = queue.SimpleQueue()
+        self._thread = self._start()
+
+    def halt(self, reason: str, answered: Answered) -> None:
+        """Halt on the ready thread; ``answered`` is called there with the verdict. Returns at once."""
+        self._jobs.put((reason, answered))
+
+    def renew(self) -> None:
+        """Put a fresh thread beside one whose halt has not answered; that one ends when its halt returns."""
+        self._jobs.put(None)
+        self._jobs = queue.SimpleQueue()
+        self._thread = self._start()
+
+    def close(self, wait: float = 1.0) -> None:
+        """End the thread; one that is stuck in a halt is left behind as a daemon."""
+        self._jobs.put(None)
+        if self._thread is not threading.current_thread():
+            self._thread.join(wait)
+
+    def _start(self) -> threading.Thread:
+        thread = threading.Thread(target=self._run, args=(self._jobs,), name=f"halt-{self._robot_id}", daemon=True)
+        thread.start()
+        return thread
+
+    def _run(self, jobs: queue.SimpleQueue[tuple[str, Answered] | None]) -> None:
+        while (job := jobs.get()) is not None:
+            reason, answered = job
+            answered(halt_of(self._robot, self._robot_id, reason))

@@ -1,0 +1,320 @@
+"""The safety plane of a process: every robot in it, and the one function in which every emergency stop ends."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+from strands_robots import settings
+from strands_robots.audit import log_safety_event
+from strands_robots.contract import Haltable
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.safety.checkin import CheckIn
+from strands_robots.safety.clearance import ClearanceDesk
+from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.halting import HaltWorker
+from strands_robots.safety.latch import LockoutLatch
+from strands_robots.safety.lockout import Cleared, Hold
+from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
+from strands_robots.safety.persistence import Kept, LockoutStore
+from strands_robots.safety.reporting import OnReport, Reporter, StopRun
+from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import ValidationError, identifier, shown
+
+logger = logging.getLogger(__name__)
+
+REPORTS_KEPT = 64
+ISSUER_EXCESS = 64
+"""Different stops of one source after which the audit says so, once; they still stop."""
+
+
+class Stoppable(Haltable, Protocol):
+    """What the plane can hold: a robot with a gate and a halt."""
+
+    gate: MotionGate
+
+
+class Registered:
+    """One robot in the plane. ``close`` takes it out; the lockout on disk stays."""
+
+    def __init__(self, plane: SafetyPlane, robot_id: str, robot: Stoppable, key: str | None, kept: Kept) -> None:
+        self.robot_id = robot_id
+        self.robot = robot
+        self.key = key
+        self.users = 1
+        self.latch = LockoutLatch(robot_id, kept.state, kept.seen)
+        self.worker = HaltWorker(robot, robot_id)
+        self.verifier = ResumeVerifier([robot_id])
+        self.reports: dict[str, RobotReport] = {}
+        self._plane = plane
+
+    @property
+    def locked(self) -> bool:
+        """True while any emergency stop is held."""
+        return self.latch.state.locked
+
+    @property
+    def epochs(self) -> tuple[str, ...]:
+        """The epochs held, oldest first."""
+        return self.latch.state.epochs
+
+    def resume(self, assertion: object, road: str = "local") -> Envelope:
+        """Clear the epoch that a signed assertion names, or refuse without saying why."""
+        return self._plane.resume(self.robot_id, assertion, road)
+
+    def close(self) -> None:
+        """Take the robot out of the plane."""
+        self._plane.unregister(self)
+
+    def remember(self, report: RobotReport) -> None:
+        """Keep the report for whoever asks about this stop again."""
+        self.reports[report.epoch] = report
+        while len(self.reports) > REPORTS_KEPT:
+            del self.reports[next(iter(self.reports))]
+
+
+class SafetyPlane:
+    """All robots of the process. Every public method may be called from any thread.
+
+    Args:
+        store: where lockouts are kept.
+        deadline_s: seconds a robot has to halt; ``STRANDS_HALT_DEADLINE_S`` by default, read at each stop.
+    """
+
+    def __init__(self, store: LockoutStore | None = None, deadline_s: float | None = None) -> None:
+        self.store = store or LockoutStore()
+        self._deadline_s = deadline_s
+        self._registering = threading.Lock()
+        self._keeping = threading.Lock()
+        self._robots: dict[str, Registered] = {}
+        self._reporter: Reporter | None = None
+        self._issued: dict[str, int] = {}
+        self._desk = ClearanceDesk(self.robot_ids, self.clear_local)
+        self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
+
+    @property
+    def robots(self) -> dict[str, Registered]:
+        """The robots held now, by id; never changed, only replaced."""
+        return self._robots
+
+    def robot_ids(self) -> frozenset[str]:
+        """The ids of the robots held now."""
+        return frozenset(self._robots)
+
+    def register(self, robot_id: str, robot: Stoppable, *, key: str | None = None) -> Registered:
+        """Hold ``robot``: its gate refuses motion while it is locked, and every emergency stop halts it.
+
+        Args:
+            robot_id: the name it answers by; also what a resume targets.
+            key: what its lockout is kept under over a restart, from :func:`~.persistence.hardware_key` or
+                :func:`~.persistence.simulation_key`. None: it is not kept.
+
+        Registering the same robot again under its name, as its second network does, returns the same entry, which
+        lives until it was closed as often.
+
+        Raises:
+            ValidationError: no identifier, or another robot has this name.
+        """
+        identifier("robot_id", robot_id)
+        with self._registering:
+            known = self._robots.get(robot_id)
+            if known is not None:
+                if known.robot is not robot:
+                    raise ValidationError(f"robot_id {shown(robot_id)} is taken by another robot of this process.")
+                known.users += 1
+                return known
+            entry = Registered(self, robot_id, robot, key, self.store.load(key) if key else Kept())
+            robot.gate.attach(entry.latch)
+            if not self._robots:
+                self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
+                self._reporter = Reporter(self._tick)
+            self._robots = {**self._robots, robot_id: entry}
+        if entry.locked:
+            # A permit given before the latch was attached is void.
+            robot.gate.revoke()
+            logger.warning("%s comes up locked: epochs %s.", robot_id, ", ".join(entry.epochs))
+        return entry
+
+    def unregister(self, entry: Registered) -> None:
+        """Take a robot out when its last user lets go; the threads end with the last robot."""
+        with self._registering:
+            entry.users -= 1
+            if entry.users or self._robots.get(entry.robot_id) is not entry:
+                return
+            self._robots = {name: each for name, each in self._robots.items() if each is not entry}
+            reporter, self._reporter = self._reporter, None if not self._robots else self._reporter
+        if not self._robots and reporter is not None:
+            reporter.close()
+        entry.worker.close()
+
+    def begin(self, order: StopOrder, on_report: OnReport = lambda report: None) -> StopRun | None:
+        """Lock every robot at once and set every halt going; returns before any of them has answered.
+
+        A robot that has seen this stop is not halted again; its report of then is given to ``on_report`` at once,
+        where there is one. None when no robot had anything to do.
+        """
+        robots = [each for name, each in self._robots.items() if not (order.heard and name == order.source)]
+        fresh: list[Registered] = []
+        for entry in robots:
+            if entry.latch.engage(order.epoch, order.source, order.reason) is not None:
+                entry.robot.gate.revoke()
+                fresh.append(entry)
+        reporter = self._reporter
+        if not fresh or reporter is None:
+            self._repeat(order, robots, on_report)
+            return None
+        by_id = {entry.robot_id: entry for entry in fresh}
+
+        def reported(report: RobotReport) -> None:
+            by_id[report.robot_id].remember(report)
+            on_report(report)
+
+        run = StopRun(
+            order,
+            tuple(by_id),
+            frozenset(name for name, entry in by_id.items() if entry.key),
+            settings.number("STRANDS_HALT_DEADLINE_S") if self._deadline_s is None else self._deadline_s,
+            lambda name: by_id[name].epochs,
+            reported,
+            self._record,
+            lambda: self._keep(fresh),
+            {name: entry.worker for name, entry in by_id.items()},
+        )
+        for entry in fresh:
+            entry.worker.halt(order.reason, functools.partial(reporter.answer, run, entry.robot_id))
+        reporter.begin(run)
+        self._repeat(order, [each for each in robots if each.robot_id not in by_id], on_report)
+        return run
+
+    def emergency_stop(self, order: StopOrder, on_report: OnReport = lambda report: None) -> dict[str, RobotReport]:
+        """Lock and halt every robot of the process and wait for their answers, by robot id.
+
+        Returns within the halt deadline and the time the lockout file takes, whatever the robots do. A robot that
+        has seen this stop before answers with its report of then.
+        """
+        run = self.begin(order, on_report)
+        if run is not None:
+            run.wait(run.deadline_s + 2.0)
+        answers = (entry.reports.get(order.epoch) for entry in self._robots.values())
+        return {report.robot_id: report for report in answers if report is not None}
+
+    def resume(self, robot_id: str, assertion: object, road: str) -> Envelope:
+        """Check a signed resume for one robot; the wire's answer never says why it was rejected."""
+        entry = self._robots.get(robot_id)
+        if entry is None:
+            return error(REJECTED)
+        verdict = entry.verifier.check(assertion, entry.latch.state.resumable)
+        if not isinstance(verdict, Admitted):
+            log_safety_event("resume_denied", robot_id, {"why": verdict.value, "road": road})
+            return error(REJECTED)
+        entry.latch.resume(verdict.epoch)
+        persisted = self._kept([entry])
+        log_safety_event(
+            "resume_ok",
+            robot_id,
+            {"epoch": verdict.epoch, "road": road, "still_held": list(entry.epochs), "persisted": persisted},
+        )
+        self._freed()
+        left = f"; {len(entry.epochs)} more stops hold it" if entry.locked else " and may move when told to"
+        return success(
+            f"{robot_id} is free of {verdict.epoch}{left}.",
+            epoch=verdict.epoch,
+            locked=entry.locked,
+            epochs=list(entry.epochs),
+        )
+
+    def clear_local(self, who: str, robot_ids: Iterable[str] | None = None) -> dict[str, tuple[Hold, ...]]:
+        """Clear everything that these robots hold (all by default) at the word of ``who``, at this machine."""
+        wanted = self._robots.keys() if robot_ids is None else set(robot_ids)
+        cleared: dict[str, tuple[Hold, ...]] = {}
+        for name in wanted & self._robots.keys():
+            entry = self._robots[name]
+            effect = entry.latch.clear_local(who)
+            if not isinstance(effect, Cleared):
+                continue
+            cleared[name] = effect.holds
+            persisted = self._kept([entry])
+            epochs = [hold.epoch for hold in effect.holds]
+            log_safety_event("resume_local", name, {"who": who, "epochs": epochs, "persisted": persisted})
+            logger.warning("%s was cleared at this machine by %s.", name, who)
+        self._freed()
+        return cleared
+
+    def lockouts(self) -> dict[str, tuple[Hold, ...]]:
+        """Who is locked now, and by what."""
+        return {name: entry.latch.state.all for name, entry in self._robots.items() if entry.locked}
+
+    def _repeat(self, order: StopOrder, robots: Iterable[Registered], on_report: OnReport) -> None:
+        for entry in robots:
+            known = entry.reports.get(order.epoch)
+            if known is not None:
+                on_report(_again(entry, known))
+            elif order.epoch not in entry.epochs and order.epoch in entry.latch.seen:
+                why = {entry.robot_id: "this stop was resumed before it came again"}
+                on_report(RobotReport(entry.robot_id, order.epoch, StopVerdict(unknown=why), entry.epochs, 0.0))
+
+    def _keep(self, entries: Iterable[Registered]) -> None:
+        # One at a time, so that no older state is written over a newer one.
+        with self._keeping:
+            records = {entry.key: Kept(entry.latch.state, entry.latch.seen) for entry in entries if entry.key}
+            if records:
+                self.store.save(records)
+
+    def _kept(self, entries: Iterable[Registered]) -> bool:
+        try:
+            self._keep(entries)
+        except OSError:
+            logger.critical("The lockout file was not written: after a restart the old state holds.", exc_info=True)
+            return False
+        return True
+
+    def _record(self, run: StopRun) -> None:
+        order, now = run.order, time.time()
+        event = "remote_estop_engaged" if order.heard else "emergency_stop"
+        for report in run.reports.values():
+            facts: dict[str, Any] = {
+                **report.fields(),
+                "source": order.source,
+                "reason": order.reason,
+                "road": order.road,
+                "issued": order.issued,
+                "timing": order.timing(now),
+            }
+            log_safety_event(event, report.robot_id, facts)
+        if len(self._issued) < 1024 or order.source in self._issued:
+            self._issued[order.source] = self._issued.get(order.source, 0) + 1
+            if self._issued[order.source] == ISSUER_EXCESS:
+                log_safety_event("estop_issuer_excess", order.source or "unnamed", {"stops": ISSUER_EXCESS})
+
+    def _freed(self) -> None:
+        if not self.lockouts():
+            self.checkin.rearm(time.monotonic())
+
+    def _tick(self) -> None:
+        silent = self.checkin.lapsed(time.monotonic())
+        if silent is not None:
+            names = ", ".join(silent) or "no safety controller was ever heard"
+            reason = f"check-in lost: {names}, {self.checkin.timeout_s:g} s"
+            self.begin(StopOrder(new_epoch(), "check-in", reason, road="check-in"))
+        if any(entry.locked for entry in self._robots.values()):
+            self._desk.look()
+
+
+def _again(entry: Registered, known: RobotReport) -> RobotReport:
+    return RobotReport(
+        known.robot_id, known.epoch, known.verdict, entry.epochs, known.elapsed_ms, known.persisted, repeated=True
+    )
+
+
+_PLANE = SafetyPlane()
+
+
+def plane() -> SafetyPlane:
+    """The plane of this process."""
+    return _PLANE
+

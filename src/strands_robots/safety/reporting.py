@@ -1,0 +1,219 @@
+"""After the halts were ordered: wait for the answers, keep the lockouts, report, record. Never on a stop's way.
+
+One thread turns three things into reports: a halt's answer, the lockout file being written, and time. It waits for
+nothing else: the file is written by a thread of its own, and the audit has its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from strands_robots.safety.halting import HaltWorker
+from strands_robots.safety.orders import RobotReport, StopOrder
+from strands_robots.safety.stopping import StopVerdict
+
+logger = logging.getLogger(__name__)
+
+GRACE_S = 0.03
+"""Lockouts are written when every robot has answered, or after this long: a slow halt delays only its own report."""
+
+KEEP_S = 0.7
+"""How long a report waits for the lockout file before it says ``persisted: false``."""
+
+OnReport = Callable[[RobotReport], None]
+OnDone = Callable[["StopRun"], None]
+
+
+@dataclass(eq=False)
+class StopRun:
+    """One emergency stop on its way through the robots of this process."""
+
+    order: StopOrder
+    robot_ids: tuple[str, ...]
+    kept_ids: frozenset[str]
+    deadline_s: float
+    epochs_of: Callable[[str], tuple[str, ...]]
+    on_report: OnReport
+    on_done: OnDone
+    keep: Callable[[], None]
+    workers: dict[str, HaltWorker]
+    reports: dict[str, RobotReport] = field(default_factory=dict)
+    done: threading.Event = field(default_factory=threading.Event)
+    started: float = field(default_factory=time.monotonic)
+    answers: dict[str, tuple[StopVerdict, float]] = field(default_factory=dict)
+    keeping_since: float | None = None
+    kept: bool | None = None
+
+    def wait(self, timeout: float) -> bool:
+        """True when every robot has been reported."""
+        return self.done.wait(timeout)
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    run: StopRun
+    robot_id: str
+    verdict: StopVerdict
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    run: StopRun
+    ok: bool
+
+
+class Reporter:
+    """The reporting thread and the one that writes the file. Made with the first robot, closed with the last.
+
+    Args:
+        tick: called about every ``tick_s`` seconds on the reporting thread, for what is due by time alone.
+    """
+
+    def __init__(self, tick: Callable[[], None] = lambda: None, tick_s: float = 0.1) -> None:
+        self._inbox: queue.SimpleQueue[StopRun | _Answer | _Kept | None] = queue.SimpleQueue()
+        self._files: queue.SimpleQueue[StopRun | None] = queue.SimpleQueue()
+        self._runs: list[StopRun] = []
+        self._tick = tick
+        self._tick_s = tick_s
+        self._threads = [
+            threading.Thread(target=self._run, name="safety-report", daemon=True),
+            threading.Thread(target=self._write, name="safety-keep", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def begin(self, run: StopRun) -> None:
+        """Follow ``run`` to its end."""
+        self._inbox.put(run)
+
+    def answer(self, run: StopRun, robot_id: str, verdict: StopVerdict) -> None:
+        """A halt has answered."""
+        self._inbox.put(_Answer(run, robot_id, verdict, time.monotonic()))
+
+    def close(self) -> None:
+        """End both threads; what is still unreported is reported as unanswered first."""
+        self._inbox.put(None)
+        self._files.put(None)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(1.0)
+
+    def _run(self) -> None:
+        next_tick = time.monotonic() + self._tick_s
+        while True:
+            try:
+                message = self._inbox.get(timeout=self._patience())
+            except queue.Empty:
+                message = None
+            else:
+                if message is None:
+                    for run in list(self._runs):
+                        self._time_out(run)
+                    return
+            if time.monotonic() >= next_tick:
+                next_tick = time.monotonic() + self._tick_s
+                _call(self._tick)
+            if isinstance(message, StopRun):
+                self._runs.append(message)
+            elif isinstance(message, _Answer):
+                self._answered(message)
+            elif isinstance(message, _Kept):
+                message.run.kept = message.ok
+            for run in list(self._runs):
+                self._advance(run, time.monotonic())
+
+    def _patience(self) -> float:
+        return min([self._tick_s, *(0.01 for _ in self._runs)])
+
+    def _answered(self, answer: _Answer) -> None:
+        run = answer.run
+        late = run.reports.get(answer.robot_id)
+        run.answers[answer.robot_id] = (answer.verdict, answer.at)
+        if late is not None:
+            logger.warning("%s answered its halt late: stopped=%s.", answer.robot_id, answer.verdict.stopped)
+            self._report(run, answer.robot_id, late=True)
+
+    def _advance(self, run: StopRun, now: float) -> None:
+        waiting = [each for each in run.robot_ids if each not in run.answers]
+        if run.keeping_since is None and (not waiting or now - run.started >= GRACE_S):
+            run.keeping_since = now
+            self._files.put(run)
+        if run.keeping_since is not None and run.kept is None and now - run.keeping_since > KEEP_S:
+            run.kept = False
+        if run.kept is not None:
+            for robot_id in run.robot_ids:
+                if robot_id in run.answers and robot_id not in run.reports:
+                    self._report(run, robot_id)
+        if waiting and now - run.order.received >= run.deadline_s:
+            self._time_out(run)
+        if len(run.reports) == len(run.robot_ids):
+            self._finish(run)
+
+    def _time_out(self, run: StopRun) -> None:
+        for robot_id in run.robot_ids:
+            if robot_id in run.reports:
+                continue
+            if robot_id not in run.answers:
+                why = {robot_id: f"no answer in {run.deadline_s:g} s"}
+                run.answers[robot_id] = (StopVerdict(not_stopped=why), time.monotonic())
+                run.workers[robot_id].renew()
+            self._report(run, robot_id)
+
+    def _report(self, run: StopRun, robot_id: str, *, late: bool = False) -> None:
+        verdict, at = run.answers[robot_id]
+        persisted = bool(run.kept) if robot_id in run.kept_ids else None
+        report = RobotReport(
+            robot_id,
+            run.order.epoch,
+            verdict,
+            run.epochs_of(robot_id),
+            (at - run.order.received) * 1000,
+            persisted=persisted,
+            late=late,
+        )
+        run.reports[robot_id] = report
+        if report.stopped is not True:
+            logger.critical(
+                "%s did not confirm emergency stop %s of %s: not stopped %s, unknown %s.",
+                robot_id,
+                run.order.epoch,
+                run.order.source,
+                dict(verdict.not_stopped),
+                dict(verdict.unknown),
+            )
+        if persisted is False:
+            logger.critical("%s is locked, but its lockout is not on the disk: a restart would forget it.", robot_id)
+        _call(run.on_report, report)
+
+    def _finish(self, run: StopRun) -> None:
+        self._runs.remove(run)
+        run.done.set()
+        _call(run.on_done, run)
+
+    def _write(self) -> None:
+        while (run := self._files.get()) is not None:
+            try:
+                run.keep()
+            except Exception:
+                logger.critical("The lockout file was not written.", exc_info=True)
+                self._inbox.put(_Kept(run, ok=False))
+            else:
+                self._inbox.put(_Kept(run, ok=True))
+
+
+def _call(listener: Callable[..., None], *args: object) -> None:
+    try:
+        listener(*args)
+    except Exception:
+        logger.critical("A listener of a stop's report raised.", exc_info=True)
+
+
+def all_stopped(reports: Iterable[RobotReport]) -> bool:
+    """True when every report says that its robot is known to be still."""
+    return all(report.stopped is True for report in reports)

@@ -1,0 +1,345 @@
+"""Where every emergency stop ends: all robots locked at once, halted side by side, answered for by name."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.recording_robot import RecordingRobot
+from fixtures.waiting import eventually
+
+from strands_robots.audit import read_audit_log
+from strands_robots.envelope import is_error
+from strands_robots.safety import clearance, ed25519
+from strands_robots.safety.orders import RobotReport, StopOrder, derived_epoch, epoch_of, new_epoch
+from strands_robots.safety.persistence import LockoutStore, hardware_key
+from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.resume import sign
+from strands_robots.utils import ValidationError
+
+Add = Callable[..., RecordingRobot]
+
+
+@pytest.fixture
+def plane() -> Iterator[SafetyPlane]:
+    here = SafetyPlane(deadline_s=0.5)
+    yield here
+    for entry in list(here.robots.values()):
+        entry.close()
+
+
+@pytest.fixture
+def add(plane: SafetyPlane) -> Iterator[Add]:
+    made: list[RecordingRobot] = []
+
+    def one(robot_id: str = "arm-1", key: str | None = None, **robot: Any) -> RecordingRobot:
+        made.append(RecordingRobot(**robot))
+        plane.register(robot_id, made[-1], key=key)
+        return made[-1]
+
+    yield one
+    for robot in made:
+        robot.close()
+
+
+def order(epoch: str = "", source: str = "safety-1", **fields: Any) -> StopOrder:
+    return StopOrder(epoch or new_epoch(), source, fields.pop("reason", "smoke"), **fields)
+
+
+def test_after_the_verdict_no_action_reaches_the_device(plane: SafetyPlane, add: Add) -> None:
+    robots = {f"arm-{n}": add(f"arm-{n}", write_s=0.003) for n in range(4)}
+    for robot in robots.values():
+        robot.start()
+    eventually(lambda: all(len(robot.device.times) > 3 for robot in robots.values()))
+    given: dict[str, float] = {}
+    reports = plane.emergency_stop(order(), lambda report: given.setdefault(report.robot_id, time.monotonic()))
+    assert {name: report.stopped for name, report in reports.items()} == dict.fromkeys(robots, True)
+    time.sleep(0.05)
+    for name, robot in robots.items():
+        assert robot.device.times[-1] <= given[name]
+        assert reports[name].verdict.halted == ("policy",)
+        assert robot.refuses()
+
+
+def test_every_robot_is_locked_before_any_has_halted(plane: SafetyPlane, add: Add) -> None:
+    go = threading.Event()
+    robots = [add(f"arm-{n}", before_halt=lambda: go.wait(5)) for n in range(8)]
+    run = plane.begin(order())
+    assert run is not None
+    assert all(robot.refuses() for robot in robots)
+    go.set()
+    assert run.wait(5)
+
+
+def test_a_wedged_robot_holds_up_no_other_and_is_named(plane: SafetyPlane, add: Add) -> None:
+    release = threading.Event()
+    wedged = add("wedged", before_halt=lambda: release.wait(10))
+    add("well")
+    seen: list[RobotReport] = []
+    run = plane.begin(order(), seen.append)
+    assert run is not None
+    eventually(lambda: [each.robot_id for each in seen] == ["well"])
+    assert wedged.refuses()
+    assert run.wait(5)
+    report = run.reports["wedged"]
+    assert report.stopped is False
+    assert report.verdict.not_stopped == {"wedged": "no answer in 0.5 s"}
+    assert run.reports["well"].stopped is True
+    assert run.reports["well"].elapsed_ms < report.elapsed_ms
+    release.set()
+    late = eventually(lambda: [each for each in seen if each.late])
+    assert (late[0].robot_id, late[0].stopped) == ("wedged", True)
+
+
+def test_a_robot_wedged_in_one_stop_is_asked_again_by_the_next(plane: SafetyPlane, add: Add) -> None:
+    release = threading.Event()
+    robot = add("wedged", before_halt=lambda: release.wait(10))
+    assert plane.emergency_stop(order())["wedged"].stopped is False
+    assert plane.emergency_stop(order())["wedged"].stopped is False
+    assert len(robot.halts) == 2
+    release.set()
+    assert plane.emergency_stop(order())["wedged"].stopped is True
+
+
+@pytest.mark.parametrize(
+    ("answer", "stopped"),
+    [
+        ({"status": "error", "reason": "bus is gone"}, False),
+        (RuntimeError("bus is gone"), False),
+        ({"odd": 1}, None),
+        (None, None),
+        ({"status": "success"}, True),
+    ],
+)
+def test_each_answer_of_a_halt_is_graded(plane: SafetyPlane, add: Add, answer: object, stopped: bool | None) -> None:
+    robot = add()
+
+    def halt(reason: str = "") -> Any:
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    robot.halt = halt  # type: ignore[method-assign]
+    assert plane.emergency_stop(order())["arm-1"].stopped is stopped
+    assert robot.refuses()
+
+
+def test_the_second_road_is_a_no_op_that_answers_the_same(plane: SafetyPlane, add: Add) -> None:
+    robot = add()
+    first, epoch = [], new_epoch()
+    plane.emergency_stop(order(epoch, road="lane"), first.append)
+    again: list[RobotReport] = []
+    assert plane.begin(order(epoch, road="runtime"), again.append) is None
+    assert len(robot.halts) == 1
+    assert (again[0].repeated, again[0].stopped) == (True, True)
+    assert again[0].elapsed_ms == first[0].elapsed_ms
+
+
+def test_roads_that_meet_at_the_same_moment_halt_once(plane: SafetyPlane, add: Add) -> None:
+    robot, epoch = add(), new_epoch()
+    threads = [threading.Thread(target=plane.emergency_stop, args=(order(epoch),)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(robot.halts) == 1
+
+
+def test_a_robot_is_not_stopped_by_its_own_event_but_its_neighbours_are(plane: SafetyPlane, add: Add) -> None:
+    own, other = add("arm-1"), add("arm-2")
+    plane.emergency_stop(order(source="arm-1", heard=True))
+    assert not own.refuses()
+    assert other.refuses()
+
+
+def test_its_own_local_stop_stops_everything(plane: SafetyPlane, add: Add) -> None:
+    own, other = add("arm-1"), add("arm-2")
+    plane.emergency_stop(order(source="arm-1"))
+    assert own.refuses()
+    assert other.refuses()
+
+
+def test_the_reason_reaches_the_robot(plane: SafetyPlane, add: Add) -> None:
+    robot = add()
+    plane.emergency_stop(order(reason="smoke in cell 3"))
+    assert robot.reasons == ["smoke in cell 3"]
+
+
+def test_each_stop_is_in_the_audit_with_its_verdict_and_its_timing(plane: SafetyPlane, add: Add) -> None:
+    add(key=hardware_key("so101", "usb-1"))
+    now = time.time()
+    for issued in (None, now, now - 3600, now + 3600):
+        plane.emergency_stop(order(heard=True, road="lane", issued=issued))
+    records = eventually(lambda: len(all_ := read_audit_log()) == 4 and all_)
+    assert {each["event"] for each in records} == {"remote_estop_engaged"}
+    assert [each["payload"]["timing"] for each in records] == ["untimed", "on time", "late", "ahead"]
+    assert all(each["payload"]["stopped"] and each["payload"]["persisted"] for each in records)
+    assert records[0]["payload"]["source"] == "safety-1"
+
+
+def test_a_lockout_survives_the_process_and_so_does_the_memory_of_its_id(plane: SafetyPlane, add: Add) -> None:
+    key, epoch = hardware_key("so101", "usb-1"), new_epoch()
+    add(key=key)
+    report = plane.emergency_stop(order(epoch))["arm-1"]
+    assert report.persisted is True
+    after = SafetyPlane(deadline_s=0.5)
+    robot = RecordingRobot()
+    permit = robot.gate.permit("start")
+    entry = after.register("arm-1", robot, key=key)
+    assert robot.refuses()
+    assert not permit.valid
+    assert entry.epochs == (epoch,)
+    assert after.emergency_stop(order(epoch)) == {}
+    assert robot.halts == []
+    entry.close()
+
+
+def test_a_simulation_without_a_name_is_not_kept(plane: SafetyPlane, add: Add) -> None:
+    add()
+    assert plane.emergency_stop(order())["arm-1"].persisted is None
+    assert LockoutStore().load_all() == {}
+
+
+def test_a_lockout_that_cannot_be_written_is_still_reported(
+    plane: SafetyPlane, add: Add, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = add(key="k")
+    monkeypatch.setenv("STRANDS_STATE_DIR", "/proc/nowhere")
+    report = plane.emergency_stop(order())["arm-1"]
+    assert (report.stopped, report.persisted) == (True, False)
+    assert robot.refuses()
+    assert "not on the disk" in caplog.text
+
+
+def test_an_id_resumed_before_comes_again_and_is_answered_without_a_halt(plane: SafetyPlane, add: Add) -> None:
+    robot, epoch = add(), new_epoch()
+    plane.robots["arm-1"].latch.engage(epoch, "s", "")
+    plane.robots["arm-1"].latch.resume(epoch)
+    seen: list[RobotReport] = []
+    plane.begin(order(epoch), seen.append)
+    assert robot.halts == []
+    assert "resumed" in str(seen[0].verdict.unknown)
+
+
+@pytest.fixture
+def operator(monkeypatch: pytest.MonkeyPatch) -> Ed25519PrivateKey:
+    key = Ed25519PrivateKey.generate()
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", ed25519.encode(ed25519.public_half(key)))
+    return key
+
+
+def test_two_stops_need_two_resumes_and_a_resume_starts_nothing(
+    plane: SafetyPlane, add: Add, operator: Ed25519PrivateKey
+) -> None:
+    robot = add()
+    robot.start()
+    epochs = [new_epoch(), new_epoch()]
+    for epoch in epochs:
+        plane.emergency_stop(order(epoch))
+    for left, epoch in ((True, epochs[0]), (False, epochs[1])):
+        answer = plane.resume("arm-1", sign(operator, epoch, ["arm-1"])[0], "test")
+        assert not is_error(answer)
+        assert answer["locked"] is left
+        assert robot.refuses() is left
+    writes = len(robot.device.times)
+    time.sleep(0.03)
+    assert len(robot.device.times) == writes
+    robot.start()
+    assert robot.moving
+
+
+def test_a_rejected_resume_says_nothing_on_the_wire_and_why_in_the_audit(
+    plane: SafetyPlane, add: Add, operator: Ed25519PrivateKey
+) -> None:
+    robot, epoch = add(), new_epoch()
+    plane.emergency_stop(order(epoch))
+    answer = plane.resume("arm-1", sign(operator, epoch, ["arm-2"])[0], "mesh")
+    assert answer["reason"] == "resume rejected"
+    assert robot.refuses()
+    denied = [each for each in read_audit_log() if each["event"] == "resume_denied"]
+    assert "targets" in denied[0]["payload"]["why"]
+    assert is_error(plane.resume("nobody", {}, "mesh"))
+
+
+def test_a_local_clear_frees_names_who_and_survives_a_restart(plane: SafetyPlane, add: Add) -> None:
+    robot = add(key="k")
+    plane.emergency_stop(order())
+    assert list(plane.clear_local("ann")) == ["arm-1"]
+    assert not robot.refuses()
+    assert not LockoutStore().load("k").state.locked
+    assert [each["payload"]["who"] for each in read_audit_log() if each["event"] == "resume_local"] == ["ann"]
+
+
+def test_a_slip_laid_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane, add: Add) -> None:
+    robots = {name: add(name) for name in ("arm-1", "arm-2")}
+    plane.emergency_stop(order())
+    clearance.lay("ann", ["arm-1"])
+    eventually(lambda: not robots["arm-1"].refuses())
+    assert robots["arm-2"].refuses()
+    assert list(clearance.clearances().iterdir()) == []
+
+
+def test_a_slip_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:
+    robot = add()
+    plane.emergency_stop(order())
+    clearance.lay("ann", ["arm-1"])
+    clearance.clearances().chmod(0o777)
+    time.sleep(0.6)
+    assert robot.refuses()
+
+
+def test_the_name_of_another_robot_is_refused_and_the_same_robot_is_shared(plane: SafetyPlane, add: Add) -> None:
+    robot = add()
+    assert plane.register("arm-1", robot) is plane.robots["arm-1"]
+    with pytest.raises(ValidationError, match="arm-1"):
+        plane.register("arm-1", RecordingRobot())
+    entry = plane.robots["arm-1"]
+    entry.close()
+    assert "arm-1" in plane.robots
+    entry.close()
+    assert plane.robots == {}
+
+
+def test_the_last_robot_out_ends_the_threads() -> None:
+    before = threading.active_count()
+    here = SafetyPlane()
+    entries = [here.register(f"arm-{n}", RecordingRobot()) for n in range(3)]
+    assert threading.active_count() == before + 5
+    for entry in entries:
+        entry.close()
+    assert threading.active_count() == before
+
+
+def test_a_stop_without_robots_is_answered_by_none(plane: SafetyPlane) -> None:
+    assert plane.emergency_stop(order()) == {}
+
+
+def test_a_silent_controller_stops_the_robot_which_says_who(
+    add: Add, plane: SafetyPlane, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_CHECKIN_TIMEOUT_S", "0.2")
+    robot = add()
+    for _ in range(8):
+        plane.checkin.heard("safety-1", time.monotonic())
+        time.sleep(0.05)
+        assert not robot.refuses()
+    eventually(robot.refuses)
+    assert "safety-1" in robot.reasons[0]
+    assert plane.checkin.time_left(time.monotonic()) == 0.0
+    assert len(robot.halts) == 1
+    plane.clear_local("ann")
+    eventually(lambda: len(robot.halts) == 2)
+    assert "no safety controller" in robot.reasons[1]
+
+
+def test_the_epoch_of_a_stop_is_its_id_or_derived_the_same_on_every_road() -> None:
+    epoch = new_epoch()
+    assert epoch_of("s", {"estop_id": epoch, "event_id": "e"}, b"") == epoch
+    derived = epoch_of("s", {"estop_id": epoch.upper()[:31] + "X", "event_id": "e"}, b"one")
+    assert derived == epoch_of("s", {"event_id": "e"}, b"two") == derived_epoch("s", b"e")
+    assert derived != epoch_of("t", {"event_id": "e"}, b"one")
+    assert epoch_of("s", {}, b"one") != epoch_of("s", {}, b"two")
