@@ -23,7 +23,7 @@ def dress(spec: Any, *, floor: bool) -> None:
     spec.stat.extent = 1.0
     spec.stat.center = [0.1, 0.0, 0.1]
     visual.map.znear, visual.map.zfar = 0.005, 30
-    visual.map.shadowclip = 1.2
+    visual.map.shadowclip = 2.2
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,

@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+
 from strands_robots.simulation import gl
+
+_LATE = "mujoco" in sys.modules and gl.undecided()
 
 BACKEND: str = gl.prepare()
 """The OpenGL backend in use: egl, osmesa, disable, the user's own word, or empty for MuJoCo's default."""
 
 import mujoco  # noqa: E402 - MuJoCo reads MUJOCO_GL while it is imported
+
+
+def _make_up() -> None:
+    """Give a MuJoCo that was imported before the choice the context class that it would have taken."""
+    contexts = sys.modules.get("mujoco.rendering.classic.gl_context") or sys.modules.get("mujoco.gl_context")
+    if contexts is not None:
+        vars(contexts)["GLContext"] = importlib.import_module(f"mujoco.{BACKEND}").GLContext
+
+
+if _LATE and BACKEND in gl.LIBRARIES:
+    _make_up()
 
 __all__ = ["BACKEND", "mujoco"]

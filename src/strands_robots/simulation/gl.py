@@ -1,6 +1,7 @@
-"""Which OpenGL MuJoCo renders with, chosen once, before MuJoCo is imported.
+"""Which OpenGL MuJoCo renders with, chosen once.
 
-MuJoCo reads ``MUJOCO_GL`` while it is being imported and never again. Without a display its default (GLFW)
+MuJoCo reads ``MUJOCO_GL`` while it is being imported and never again; where somebody imported it earlier,
+``engine`` makes up for it. Without a display its default (GLFW)
 cannot work, so EGL is taken where its library is there, else OSMesa; a value the user has set is kept.
 """
 
@@ -8,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import platform
-import sys
 from functools import cache
 
 from strands_robots import settings
@@ -16,27 +16,32 @@ from strands_robots import settings
 PACKAGES = "libegl1 libgl1 libgl1-mesa-dri (EGL) or libosmesa6 (OSMesa)"
 """The Debian packages that bring software rendering."""
 
-_LIBRARIES = {"egl": ("libEGL.so.1", "libGL.so.1"), "osmesa": ("libOSMesa.so.8",)}
+LIBRARIES = {"egl": ("libEGL.so.1", "libGL.so.1"), "osmesa": ("libOSMesa.so.8",)}
 
 
 def loads(backend: str) -> bool:
     """True when every shared library of ``backend`` (egl or osmesa) can be loaded."""
     try:
-        for library in _LIBRARIES[backend]:
+        for library in LIBRARIES[backend]:
             ctypes.CDLL(library)
     except OSError:
         return False
     return True
 
 
+def undecided() -> bool:
+    """True while nobody has said which backend to use."""
+    return not settings.is_set("MUJOCO_GL")
+
+
 @cache
 def prepare() -> str:
     """Choose the backend and set ``MUJOCO_GL``: the chosen one, the user's own, or empty for MuJoCo's default."""
-    if settings.is_set("MUJOCO_GL"):
+    if not undecided():
         return settings.raw("MUJOCO_GL").lower()
-    if platform.system() != "Linux" or settings.is_set("DISPLAY") or "mujoco" in sys.modules:
+    if platform.system() != "Linux" or settings.is_set("DISPLAY"):
         return ""
-    for backend in _LIBRARIES:
+    for backend in LIBRARIES:
         if loads(backend):
             settings.put("MUJOCO_GL", backend)
             return backend

@@ -83,7 +83,9 @@ def map_robot(model: Any, name: str, label: str) -> RobotParts:
             continue
         key = full[len(prefix) :] or (joint_names[target] if on_joint else f"actuator_{len(actuators)}")
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-UNBOUNDED, UNBOUNDED)
-        actuators[key] = Actuator(key, index, float(low), float(high), is_servo(model, index))
+        # MuJoCo computes an inherited range, which leaves 2.0 as 2.0000000000000004.
+        bounds = round(float(low), 12), round(float(high), 12)
+        actuators[key] = Actuator(key, index, *bounds, is_servo(model, index))
     cameras = tuple(n for n in (model.camera(i).name for i in range(model.ncam)) if n.startswith(prefix))
     return RobotParts(name, label, joints, actuators, cameras, _tip(model, prefix), _root(model, prefix), base)
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from strands_robots.safety.gate import Permit
+from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.parts import Actuator, RobotParts
 from strands_robots.simulation.stage import Floats, Stage
@@ -34,10 +34,6 @@ CHUNK = 64
 # Numbers a joint has in qpos and in qvel, by mjtJoint: free, ball, slide, hinge.
 _QPOS = {0: 7, 1: 4, 2: 1, 3: 1}
 _QVEL = {0: 6, 1: 3, 2: 1, 3: 1}
-
-
-class CommandVoidError(RuntimeError):
-    """The permit was void when the write came: the robot was halted in between, and nothing was written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +100,7 @@ class Physics:
         """Set targets of one robot; the answer is what was really set, clamped to each actuator's range.
 
         Raises:
-            CommandVoidError: ``permit`` is void; nothing was written.
+            PermitVoidError: ``permit`` is void; nothing was written.
             ValidationError: the robot or a key is not there; nothing was written.
         """
         with self._command_lock:
@@ -116,14 +112,19 @@ class Physics:
                     raise ValidationError(f"action has no key {shown(key)}; {robot_name} has {', '.join(actuators)}.")
                 sent[key] = actuator.clamp(value)
             if permit is not None and not permit.valid:
-                raise CommandVoidError(f"{robot_name} was halted")
+                raise PermitVoidError(f"{robot_name} was halted")
             for key, value in sent.items():
                 self._setpoints[actuators[key].index] = value
             return sent
 
-    def hold(self, robot_name: str | None = None) -> None:
-        """Freeze one robot, or all: servos hold where they are now, everything else is commanded to zero."""
+    def hold(self, robot_name: str | None = None, permit: Permit | None = None) -> None:
+        """Freeze one robot, or all: servos hold where they are now, everything else is commanded to zero.
+
+        Nothing is written when ``permit`` was revoked: the halt that did it has frozen the robot.
+        """
         with self._command_lock:
+            if permit is not None and permit.revoked:
+                return
             robots: Iterable[RobotParts] = (
                 self.stage.robots.values() if robot_name is None else (self._robot(robot_name),)
             )

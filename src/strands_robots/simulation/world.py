@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from typing import Any
 
+from strands_robots import settings
 from strands_robots.envelope import Envelope, success
+from strands_robots.safety.gate import PermitVoidError
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.simulation.arguments import STEPS_MAX, answered
 from strands_robots.simulation.construction import checked_plan
-from strands_robots.simulation.physics import CHUNK, CommandVoidError
-from strands_robots.simulation.pictures import Pictures
+from strands_robots.simulation.motion import Rollouts
+from strands_robots.simulation.physics import CHUNK
 from strands_robots.simulation.views import camera_names
 from strands_robots.utils import ValidationError, flag, text, whole
 
+logger = logging.getLogger(__name__)
 
-class Simulation(Pictures):
+
+class Simulation(Rollouts):
     """A world of simulated robots, each with its own rollout, behind the contract :class:`WorldRobot`.
 
     Physics keeps real time while a rollout or a teleoperation runs, and for a moment after a single command;
@@ -58,7 +64,7 @@ class Simulation(Pictures):
         permit = self.gate.permit("send_action")
         try:
             sent = body.send_action(action, permit)
-        except CommandVoidError as void:
+        except PermitVoidError as void:
             raise ValidationError(f"send_action was overtaken by a stop: {void}.") from None
         return success(f"Sent {len(sent)} targets to {body.name}.", robot=body.name, sent=sent)
 
@@ -85,10 +91,11 @@ class Simulation(Pictures):
         """Halt, then put the world back to its initial state. Refused while the robot is locked."""
         self._open()
         self.gate.permit("reset")
-        verdict = self.halt("reset")
-        if not verdict.stopped:
-            return verdict.envelope()
         with self._building:
+            # Nothing starts a rollout while this lock is held.
+            verdict = self.halt("reset")
+            if not verdict.stopped:
+                return verdict.envelope()
             self._physics.reset()
         return success("The world is back at its start.", sim_time=self._physics.snapshot.time, halted=verdict.halted)
 
@@ -102,7 +109,7 @@ class Simulation(Pictures):
             sim_time=snapshot.time,
             step_count=snapshot.steps,
             robots=robots,
-            running_policies={},
+            running_policies={row["robot"]: row for row in self.list_policies_running()},
             real_time_factor=round(self._clock.real_time_factor, 4),
             diverged=self._physics.diverged,
         )
@@ -132,10 +139,17 @@ class Simulation(Pictures):
         )
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop everything that moves a robot of this world, and freeze them where they are."""
+        """Stop everything that moves a robot of this world, and freeze them where they are.
+
+        The gate goes first and the freeze second; both take microseconds, and after them no action is written,
+        whatever a policy is doing. Waiting for the loops to end, so as to say whether they did, comes last.
+        """
+        deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
         self.gate.revoke()
         self._physics.hold()
-        return halt_each({})
+        stops = self._stops(deadline)
+        logger.info("Halting %s (%s): %s.", self.tool_name_str, reason or "no reason given", ", ".join(stops) or "-")
+        return halt_each(stops)
 
     def cleanup(self) -> Envelope:
         """Halt, stop the clock and free the pictures. A second call does nothing."""

@@ -1,0 +1,167 @@
+"""Rollouts of the robots of a world: one at a time for each robot, all of them ended by a halt."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from strands_robots import settings
+from strands_robots.contract import Observer, Unsubscribe
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.policies.registry import create_policy
+from strands_robots.rollout import STOP_JOIN_S, Observers, Rollout
+from strands_robots.simulation.arguments import answered
+from strands_robots.simulation.body import RobotBody
+from strands_robots.simulation.pictures import Pictures
+from strands_robots.simulation.stage import Plan
+from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
+
+DURATION_MAX_S = 86_400.0
+"""Longest rollout: a day."""
+
+TEARDOWN_S = 5.0
+"""How much longer than its duration :meth:`Rollouts.run_policy` waits for a rollout to end."""
+
+
+class Rollouts(Pictures):
+    """The verbs that start, watch and stop rollouts."""
+
+    def __init__(self, plan: Plan, *, realtime: bool) -> None:
+        super().__init__(plan, realtime=realtime)
+        self._observers = Observers()
+        self._rollouts: dict[str, Rollout] = {}
+
+    def subscribe(self, observer: Observer) -> Unsubscribe:
+        """Tell ``observer`` of every rollout event until the returned callable is called."""
+        return self._observers.subscribe(observer)
+
+    @answered
+    def start_policy(
+        self,
+        robot_name: str,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        **policy: Any,
+    ) -> Envelope:
+        """Start a rollout of one robot and return at once.
+
+        Args:
+            robot_name: a robot of this world; empty for the first.
+            instruction: what it shall do, 1 to 2000 characters.
+            policy_provider: a registered policy, such as mock.
+            duration: seconds, above 0 up to a day.
+            policy: what that policy's constructor takes.
+        """
+        rollout = self._begin(robot_name, instruction, policy_provider, duration, policy)
+        return success(
+            f"{rollout.robot} started: {rollout.instruction}",
+            robot=rollout.robot,
+            instruction=rollout.instruction,
+            policy_provider=rollout.policy_name,
+            duration=rollout.duration,
+        )
+
+    @answered
+    def run_policy(
+        self,
+        robot_name: str,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        **policy: Any,
+    ) -> Envelope:
+        """The same, but wait for the end; an error when the policy failed or did not end in its time."""
+        rollout = self._begin(robot_name, instruction, policy_provider, duration, policy)
+        if not rollout.join((rollout.duration or 0.0) + TEARDOWN_S):
+            rollout.request_stop()
+            return error(f"{rollout.robot} was still running {TEARDOWN_S:g} s after its time.", **self._row(rollout))
+        if rollout.state == "error":
+            return error(f"{rollout.robot} failed: {rollout.error}", **self._row(rollout))
+        return success(f"{rollout.robot} {rollout.state} after {rollout.step_count} steps.", **self._row(rollout))
+
+    @answered
+    def stop_policy(self, robot_name: str) -> Envelope:
+        """Stop one robot's rollout and freeze the robot where it is; ``stopped`` is false if the loop outlived it."""
+        body = self.body(robot_name)
+        rollout = self._rollouts.get(body.name)
+        if rollout is None or not rollout.running:
+            return success(f"{body.name} runs no policy.", robot=body.name, stopped=True, was_running=False)
+        return self._stop(body, rollout, STOP_JOIN_S)
+
+    def list_policies_running(self) -> list[dict[str, Any]]:
+        """One row a running rollout: robot, instruction, policy, step, elapsed_s."""
+        return [rollout.row() for rollout in self._running().values()]
+
+    def policy_status(self, robot_name: str | None = None) -> dict[str, Any]:
+        """The row of a robot's present or last rollout, with state and error; empty when there was none."""
+        rollout = self._rollouts.get(self.body(robot_name).name)
+        return {} if rollout is None else self._row(rollout)
+
+    def moving(self) -> list[str]:
+        return [f"policy on {name}" for name in self._running()]
+
+    def _begin(
+        self, robot_name: str, instruction: str, provider: str, duration: float, options: dict[str, Any]
+    ) -> Rollout:
+        task = text("instruction", instruction)
+        seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
+        if not whole("policy_port", options.get("policy_port", 0), low=0, high=65535):
+            options.pop("policy_port", None)
+        try:
+            policy = create_policy(provider, **options)
+        except MissingExtraError as missing:
+            raise ValidationError(str(missing)) from missing
+        with self._building:
+            self._open()
+            body = self.body(robot_name)
+            self._idle(body.name)
+            rollout = Rollout(
+                body,
+                policy,
+                permit=self.gate.permit("start_policy"),
+                instruction=task,
+                policy_name=provider,
+                duration=seconds,
+                hz=settings.number("STRANDS_CONTROL_HZ"),
+                observers=self._observers,
+            )
+            self._rollouts[body.name] = rollout
+            rollout.start()
+            return rollout
+
+    def _idle(self, name: str) -> None:
+        rollout = self._rollouts.get(name)
+        if rollout is not None and rollout.running:
+            raise ValidationError(f"{name} already runs a policy: {rollout.instruction!r}. Stop it first.")
+
+    def _running(self) -> dict[str, Rollout]:
+        return {name: rollout for name, rollout in list(self._rollouts.items()) if rollout.running}
+
+    @staticmethod
+    def _row(rollout: Rollout) -> dict[str, Any]:
+        return {**rollout.row(), "state": rollout.state, "error": rollout.error}
+
+    def _stop(self, body: RobotBody, rollout: Rollout, patience_s: float) -> Envelope:
+        rollout.request_stop()
+        body.hold()
+        stopped = rollout.join(patience_s)
+        row = {**self._row(rollout), "stopped": stopped, "was_running": True}
+        if not stopped:
+            policy = rollout.policy_name
+            return error(f"{body.name} is frozen, but its policy {policy} has not returned yet.", **row)
+        return success(f"{body.name} stopped after {rollout.step_count} steps.", **row)
+
+    def _stops(self, deadline: float) -> dict[str, Callable[[], object]]:
+        """Ask every rollout to end at once; how to wait for each, until ``deadline`` on the monotonic clock."""
+        running = self._running()
+        for rollout in running.values():
+            rollout.request_stop()
+        return {name: partial(self._ended, name, rollout, deadline) for name, rollout in running.items()}
+
+    def _ended(self, name: str, rollout: Rollout, deadline: float) -> Envelope:
+        if rollout.join(max(0.0, deadline - time.monotonic())):
+            return success(f"{name} stopped.", stopped=True)
+        return error(f"frozen, but its policy {rollout.policy_name} has not returned yet", stopped=False)

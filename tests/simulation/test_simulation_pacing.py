@@ -1,0 +1,152 @@
+"""Real time, locks and halts: reads never wait, commands never follow a halt, and no thread is left."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.safety.gate import MotionGate, PermitVoidError
+from strands_robots.simulation import Simulation
+from strands_robots.simulation.catalog import find
+from strands_robots.simulation.pacing import Clock
+from strands_robots.simulation.physics import Physics
+from strands_robots.simulation.stage import Plan, RobotPlan, compile_stage
+
+
+def pacers() -> list[str]:
+    return [t.name for t in threading.enumerate() if t.name.startswith("simulation")]
+
+
+@pytest.fixture
+def physics() -> Physics:
+    return Physics(compile_stage(Plan(robots=(RobotPlan("arm", find("so100")),))))
+
+
+@pytest.fixture
+def world() -> Iterator[Simulation]:
+    simulation = Simulation()
+    simulation.add_robot("arm", "so100")
+    yield simulation
+    simulation.cleanup()
+
+
+def test_an_idle_world_stands_still_and_has_no_thread(world: Simulation) -> None:
+    assert pacers() == []
+    assert world.get_state()["step_count"] == 0
+
+
+def test_a_single_command_is_followed_in_real_time_and_then_the_thread_ends(world: Simulation) -> None:
+    world.send_action({"shoulder_pan": 0.5})
+    eventually(lambda: abs(world.get_observation()["shoulder_pan"] - 0.5) < 0.02, what="arm follows")
+    assert world.get_state()["sim_time"] < 3.0
+    eventually(lambda: not pacers(), within=6.0, what="pacer ends")
+
+
+def test_whoever_steps_by_hand_owns_the_clock(world: Simulation) -> None:
+    world.step(10)
+    world.send_action({"shoulder_pan": 0.5})
+    assert pacers() == []
+    assert world.get_state()["step_count"] == 10
+
+
+def test_simulated_time_keeps_to_real_time(physics: Physics) -> None:
+    clock = Clock(physics)
+    with clock.running():
+        eventually(lambda: physics.snapshot.time > 0.05)
+        began, simulated = time.monotonic(), physics.snapshot.time
+        eventually(lambda: physics.snapshot.time > simulated + 0.5, within=20)
+        real = time.monotonic() - began
+        # Never ahead of real time; how far behind is the machine's affair.
+        assert physics.snapshot.time - simulated <= real + 0.05
+    clock.close()
+    assert pacers() == []
+
+
+def test_many_worlds_share_one_thread() -> None:
+    worlds = [Simulation() for _ in range(6)]
+    for simulation in worlds:
+        simulation.add_robot("arm", "so100")
+        simulation.send_action({"gripper": 1.0})
+    assert len(pacers()) == 1
+    eventually(lambda: all(w.get_state()["step_count"] > 20 for w in worlds), what="all advance")
+    for simulation in worlds:
+        simulation.cleanup()
+    assert pacers() == []
+
+
+def test_a_read_does_not_wait_while_physics_holds_its_lock(physics: Physics) -> None:
+    done = threading.Event()
+
+    def long_steps() -> None:
+        physics.advance(60_000)
+        done.set()
+
+    stepping = threading.Thread(target=long_steps)
+    stepping.start()
+    reads = 0
+    while not done.is_set():
+        physics.snapshot.joints(physics.stage.robots["arm"])
+        physics.command("arm", {"gripper": 0.1})
+        reads += 1
+    stepping.join()
+    assert reads > 50
+
+
+def test_a_snapshot_is_never_half_a_step(physics: Physics) -> None:
+    torn: list[object] = []
+    stop = threading.Event()
+
+    def reader() -> None:
+        while not stop.is_set():
+            seen = physics.snapshot
+            before = seen.qpos.copy()
+            if seen.steps != round(seen.time / 0.002) or not np.array_equal(before, seen.qpos):
+                torn.append(seen)
+
+    thread = threading.Thread(target=reader)
+    thread.start()
+    for _ in range(400):
+        physics.advance(3)
+    stop.set()
+    thread.join()
+    assert torn == []
+
+
+def test_no_command_is_written_with_a_void_permit(physics: Physics) -> None:
+    gate = MotionGate()
+    permit = gate.permit("send_action")
+    gate.revoke()
+    before = physics.setpoints
+    with pytest.raises(PermitVoidError):
+        physics.command("arm", {"gripper": 1.0}, permit)
+    assert np.array_equal(before, physics.setpoints)
+
+
+def test_a_halt_in_mid_motion_freezes_the_arm_where_it_is(world: Simulation) -> None:
+    world.send_action({"shoulder_pan": 2.0})
+    eventually(lambda: world.get_observation()["shoulder_pan"] > 0.3, what="arm moves")
+    verdict = world.halt("test")
+    where = world.get_observation()["shoulder_pan"]
+    assert verdict.stopped is True
+    steps = world.get_state()["step_count"]
+    eventually(lambda: world.get_state()["step_count"] > steps + 300, what="physics goes on")
+    # It runs out its speed within a few degrees and stays, instead of going on to 2.0.
+    assert abs(world.get_observation()["shoulder_pan"] - where) < 0.35
+
+
+def test_a_halt_stops_the_rover() -> None:
+    simulation = Simulation(realtime=False)
+    simulation.add_robot("rover")
+    simulation.send_action({"linear_velocity": 0.5})
+    simulation.step(500)
+    simulation.halt("test")
+    simulation.step(250)
+    before = simulation.get_observation()["base_x"]
+    simulation.step(500)
+    assert simulation.get_observation()["base_x"] == pytest.approx(before, abs=0.002)
+    simulation.cleanup()

@@ -1,0 +1,155 @@
+"""Pictures without OpenGL, paths and animations; with OpenGL where the machine has it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from strands_robots.simulation import Simulation, gl
+from strands_robots.simulation.rendering import RenderingError
+from strands_robots.simulation.scene import Recording, draw_path, save_animation
+from strands_robots.utils import ValidationError
+
+OPENGL = any(gl.loads(backend) for backend in ("egl", "osmesa"))
+needs_opengl = pytest.mark.skipif(not OPENGL, reason=f"no OpenGL here: needs {gl.PACKAGES}")
+
+
+@pytest.fixture
+def world() -> Iterator[Simulation]:
+    simulation = Simulation(realtime=False)
+    simulation.add_robot("arm", "so100")
+    yield simulation
+    simulation.cleanup()
+
+
+def orange(picture: np.ndarray) -> float:
+    """Share of the picture that has the arm's colour."""
+    r, g, b = (picture[..., i].astype(int) for i in range(3))
+    return float(((r > 120) & (r - b > 70) & (r - g > 40)).mean())
+
+
+@pytest.mark.parametrize("camera", ["overview", "front", "side"])
+def test_the_projection_shows_the_arm_on_a_floor_under_a_sky(world: Simulation, camera: str) -> None:
+    picture = world.project(camera, 160, 120)
+    assert picture.shape == (120, 160, 3)
+    assert picture.dtype == np.uint8
+    assert orange(picture) > 0.01
+
+
+def test_the_projection_follows_the_arm(world: Simulation) -> None:
+    before = world.project("top", 160, 120)
+    world.send_action({"shoulder_pan": 1.2})
+    world.step(500)
+    assert np.abs(before.astype(int) - world.project("top", 160, 120)).mean() > 1.0
+
+
+def test_a_path_is_drawn_from_blue_to_red_within_the_picture() -> None:
+    blank = np.full((60, 80, 3), 255, dtype=np.uint8)
+    drawn = draw_path(blank, np.array([[5.0, 30.0], [40.0, 30.0], [75.0, 30.0]]))
+    assert drawn[30, 12, 2] > drawn[30, 12, 0]
+    assert drawn[30, 70, 0] > drawn[30, 70, 2]
+    assert (blank == 255).all()
+
+
+def test_the_tip_is_seen_where_its_path_is_drawn(world: Simulation) -> None:
+    x, y, depth = world.view("overview").pixels([world.tip_position("arm")], 320, 240)[0]
+    assert 0 < x < 320
+    assert 0 < y < 240
+    assert depth > 0
+
+
+def test_a_recording_becomes_a_picture_and_an_animation(world: Simulation, tmp_path: Path) -> None:
+    recording = Recording(world, width=96, height=72)
+    for target in (0.2, 0.5, 0.8):
+        world.send_action({"shoulder_pan": target})
+        world.step(60)
+        recording.capture()
+    gif = Image.open(recording.save_animation(tmp_path / "out" / "arm.gif", fps=10))
+    assert (gif.size, getattr(gif, "n_frames", 1)) == ((96, 72), 3)
+    assert Image.open(recording.save_picture(tmp_path / "arm.png", 128, 96)).size == (128, 96)
+    assert recording.how in ("opengl", "projection")
+
+
+@pytest.mark.parametrize("fps", [0, 51, float("nan")])
+def test_an_animation_needs_frames_and_a_rate_that_gif_has(tmp_path: Path, fps: float) -> None:
+    with pytest.raises(ValidationError, match="frames"):
+        save_animation([], tmp_path / "a.gif")
+    with pytest.raises(ValidationError, match="fps"):
+        save_animation([np.zeros((8, 8, 3), dtype=np.uint8)], tmp_path / "a.gif", fps)
+
+
+@pytest.mark.parametrize(("width", "height"), [(15, 64), (64, 5000), (True, 64), (64.0, 64)])
+def test_a_picture_of_an_unusable_size_is_refused(world: Simulation, width: int, height: int) -> None:
+    with pytest.raises(ValidationError, match=r"width|height"):
+        world.project("overview", width, height)
+    with pytest.raises(ValidationError, match=r"width|height"):
+        world.render("overview", width, height)
+
+
+def test_an_unknown_camera_lists_those_there_are(world: Simulation) -> None:
+    with pytest.raises(ValidationError, match="overview, front, side, top, arm/wrist"):
+        world.project("nose")
+
+
+def test_a_robots_camera_is_found_by_its_own_name_while_only_one_has_it(world: Simulation) -> None:
+    assert world.view("wrist").camera == "arm/wrist"
+    world.add_robot("other", "so100")
+    with pytest.raises(ValidationError, match="other/wrist"):
+        world.view("wrist")
+
+
+@pytest.mark.system
+@needs_opengl
+@pytest.mark.parametrize("camera", ["overview", "front", "side", "top", "wrist"])
+def test_opengl_shows_the_arm_without_a_display(world: Simulation, camera: str) -> None:
+    picture = world.render(camera, 160, 120)
+    assert picture.shape == (120, 160, 3)
+    assert orange(picture) > 0.005
+
+
+@pytest.mark.system
+@needs_opengl
+def test_opengl_and_the_projection_agree_where_the_arm_is(world: Simulation) -> None:
+    drawn, projected = world.render("side", 160, 120), world.project("side", 160, 120)
+    assert orange(drawn) == pytest.approx(orange(projected), rel=0.35)
+
+
+@pytest.mark.system
+@needs_opengl
+def test_every_thread_may_ask_for_pictures_and_cleanup_ends_the_rendering_thread(world: Simulation) -> None:
+    pictures: list[np.ndarray] = []
+    threads = [threading.Thread(target=lambda: pictures.append(world.render("front", 64, 48))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(np.array_equal(pictures[0], p) for p in pictures)
+    world.cleanup()
+    assert not [t for t in threading.enumerate() if t.name.startswith("simulation-render")]
+
+
+@pytest.mark.system
+@needs_opengl
+def test_a_picture_is_taken_while_robots_come_and_go(world: Simulation) -> None:
+    first = world.render("overview", 64, 48)
+    world.add_robot("car", "rover", position=(0.3, 0.2, 0))
+    assert not np.array_equal(first, world.render("overview", 64, 48))
+
+
+def test_without_opengl_the_error_names_the_packages_and_a_picture_is_still_made(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise ImportError("libEGL.so.1 is not there")
+
+    monkeypatch.setattr("mujoco.Renderer", none)
+    with pytest.raises(RenderingError, match=r"libegl1 .*libosmesa6"):
+        world.render("overview", 64, 48)
+    picture, how = world.picture("overview", 64, 48)
+    assert how == "projection"
+    assert picture.shape == (48, 64, 3)

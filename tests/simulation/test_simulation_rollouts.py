@@ -1,0 +1,248 @@
+"""Rollouts: one for each robot of a world, honest stops, and nothing written after a halt."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.contract import RolloutEvent
+from strands_robots.envelope import Envelope, error
+from strands_robots.safety.stopping import Outcome, grade
+from strands_robots.simulation import Simulation, motion
+
+
+@pytest.fixture
+def world() -> Iterator[Simulation]:
+    simulation = Simulation()
+    simulation.add_robot("left", "so100")
+    simulation.add_robot("right", "so101")
+    yield simulation
+    simulation.cleanup()
+
+
+@pytest.fixture
+def events(world: Simulation) -> list[RolloutEvent]:
+    seen: list[RolloutEvent] = []
+    world.subscribe(seen.append)
+    return seen
+
+
+def busy(world: Simulation) -> list[str]:
+    return sorted(row["robot"] for row in world.list_policies_running())
+
+
+class Stuck:
+    """A policy that does not come back from its third step until it is let go."""
+
+    uses_cameras = False
+
+    def __init__(self) -> None:
+        self.inside = threading.Event()
+        self.let_go = threading.Event()
+        self._calls = 0
+
+    def reset(self, instruction: str, ranges: Mapping[str, tuple[float, float]]) -> None:
+        """Nothing to load."""
+
+    def act(self, observation: Mapping[str, Any]) -> dict[str, float]:
+        self._calls += 1
+        if self._calls == 3:
+            self.inside.set()
+            self.let_go.wait(10)
+        return {"shoulder_pan": 1.5}
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class Failing(Stuck):
+    def act(self, observation: Mapping[str, Any]) -> dict[str, float]:
+        raise ZeroDivisionError("no idea")
+
+
+@pytest.fixture
+def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
+    policy = Stuck()
+    monkeypatch.setattr(motion, "create_policy", lambda provider, **options: policy)
+    yield policy
+    policy.let_go.set()
+
+
+def test_two_robots_each_run_their_own_policy(world: Simulation, events: list[RolloutEvent]) -> None:
+    assert world.start_policy("left", "wave")["status"] == "success"
+    assert world.start_policy("right", "nod")["status"] == "success"
+    eventually(lambda: {e.robot for e in events if e.step > 5} == {"left", "right"})
+    assert busy(world) == ["left", "right"]
+    assert set(world.get_state()["running_policies"]) == {"left", "right"}
+    assert world.stop_policy("left")["stopped"] is True
+    assert busy(world) == ["right"]
+    step = world.list_policies_running()[0]["step"]
+    eventually(lambda: world.list_policies_running()[0]["step"] > step + 5, what="the other goes on")
+
+
+def test_a_rollout_moves_its_robot_alone(world: Simulation, events: list[RolloutEvent]) -> None:
+    still = world.get_observation("right")
+    start = world.get_observation("left")
+    world.run_policy("left", "wave", duration=0.6)
+    assert max(abs(world.get_observation("left")[k] - start[k]) for k in start) > 0.01
+    assert world.get_observation("right") == pytest.approx(still, abs=0.004)
+    assert [e.kind for e in events][:1] + [e.kind for e in events][-1:] == ["started", "finished"]
+
+
+def test_run_policy_waits_and_reports(world: Simulation) -> None:
+    began = time.monotonic()
+    answer = world.run_policy("left", "wave", duration=0.3)
+    assert time.monotonic() - began >= 0.3
+    assert (answer["state"], answer["status"]) == ("completed", "success")
+    assert answer["step"] >= 5
+
+
+def test_reads_are_quick_during_a_rollout(world: Simulation) -> None:
+    world.start_policy("left", "wave")
+    reads = 0
+    until = time.monotonic() + 0.3
+    while time.monotonic() < until:
+        world.get_state()
+        world.get_observation("left")
+        reads += 1
+    assert reads > 100
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments"),
+    [("remove_robot", ("right",)), ("add_robot", ("x", "so100")), ("add_object", ("cube",)), ("create_world", ())],
+)
+def test_the_world_does_not_change_while_a_rollout_runs(
+    world: Simulation, change: str, arguments: tuple[Any, ...]
+) -> None:
+    world.start_policy("left", "wave")
+    answer = getattr(world, change)(*arguments)
+    assert f"{change} is refused while something moves: policy on left" in answer["reason"]
+    assert world.list_robots() == ["left", "right"]
+    world.stop_policy("left")
+    assert getattr(world, change)(*arguments)["status"] == "success"
+
+
+def test_one_robot_runs_one_policy(world: Simulation) -> None:
+    world.start_policy("left", "wave")
+    assert "already runs a policy: 'wave'" in world.start_policy("left", "nod")["reason"]
+
+
+def test_a_halt_stops_every_rollout_and_nothing_is_written_afterwards(
+    world: Simulation, events: list[RolloutEvent]
+) -> None:
+    world.start_policy("left", "wave")
+    world.start_policy("right", "nod")
+    eventually(lambda: len([e for e in events if e.kind == "step"]) > 20)
+    verdict = world.halt("test")
+    held = world.body("left").targets, world.body("right").targets
+    assert verdict.stopped is True
+    assert sorted(verdict.halted) == ["left", "right"]
+    assert verdict.elapsed_ms < 1000
+    time.sleep(0.2)
+    assert held == (world.body("left").targets, world.body("right").targets)
+    assert busy(world) == []
+
+
+def test_a_policy_that_does_not_return_is_named_and_its_action_is_not_written(
+    world: Simulation, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    world.start_policy("left", "think")
+    assert stuck.inside.wait(5)
+    verdict = world.halt("test")
+    assert verdict.stopped is False
+    assert "has not returned" in verdict.not_stopped["left"]
+    held = world.body("left").targets
+    stuck.let_go.set()
+    eventually(lambda: not busy(world))
+    assert held == world.body("left").targets
+
+
+def test_a_stop_of_one_robot_voids_what_its_stuck_policy_says_later(
+    world: Simulation, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(motion, "STOP_JOIN_S", 0.1)
+    world.start_policy("left", "think")
+    assert stuck.inside.wait(5)
+    answer = world.stop_policy("left")
+    assert answer["stopped"] is False
+    assert grade(answer) is Outcome.REFUSED
+    where = world.get_observation("left")["shoulder_pan"]
+    stuck.let_go.set()
+    eventually(lambda: not busy(world))
+    world.step(300)
+    assert world.get_observation("left")["shoulder_pan"] == pytest.approx(where, abs=0.2)
+
+
+def test_a_policy_that_fails_ends_in_error_and_on_hold(
+    world: Simulation, events: list[RolloutEvent], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(motion, "create_policy", lambda provider, **options: Failing())
+    answer = world.run_policy("left", "wave", duration=5)
+    assert answer["status"] == "error"
+    assert "ZeroDivisionError: no idea" in answer["reason"]
+    assert (events[-1].kind, events[-1].state) == ("finished", "error")
+    assert busy(world) == []
+
+
+def test_reset_ends_the_rollouts_first(world: Simulation) -> None:
+    start = world.get_observation("left")
+    world.start_policy("left", "wave")
+    eventually(lambda: world.list_policies_running()[0]["step"] > 5)
+    assert world.reset()["status"] == "success"
+    assert busy(world) == []
+    assert world.get_observation("left") == pytest.approx(start, abs=0.004)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"robot_name": "nobody"}, "robot_name"),
+        ({"instruction": ""}, "instruction"),
+        ({"instruction": "a\x00b"}, "instruction"),
+        ({"duration": 0}, "duration"),
+        ({"duration": float("inf")}, "duration"),
+        ({"duration": True}, "duration"),
+        ({"policy_provider": "mok"}, "policy_provider"),
+        ({"policy_port": -1}, "policy_port"),
+    ],
+)
+def test_a_rollout_out_of_domain_is_refused_by_name_and_does_not_start(
+    world: Simulation, change: dict[str, Any], named: str
+) -> None:
+    answer = world.start_policy(**{"robot_name": "left", "instruction": "wave", **change})
+    assert answer["status"] == "error"
+    assert named in answer["reason"]
+    assert busy(world) == []
+
+
+def test_a_locked_world_starts_nothing(world: Simulation) -> None:
+    class Locked:
+        def refusal(self, verb: str) -> Envelope | None:
+            return error(f"{verb} is refused: locked.")
+
+    world.gate.attach(Locked())
+    assert world.start_policy("left", "wave")["reason"] == "start_policy is refused: locked."
+    assert busy(world) == []
+
+
+def test_stopping_what_does_not_run_is_a_stop(world: Simulation) -> None:
+    assert world.stop_policy("left")["stopped"] is True
+    assert world.halt("test").stopped is True
+    assert "robot_name" in world.stop_policy("nobody")["reason"]
+
+
+def test_cleanup_ends_rollouts_and_leaves_no_thread(world: Simulation) -> None:
+    before = threading.active_count()
+    world.start_policy("left", "wave")
+    world.start_policy("right", "nod")
+    assert threading.active_count() > before
+    assert world.cleanup()["status"] == "success"
+    assert not [t.name for t in threading.enumerate() if t.name.startswith(("rollout", "simulation"))]
+    assert "cleaned up" in world.start_policy("left", "wave")["reason"]
