@@ -23,8 +23,15 @@ from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig, open_client
+from strands_robots.device_connect.backends.errors import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
-from strands_robots.device_connect.limits import BRINGUP_TIMEOUT_S, LOOP_JOIN_TIMEOUT_S, PROBE_TIMEOUT_S
+from strands_robots.device_connect.limits import (
+    BRINGUP_TIMEOUT_S,
+    LOOP_JOIN_TIMEOUT_S,
+    PROBE_EVERY_S,
+    PROBE_TIMEOUT_S,
+    PROBES,
+)
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
@@ -81,13 +88,14 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     Raises:
         ValidationError: an argument out of its domain, or an unauthenticated transport without an opt-in.
         DuplicateDeviceError: a live device has this id.
+        ConnectionError: the broker or router was not reached.
         TimeoutError: not callable in time; nothing is left running.
     """
     choice("peer_type", peer_type, ("robot", "sim"))
+    name = default_id(robot) if peer_id is None else device_id("peer_id", peer_id)
     reach = link_for(messaging_url, messaging_backend, tenant, link)
     insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
     driver = driver_for(robot, peer_type)
-    name = default_id(robot) if peer_id is None else device_id("peer_id", peer_id)
     announceable(driver)
     _keep_logging_to_the_application(name)
     async with asyncio.timeout(bringup_timeout):
@@ -108,6 +116,9 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
             await asyncio.shield(_put_down(runtime, task))
             raise
     _hosts[runtime] = Host(asyncio.get_running_loop(), task)
+    # Again with each device, because what is registered last runs first: the link must still be open then.
+    atexit.unregister(_leave_no_ghost)
+    atexit.register(_leave_no_ghost)
     task.add_done_callback(lambda _: _ended(runtime, task))
     return runtime
 
@@ -256,12 +267,21 @@ def announceable(driver: DeviceDriver) -> None:
 async def refuse_duplicate(name: str, link: LinkConfig) -> None:
     """Raise :class:`DuplicateDeviceError` when a device with this id answers within a second. A ghost does not."""
     request = {"jsonrpc": "2.0", "id": "probe", "method": "requestRegistration", "params": {}}
-    client = await open_client(link)
+    try:
+        client = await open_client(link)
+    except MessagingError as exc:
+        raise ConnectionError(f"{', '.join(link.connect) or 'The network'} was not reached: {exc}") from exc
+    if link.is_peer:
+        # A peer's links come up one after another; a client's server knows at once who is there.
+        client.configure_d2d_retry(retries=PROBES, delay=PROBE_EVERY_S)
     try:
         await client.request(
             f"device-connect.{link.tenant}.{name}.cmd", json.dumps(request).encode(), timeout=PROBE_TIMEOUT_S
         )
-    except MessagingError:
+    except NoResponderError:
+        return
+    except MessagingError as exc:
+        logger.warning("A device %r is known on this network and does not answer (%s); taking its place.", name, exc)
         return
     finally:
         await client.close()
@@ -298,7 +318,6 @@ def _keep_logging_to_the_application(name: str) -> None:
         framework.addHandler(logging.NullHandler())
 
 
-@atexit.register
 def _leave_no_ghost() -> None:
     for runtime, host in list(_hosts.items()):
         if host.thread is None or not host.thread.is_alive():

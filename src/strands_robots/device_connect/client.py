@@ -146,6 +146,10 @@ class FleetClient:
         """
         return self._wait(self._collect(timeout), timeout + 1.0)
 
+    def known(self) -> tuple[str, ...]:
+        """The ids that have announced themselves since the last look, without those that have departed."""
+        return tuple(sorted(self._seen))
+
     def call(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0
     ) -> Envelope:

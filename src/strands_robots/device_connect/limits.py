@@ -8,3 +8,6 @@ LOOP_JOIN_TIMEOUT_S = 5.0
 
 PROBE_TIMEOUT_S = 1.0
 """In which a device that already has the wanted id has to answer."""
+
+PROBES, PROBE_EVERY_S = 3, 0.05
+"""How often, and how far apart, a peer asks for its own id before it is nobody's."""

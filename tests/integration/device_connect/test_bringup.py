@@ -1,0 +1,328 @@
+"""Going on the network and off again: found, refused, cancelled, and nothing left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from enum import Enum
+from typing import Any
+
+import psutil
+import pytest
+from device_connect_edge.drivers import DeviceDriver, rpc
+from fixtures.nats_server import NatsServer
+from fixtures.toy_robots import ToyRobot, ToyWorld
+from fixtures.waiting import eventually, free_port
+
+from strands_robots import device_connect
+from strands_robots.device_connect import (
+    DuplicateDeviceError,
+    FleetClient,
+    LinkConfig,
+    bringup,
+    init_device_connect,
+    init_device_connect_sync,
+    loopback_config,
+    stop_device_connect,
+)
+from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.utils import ValidationError
+
+
+@pytest.fixture(autouse=True)
+def quiet_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DEVICE_CONNECT_ALLOW_INSECURE", "DEVICE_CONNECT_RPC_ALLOW", "ZENOH_CONNECT", "NATS_URL"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def link() -> LinkConfig:
+    return loopback_config(free_port())
+
+
+@pytest.fixture
+def world() -> Iterator[ToyWorld]:
+    toy = ToyWorld()
+    yield toy
+    toy.close()
+
+
+@pytest.fixture(scope="module")
+def nats() -> Iterator[NatsServer]:
+    with NatsServer() as server:
+        yield server
+
+
+def open_things() -> tuple[int, int]:
+    me = psutil.Process()
+    return me.num_threads(), me.num_fds()
+
+
+def settles(before: tuple[int, int], spare: int = 0) -> None:
+    """Threads and descriptors come back to what they were; ``spare`` for Zenoh's own pool, made once."""
+    eventually(lambda: all(now <= then + spare for now, then in zip(open_things(), before, strict=True)), within=10)
+
+
+def test_a_simulation_is_found_called_and_gone(link: LinkConfig, world: ToyWorld) -> None:
+    runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
+    with FleetClient(link, "tester") as fleet:
+        (peer,) = fleet.peers()
+        assert (peer.id, peer.type, peer.model) == ("arm-1", "strands_sim", "toy_sim")
+        assert {f["name"] for f in peer.functions} == {
+            *("execute", "stop", "getStatus", "getFeatures", "step", "reset"),
+        }
+        assert fleet.call("arm-1", "getStatus")["status"] == "success"
+        stop_device_connect(runtime)
+        assert fleet.peers(0.6) == []
+    stop_device_connect(runtime)
+
+
+def test_it_is_callable_when_the_call_returns(link: LinkConfig, world: ToyWorld) -> None:
+    with FleetClient(link) as fleet:
+        for _ in range(3):
+            runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
+            assert fleet.call("arm-1", "getStatus", timeout=2)["status"] == "success"
+            stop_device_connect(runtime)
+
+
+async def test_it_lives_on_the_callers_loop_too(link: LinkConfig, world: ToyWorld) -> None:
+    runtime = await init_device_connect(world, link=link)
+    assert runtime.device_id.startswith("toy_sim-")
+    await asyncio.to_thread(call_status, link, runtime.device_id)
+    await runtime.shutdown()
+    assert runtime not in bringup._hosts
+
+
+def call_status(link: LinkConfig, name: str) -> None:
+    with FleetClient(link) as fleet:
+        assert fleet.call(name, "getStatus")["status"] == "success"
+
+
+def test_the_object_decides_the_driver() -> None:
+    robot, world, ready = ToyRobot(), ToyWorld(), RobotDeviceDriver(ToyRobot())
+    assert isinstance(bringup.driver_for(world, "robot"), SimulationDeviceDriver)
+    assert isinstance(bringup.driver_for(robot, "robot"), RobotDeviceDriver)
+    assert bringup.driver_for(ready, "sim") is ready
+    with pytest.raises(ValidationError, match="list_robots"):
+        bringup.driver_for(robot, "sim")
+
+    class Both(ToyWorld):
+        start_task = stop_task = get_task_status = ToyWorld.get_state
+
+    assert isinstance(bringup.driver_for(Both(), "sim"), SimulationDeviceDriver)
+    assert isinstance(bringup.driver_for(Both(), "robot"), RobotDeviceDriver)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"peer_id": "arm.left"}, "peer_id"),
+        ({"peer_id": ""}, "peer_id"),
+        ({"peer_id": "a" * 129}, "peer_id"),
+        ({"peer_type": "arm"}, "peer_type"),
+        ({"tenant": "a.b"}, "tenant"),
+        ({"messaging_backend": "mqtt"}, "messaging_backend"),
+        ({"allow_insecure": "false"}, "allow_insecure"),
+        ({}, "allow_insecure=True"),
+    ],
+)
+def test_what_is_out_of_domain_is_refused_before_anything_opens(
+    world: ToyWorld, arguments: dict[str, Any], named: str
+) -> None:
+    before = open_things()
+    with pytest.raises(ValueError, match=named):
+        init_device_connect_sync(world, **arguments)
+    settles(before)
+
+
+def test_a_second_device_of_an_id_refuses_to_go_live(link: LinkConfig, world: ToyWorld) -> None:
+    runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
+    for _ in range(3):
+        with pytest.raises(DuplicateDeviceError, match="arm-1"):
+            init_device_connect_sync(ToyWorld(), peer_id="arm-1", link=link)
+    with FleetClient(link) as fleet:
+        assert fleet.call("arm-1", "getStatus")["status"] == "success"
+    stop_device_connect(runtime)
+    stop_device_connect(init_device_connect_sync(world, peer_id="arm-1", link=link))
+
+
+def test_a_second_device_of_an_id_refuses_on_nats_and_in_another_process(nats: NatsServer, world: ToyWorld) -> None:
+    link = LinkConfig(transport="nats", connect=(nats.url,))
+    with served("arm-1", nats.url):
+        with pytest.raises(DuplicateDeviceError):
+            init_device_connect_sync(world, peer_id="arm-1", link=link)
+        runtime = init_device_connect_sync(
+            world, peer_id="arm-1", link=LinkConfig("nats", connect=(nats.url,), tenant="b")
+        )
+        stop_device_connect(runtime)
+
+
+def test_a_driver_that_cannot_be_announced_says_so(link: LinkConfig) -> None:
+    class Colour(Enum):
+        RED = 1
+
+    class Lamp(DeviceDriver):  # type: ignore[misc]
+        device_type = "lamp"
+
+        @rpc()
+        async def shine(self, colour: Colour = Colour.RED) -> dict[str, Any]:
+            """Shine."""
+            return {}
+
+    with pytest.raises(ValidationError, match="shine"):
+        init_device_connect_sync(Lamp(), link=link)
+
+
+def test_twenty_start_and_stop_cycles_leave_nothing(link: LinkConfig, world: ToyWorld) -> None:
+    def cycle() -> None:
+        stop_device_connect(init_device_connect_sync(world, peer_id="arm-1", link=link))
+
+    cycle()
+    eventually(lambda: not any(t.name == "robot-call" for t in threading.enumerate()), within=10)
+    before = open_things()
+    for _ in range(20):
+        cycle()
+    settles(before, spare=2)
+    assert not [t for t in threading.enumerate() if t.name == "device-connect"]
+
+
+def test_twenty_failed_bring_ups_leave_nothing(world: ToyWorld) -> None:
+    nobody = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=0.2)
+
+    class Broken(SimulationDeviceDriver):
+        async def connect(self) -> None:
+            raise OSError("no such bus")
+
+    link = loopback_config(free_port())
+    with pytest.raises(OSError, match="no such bus"):
+        init_device_connect_sync(Broken(world), link=link)
+    eventually(lambda: not any(t.name == "robot-call" for t in threading.enumerate()), within=10)
+    before = open_things()
+    for _ in range(10):
+        with pytest.raises(OSError):
+            init_device_connect_sync(world, link=nobody, bringup_timeout=1.0)
+        with pytest.raises(OSError, match="no such bus"):
+            init_device_connect_sync(Broken(world), link=link)
+    settles(before, spare=2)
+    assert not [t for t in threading.enumerate() if t.name == "device-connect"]
+
+
+def test_a_bring_up_that_timed_out_never_comes_online_later(world: ToyWorld) -> None:
+    class Slow(SimulationDeviceDriver):
+        async def connect(self) -> None:
+            await asyncio.sleep(1.0)
+
+    link = loopback_config(free_port())
+    with pytest.raises(TimeoutError):
+        init_device_connect_sync(Slow(world), peer_id="late-1", link=link, bringup_timeout=0.4)
+    with FleetClient(link) as fleet:
+        time.sleep(1.2)
+        assert fleet.peers(0.5) == []
+
+
+def test_a_bring_up_that_gives_nothing_is_a_runtime_error(
+    link: LinkConfig, world: ToyWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def nothing(*_: object, **__: object) -> None:
+        return None
+
+    monkeypatch.setattr(bringup, "init_device_connect", nothing)
+    with pytest.raises(RuntimeError, match="without a runtime"):
+        init_device_connect_sync(world, link=link)
+    assert not [t for t in threading.enumerate() if t.name == "device-connect"]
+
+
+SERVE = """
+import sys
+from fixtures.toy_robots import ToyWorld
+from strands_robots.device_connect import (
+    LinkConfig, StopSignal, init_device_connect_sync, loopback_config, stop_device_connect)
+name, where, end = sys.argv[1:]
+link = loopback_config(int(where)) if where.isdigit() else LinkConfig(transport="nats", connect=(where,))
+world = ToyWorld()
+with StopSignal() as asked:
+    runtime = init_device_connect_sync(world, peer_id=name, link=link)
+    print("up", flush=True)
+    if end == "signal":
+        asked.wait()
+        world.halt("signal")
+        stop_device_connect(runtime)
+    elif end == "exit":
+        sys.stdin.read()
+print("down", flush=True)
+"""
+
+
+class served:
+    """A world in a process of its own."""
+
+    def __init__(self, name: str, where: str, end: str = "signal") -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", SERVE, name, where, end],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env={**os.environ, "PYTHONPATH": "."},
+        )
+
+    def __enter__(self) -> subprocess.Popen[str]:
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline().strip() == "up"
+        return self.process
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_leaves_no_ghost(link: LinkConfig, number: signal.Signals) -> None:
+    with FleetClient(link) as fleet, served("arm-1", str(link.meet_port)) as process:
+        eventually(lambda: [p.id for p in fleet.peers(0.6)] == ["arm-1"])
+        process.send_signal(number)
+        assert process.wait(10) == 0
+        eventually(lambda: "arm-1" not in fleet.known(), within=2)
+
+
+def test_the_end_of_the_program_leaves_no_ghost(link: LinkConfig) -> None:
+    with FleetClient(link) as fleet, served("arm-1", str(link.meet_port), "exit") as process:
+        eventually(lambda: [p.id for p in fleet.peers(0.6)] == ["arm-1"])
+        assert process.stdin is not None
+        process.stdin.close()
+        assert process.wait(10) == 0
+        eventually(lambda: "arm-1" not in fleet.known(), within=2)
+
+
+def test_a_ghost_does_not_keep_its_id(nats: NatsServer, world: ToyWorld) -> None:
+    with served("arm-7", nats.url) as process:
+        process.kill()
+        process.wait()
+        link = LinkConfig(transport="nats", connect=(nats.url,))
+        stop_device_connect(init_device_connect_sync(world, peer_id="arm-7", link=link))
+
+
+def test_two_tenants_do_not_see_each_other(world: ToyWorld) -> None:
+    port = free_port()
+    ours, theirs = loopback_config(port, "ours"), loopback_config(port, "theirs")
+    first = init_device_connect_sync(world, peer_id="arm-1", link=ours)
+    second = init_device_connect_sync(ToyWorld("other"), peer_id="arm-1", link=theirs)
+    with FleetClient(ours) as here, FleetClient(theirs) as there:
+        assert [p.model for p in here.peers()] == ["toy_sim"]
+        assert [p.model for p in there.peers()] == ["other"]
+    stop_device_connect(first)
+    stop_device_connect(second)
+
+
+def test_the_public_constant_is_the_join_timeout() -> None:
+    assert device_connect._LOOP_JOIN_TIMEOUT_S == 5.0
