@@ -55,6 +55,7 @@ _declare(
     Setting("ZENOH_CONNECT", "list", "", "Zenoh endpoints to connect to, such as tcp/127.0.0.1:7447."),
     Setting("ZENOH_LISTEN", "list", "", "Zenoh endpoints to listen on."),
     Setting("TENANT", "text", "default", "Device Connect tenant."),
+    Setting("OTEL_EXPORTER_OTLP_ENDPOINT", "text", "", "Where traces of calls go. Unset: none are recorded."),
     # Ours, on Device Connect.
     Setting(
         "DEVICE_CONNECT_RPC_ALLOW",

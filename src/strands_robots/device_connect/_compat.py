@@ -17,6 +17,7 @@ from device_connect_edge.device import DeviceRuntime
 from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.messaging.exceptions import MessagingError, NotConnectedError
 
+from .. import settings
 from .backends import LinkConfig, register
 
 FRAMEWORK_VERSION = "0.2.5"
@@ -142,6 +143,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         return asyncio.run_coroutine_threadsafe(self.enqueue_event(event, payload), self._loop)
 
     async def _connect_messaging(self) -> None:
+        framework.DeviceConnectTelemetry = _telemetry
         stock, self._messaging_backend = self._messaging_backend, register(self.link)
         try:
             await super()._connect_messaging()
@@ -154,6 +156,9 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         await super()._notify_conn_state(state)
 
     def _validate_startup_config(self) -> None:
+        # The framework makes its tracer right after this call, and connects right after that.
+        if not settings.is_set("OTEL_EXPORTER_OTLP_ENDPOINT"):
+            framework.DeviceConnectTelemetry = _NoTelemetry
         if not self.link.authenticated and not self.allow_insecure:
             raise ValueError(
                 f"{self.device_id}: nobody proves who he is on this link; give certificates or credentials, "
@@ -193,6 +198,20 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         left = self._lost_at + HOLD_EVENTS_S - self._loop.time()
         with contextlib.suppress(TimeoutError):  # whether the link is back is asked by whoever waited
             await asyncio.wait_for(self._linked.wait(), max(left, 0.0))
+
+
+class _NoTelemetry:
+    """In place of the framework's tracer where no exporter is configured: it would record spans for nobody, at a cost
+    as large as the call itself."""
+
+    def __init__(self, **_names: Any) -> None:
+        pass
+
+    def setup_otlp_exporter(self) -> None:
+        """Nothing to export to."""
+
+
+_telemetry = framework.DeviceConnectTelemetry
 
 
 def sources() -> dict[str, Callable[..., Any] | Coroutine[Any, Any, Any]]:

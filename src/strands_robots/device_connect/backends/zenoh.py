@@ -213,8 +213,13 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
     async def _ask(self, key: str, data: bytes, remaining: float, subject: str, patience: float) -> bytes | None:
         shared, inbox = self._session(), self._inbox
         assert inbox is not None
-        future: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[bytes | None] = loop.create_future()
         failure: list[str] = []
+
+        def on_deadline() -> None:
+            failure.append("Timeout")
+            _settle(future, None)
 
         def on_reply(reply: Any) -> None:
             if reply.ok is not None:
@@ -236,20 +241,19 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             cancellation_token=token,
             **options,
         )
+        # Zenoh keeps the deadline itself; this is for the case that it does not.
+        deadline = loop.call_later(remaining + 0.05, on_deadline)
         try:
             if len(data) < LARGE_BYTES:
                 get()
             else:
                 await on_a_thread(get)
-            async with asyncio.timeout(remaining + 0.05):
-                answer = await future
-        except TimeoutError:
-            answer = None
-            failure.append("Timeout")
+            answer = await future
         except zenoh.ZError as error:
             raise PublishError(f"cannot ask {subject}: {error}") from error
         finally:
-            if not future.done() or future.cancelled():
+            deadline.cancel()
+            if failure or future.cancelled():
                 token.cancel()
         if answer is None and "Timeout" in failure:
             raise RequestTimeoutError(f"no reply on {subject} within {patience:g} s")
@@ -294,12 +298,14 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
 
         A command's query is let go when its handler ends, any other after ``REPLY_TTL_S``.
         """
-        now = time.monotonic()
-        for reply, (_, until) in tuple(itertools.islice(self._queries.items(), 4)):
-            if now > until:
-                del self._queries[reply]
         reply = f"{_REPLY}{next(self._numbers)}"
-        self._queries[reply] = (query, math.inf if until_answered else now + REPLY_TTL_S)
+        if until_answered:
+            self._queries[reply] = (query, math.inf)
+        else:
+            now = time.monotonic()
+            for old in [each for each, (_, until) in self._queries.items() if until < now]:
+                del self._queries[old]
+            self._queries[reply] = (query, now + REPLY_TTL_S)
         return reply
 
     def _unanswered(self, reply: str) -> bool:
@@ -336,9 +342,9 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
 
 
 def answer_query(query: Any, data: bytes) -> None:
-    """Reply and let go of the query, which tells the caller that no more comes."""
+    """Reply with the caller's own priority and let go of the query, which tells the caller that no more comes."""
     with contextlib.suppress(zenoh.ZError):  # the caller's link is gone; nobody is left to tell
-        query.reply(query.key_expr, data, **_CALL)
+        query.reply(query.key_expr, data)
     query.drop()
 
 

@@ -1,0 +1,251 @@
+"""Calls and events of one small device, on our backend and on the framework's own, side by side.
+
+Every figure that is compared comes from the same caller process, in turns, so that what else the machine does falls
+on both. The devices are processes of their own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import statistics
+import time
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from fixtures.bare_caller import Caller
+from fixtures.echo_device import EchoDevice
+from fixtures.nats_server import NatsServer
+from fixtures.waiting import free_port, until
+from fixtures.zenoh_router import ZenohRouter
+
+from benchmarks.table import Row
+from strands_robots.device_connect.backends import LinkConfig, open_client
+
+IN_FLIGHT = 32
+EVENT_HZ = 10_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much is measured: a figure to quote, or a look."""
+
+    turns: int
+    calls: int
+    event_seconds: float
+    stops: int
+
+
+FULL = Effort(turns=5, calls=2_000, event_seconds=5.0, stops=50)
+QUICK = Effort(turns=3, calls=300, event_seconds=1.0, stops=10)
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """The same device twice, each with a caller that reaches it, and both with callers of their own kind."""
+
+    name: str
+    ours: Caller
+    bare: Caller
+    ours_both: Caller
+    device_ours: str = "ours"
+    device_bare: str = "bare"
+
+
+def run(quick: bool = False) -> list[Row]:
+    """Measure and give the rows of the table."""
+    return asyncio.run(_run(QUICK if quick else FULL))
+
+
+async def _run(effort: Effort) -> list[Row]:
+    rows = []
+    for name, opened in (("Zenoh D2D", _d2d()), ("Zenoh router", _router()), ("NATS", _nats())):
+        async with opened as pair:
+            rows += await _round_trips(name, pair, effort)
+            rows += await _in_flight(name, pair, effort)
+            rows += await _while_moving(name, pair, effort)
+            rows += await _events(name, pair, effort)
+    return rows
+
+
+async def _round_trips(name: str, pair: Pair, effort: Effort) -> list[Row]:
+    ours, bare, both = [], [], []
+    for _ in range(effort.turns):
+        bare.append(await _latencies(pair.bare, pair.device_bare, effort.calls))
+        ours.append(await _latencies(pair.ours, pair.device_ours, effort.calls))
+        both.append(await _latencies(pair.ours_both, pair.device_ours, effort.calls))
+    bound = 1.1 if name == "NATS" else 1.0
+    calls = f"getStatus, {name}, {effort.calls} calls"
+    rows = [
+        _compared(f"{calls}, p50", _median(ours, 50), _median(bare, 50), bound),
+        _compared(f"{calls}, p99", _median(ours, 99), _median(bare, 99), 1.15),
+    ]
+    if name != "NATS":
+        rows.append(_compared(f"{calls}, ours at both ends, p50", _median(both, 50), _median(bare, 50), 0.6))
+    return rows
+
+
+async def _in_flight(name: str, pair: Pair, effort: Effort) -> list[Row]:
+    ours, bare = [], []
+    for _ in range(effort.turns):
+        bare.append(await _rate(pair.bare, pair.device_bare, effort.calls))
+        ours.append(await _rate(pair.ours, pair.device_ours, effort.calls))
+    fast, slow = statistics.median(ours), statistics.median(bare)
+    bound = 0.9 if name == "NATS" else 1.2
+    return [
+        Row(
+            f"{IN_FLIGHT} calls in flight, {name}",
+            f"{fast:,.0f}/s",
+            f"{slow:,.0f}/s",
+            fast / slow,
+            f"≥ {bound:g}",
+            fast / slow >= bound,
+        )
+    ]
+
+
+async def _while_moving(name: str, pair: Pair, effort: Effort) -> list[Row]:
+    """A bare caller would wait in its own four threads, so both devices are asked by our client."""
+    took = []
+    moving = asyncio.ensure_future(pair.ours_both.call(pair.device_ours, "move", {"seconds": 2.0}, wait_s=20))
+    await asyncio.sleep(0.1)
+    for _ in range(effort.stops):
+        took.append(await _timed(pair.ours_both, pair.device_ours, "stop"))
+        await asyncio.sleep(0.02)
+    await moving
+    other = asyncio.ensure_future(pair.bare.call(pair.device_bare, "move", {"seconds": 2.0}, wait_s=20))
+    await asyncio.sleep(0.1)
+    against = await _timed(pair.bare, pair.device_bare, "stop")
+    await other
+    worst = _percentile(took, 99)
+    return [
+        Row(
+            f"stop while a 2 s call of the same device runs, {name}, p99",
+            _ms(worst),
+            _ms(against),
+            worst / against,
+            "≤ 20 ms",
+            worst <= 0.02,
+        )
+    ]
+
+
+async def _events(name: str, pair: Pair, effort: Effort) -> list[Row]:
+    count = round(EVENT_HZ * effort.event_seconds)
+    lost = {}
+    for caller, device in ((pair.ours, pair.device_ours), (pair.bare, pair.device_bare)):
+        heard = await caller.hears(device, "tick")
+        await asyncio.sleep(0.5)
+        await caller.call(device, "burst", {"count": count, "hz": EVENT_HZ})
+        await asyncio.sleep(effort.event_seconds)
+        with contextlib.suppress(AssertionError):  # the bare device has dropped the rest
+            await until(partial(_reached, heard, count), within=effort.event_seconds + 5)
+        lost[device] = count - len(heard)
+    ours, bare = lost[pair.device_ours], lost[pair.device_bare]
+    return [
+        Row(
+            f"events lost of {count:,} at 10 kHz, {name}",
+            f"{ours:,}",
+            f"{bare:,}",
+            ours / bare if bare else None,
+            "0",
+            ours == 0,
+        )
+    ]
+
+
+@contextlib.asynccontextmanager
+async def _d2d() -> AsyncIterator[Pair]:
+    """Peers without a router; callers reach them at the endpoint each listens on."""
+    here, there = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+    ours = EchoDevice("ours", LinkConfig(mode="peer", listen=(here,), multicast=False))
+    bare = EchoDevice("bare", environment={"ZENOH_LISTEN": there, "DEVICE_CONNECT_DISCOVERY_MODE": "d2d"})
+    both = LinkConfig(mode="peer", connect=(here,), multicast=False)
+    with ours, bare:
+        async with (
+            Caller(servers=(here,)) as one,
+            Caller(servers=(there,)) as other,
+            Caller(client=await open_client(both)) as own,
+        ):
+            yield await _met(Pair("Zenoh D2D", one, other, own))
+
+
+@contextlib.asynccontextmanager
+async def _router() -> AsyncIterator[Pair]:
+    with ZenohRouter() as router:
+        link = LinkConfig(connect=(router.endpoint,))
+        stock = {"ZENOH_CONNECT": router.endpoint, "DEVICE_CONNECT_DISCOVERY_MODE": "d2d"}
+        with EchoDevice("ours", link), EchoDevice("bare", environment=stock):
+            async with Caller(servers=(router.endpoint,)) as caller, Caller(client=await open_client(link)) as own:
+                yield await _met(Pair("Zenoh router", caller, caller, own))
+
+
+@contextlib.asynccontextmanager
+async def _nats() -> AsyncIterator[Pair]:
+    with NatsServer() as server:
+        link = LinkConfig("nats", connect=(server.url,))
+        stock = {"NATS_URL": server.url, "DEVICE_CONNECT_DISCOVERY_MODE": "d2d"}
+        with EchoDevice("ours", link), EchoDevice("bare", environment=stock):
+            async with (
+                Caller("nats", servers=(server.url,)) as caller,
+                Caller(client=await open_client(link)) as own,
+            ):
+                yield await _met(Pair("NATS", caller, caller, own))
+
+
+async def _met(pair: Pair) -> Pair:
+    for caller, device in (
+        (pair.ours, pair.device_ours),
+        (pair.bare, pair.device_bare),
+        (pair.ours_both, pair.device_ours),
+    ):
+        await caller.sees(device)
+        await _latencies(caller, device, 50)
+    return pair
+
+
+def _reached(heard: list[dict[str, Any]], count: int) -> bool:
+    return len(heard) >= count
+
+
+async def _latencies(caller: Caller, device: str, calls: int) -> list[float]:
+    return [await _timed(caller, device, "getStatus") for _ in range(calls)]
+
+
+async def _timed(caller: Caller, device: str, method: str) -> float:
+    started = time.perf_counter()
+    answer = await caller.call(device, method, wait_s=20)
+    took = time.perf_counter() - started
+    if "result" not in answer:
+        raise RuntimeError(f"{device} answered {answer}")
+    return took
+
+
+async def _rate(caller: Caller, device: str, calls: int) -> float:
+    async def one_of_many() -> None:
+        for _ in range(calls // IN_FLIGHT):
+            await _timed(caller, device, "getStatus")
+
+    started = time.perf_counter()
+    await asyncio.gather(*(one_of_many() for _ in range(IN_FLIGHT)))
+    return calls // IN_FLIGHT * IN_FLIGHT / (time.perf_counter() - started)
+
+
+def _compared(what: str, ours: float, against: float, bound: float) -> Row:
+    ratio = ours / against
+    return Row(what, _ms(ours), _ms(against), ratio, f"≤ {bound:g}", ratio <= bound)
+
+
+def _median(turns: list[list[float]], percent: int) -> float:
+    return statistics.median(_percentile(turn, percent) for turn in turns)
+
+
+def _percentile(values: list[float], percent: int) -> float:
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, len(ordered) * percent // 100)]
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1000:.2f} ms"
