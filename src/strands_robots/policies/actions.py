@@ -20,7 +20,7 @@ def checked_action(action: object, ranges: Ranges) -> Action:
         if key not in ranges:
             raise ValidationError(f"action has no key {shown(key)}; the robot has {', '.join(ranges)}.")
         low, high = ranges[key]
-        checked[key] = min(max(number(f"action[{key!r}]", value), low), high)
+        checked[key] = min(max(number(f"action[{key!r}]", _plain(value)), low), high)
     return checked
 
 
@@ -28,12 +28,16 @@ def numbers(observation: Mapping[str, object]) -> dict[str, float]:
     """The finite numbers of an observation: no images, no flags, no text."""
     found: dict[str, float] = {}
     for key, value in observation.items():
-        if isinstance(value, bool) or getattr(value, "ndim", 0) != 0:
-            continue
-        scalar = value.item() if hasattr(value, "item") else value
+        scalar = _plain(value)
         if isinstance(scalar, int | float) and not isinstance(scalar, bool) and math.isfinite(scalar):
             found[key] = float(scalar)
     return found
+
+
+def _plain(value: object) -> object:
+    """The Python number behind a scalar of an array package; anything else as it is."""
+    item = getattr(value, "item", None)
+    return item() if callable(item) and getattr(value, "ndim", None) == 0 else value
 
 
 class SpeedLimit:

@@ -1,0 +1,168 @@
+"""Leaders: what a follower is teleoperated by, made to look like a policy, and a scripted one for machines without.
+
+A leader is any object with ``get_action() -> dict`` of targets by action key (a LeRobot teleoperator, a gamepad). It
+may have ``is_connected`` and ``get_teleop_events()``.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from strands_robots.policies.actions import SpeedLimit, checked_action, numbers
+from strands_robots.policies.base import Action, Ranges
+from strands_robots.utils import ValidationError, mapping, number
+
+logger = logging.getLogger(__name__)
+
+GIVE_UP_S = 0.5
+"""A leader without a usable frame for so long ends the teleoperation with an error and a hold."""
+
+FULL_RANGES_PER_S = 2.0
+"""How often a second a follower's joint may cross its whole range."""
+
+UNBOUNDED_PER_S = 1440.0
+"""Speed bound of a joint without a range, in its unit a second (two turns a second in degrees, twice)."""
+
+MAGNITUDE_MAX = 720.0
+"""Largest target of a joint without a range, in its unit."""
+
+
+class InputSink(Protocol):
+    """Where a leader's frames go besides its follower: a network gives one. Returns at once, never blocks."""
+
+    def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
+        """Carry one frame; ``events`` is None when the leader has none or reading them failed."""
+
+
+class ScriptedLeader:
+    """A leader without hardware: every key follows a sine around a centre.
+
+    Args:
+        waves: by action key, centre and amplitude in the key's unit and frequency in Hz.
+        now: monotonic seconds.
+    """
+
+    def __init__(
+        self, waves: Mapping[str, tuple[float, float, float]], now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._waves = {key: tuple(number(f"waves[{key!r}]", part) for part in wave) for key, wave in waves.items()}
+        self._now = now
+        self._began: float | None = None
+        self.is_connected = True
+
+    def get_action(self) -> Action:
+        """The targets of this moment; the first call is the start of time, with every key at its centre."""
+        self._began = self._now() if self._began is None else self._began
+        seconds = self._now() - self._began
+        return {
+            key: centre + amplitude * math.sin(math.tau * hz * seconds)
+            for key, (centre, amplitude, hz) in self._waves.items()
+        }
+
+
+class LeaderPolicy:
+    """A leader as a policy: frames are checked, renamed, clamped to the follower's ranges and bounded in speed.
+
+    A frame that cannot be read or used is counted and not applied; after :data:`GIVE_UP_S` without a good one the
+    rollout ends with an error. The follower glides to the leader at the speed bound where the two begin apart.
+
+    Args:
+        leader: has ``get_action()``.
+        device: the leader's name on the network.
+        method: how it leads: arm, gamepad, keyboard or phone.
+        keys: follower's key for each leader's key; unnamed keys keep their name.
+        max_speed: whole joint ranges a second.
+        period: control period, seconds.
+        sink: gets every good frame, as the leader gave it.
+    """
+
+    uses_cameras = False
+
+    def __init__(
+        self,
+        leader: Any,
+        *,
+        device: str = "leader",
+        method: str = "arm",
+        keys: Mapping[str, str] | None = None,
+        max_speed: float = FULL_RANGES_PER_S,
+        period: float = 0.02,
+        sink: InputSink | None = None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.frames = 0
+        self.errors = 0
+        self.sink_errors = 0
+        self.last_error = ""
+        self._leader = leader
+        self._device, self._method = device, method
+        self._keys = dict(keys or {})
+        self._max_speed = max_speed
+        self._period = period
+        self._sink = sink
+        self._now = now
+        self._ranges: Ranges = {}
+        self._limit: SpeedLimit | None = None
+        self._last: dict[str, float] = {}
+        self._good_at = 0.0
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        if getattr(self._leader, "is_connected", True) is False:
+            raise ValidationError(f"teleoperator {self._device} is not connected; connect it first.")
+        self._ranges = {
+            key: (max(low, -MAGNITUDE_MAX) if low == -math.inf else low, MAGNITUDE_MAX if high == math.inf else high)
+            for key, (low, high) in ranges.items()
+        }
+        self._limit = SpeedLimit(ranges, self._max_speed, UNBOUNDED_PER_S)
+        self._last = {}
+        self._good_at = self._now()
+
+    def act(self, observation: Mapping[str, Any]) -> Action | list[Action]:
+        now = self._now()
+        try:
+            frame = mapping("leader action", self._leader.get_action())
+            target = checked_action({self._keys.get(key, key): value for key, value in frame.items()}, self._ranges)
+        except Exception as exc:
+            self.errors += 1
+            self.last_error = f"{type(exc).__name__}: {exc}"
+            if now - self._good_at >= GIVE_UP_S:
+                raise
+            return []
+        self.frames += 1
+        # A pause may not be saved up for a jump.
+        dt = min(max(now - self._good_at, self._period), 2 * self._period)
+        self._good_at = now
+        if not self._last:
+            self._last = {key: value for key, value in numbers(observation).items() if key in self._ranges}
+        limit = self._limit or SpeedLimit(self._ranges, self._max_speed, UNBOUNDED_PER_S)
+        self._last = {**self._last, **limit.limit(target, self._last, dt)}
+        self._publish(frame)
+        return {key: self._last[key] for key in target}
+
+    def close(self) -> None:
+        """The leader stays connected: it is its owner's."""
+
+    def _publish(self, frame: Mapping[str, Any]) -> None:
+        if self._sink is None:
+            return
+        try:
+            self._sink.publish(self._device, self._method, numbers(frame), self._events())
+        except Exception:
+            self.sink_errors += 1
+            if self.sink_errors == 1:
+                logger.exception("The frames of %s do not reach the network; the follower goes on.", self._device)
+
+    def _events(self) -> dict[str, Any] | None:
+        read = getattr(self._leader, "get_teleop_events", None)
+        if not callable(read):
+            return None
+        try:
+            return {str(getattr(key, "value", key)): value for key, value in dict(read()).items()}
+        except Exception as exc:
+            self.last_error = f"get_teleop_events: {type(exc).__name__}: {exc}"
+            logger.debug("The events of %s could not be read.", self._device, exc_info=True)
+            return None

@@ -1,0 +1,222 @@
+"""Teleoperation for any robot: a leader drives a body through the control loop, permits and write path of rollouts."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.rollout import STOP_JOIN_S, Body, Rollout
+from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.teleop import FULL_RANGES_PER_S, InputSink, LeaderPolicy
+from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
+
+_LATE = "the loop still waits for its leader; it sends no action any more"
+
+METHODS = ("arm", "gamepad", "keyboard", "phone")
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A leader and the body it is to drive."""
+
+    leader: Any
+    name: str
+    robot: str
+    method: str
+    keys: Mapping[str, str]
+    max_speed: float
+
+
+class TeleopMixin:
+    """``attach_teleop``, ``teleoperate`` and ``stop_teleoperate`` for a host that has the members declared here.
+
+    One source drives a body at a time. The host's ``halt`` asks :meth:`teleop_stops`, and its ``starting`` is the
+    re-entrant lock under which it looks whether a body is free and starts a motion.
+    """
+
+    gate: MotionGate
+    starting: AbstractContextManager[Any]
+    input_sink: InputSink | None = None
+    """Where frames go when ``publish`` is asked for; a network that carries input streams sets it."""
+
+    @abstractmethod
+    def body(self, robot_name: str | None = None) -> Body:
+        """The body of that name, or the host's first. Raises :class:`ValidationError` where there is none."""
+
+    @abstractmethod
+    def occupied(self, robot: str) -> str:
+        """What task drives the body of that name now, for a refusal; empty when none does."""
+
+    def attach_teleop(
+        self,
+        leader: Any,
+        name: str = "leader",
+        *,
+        robot_name: str | None = None,
+        keys: Mapping[str, str] | None = None,
+        method: str = "arm",
+        max_speed: float = FULL_RANGES_PER_S,
+    ) -> Envelope:
+        """Bind a leader to a body; nothing moves yet. A second leader of a name replaces the first.
+
+        Args:
+            leader: an object with ``get_action()``, connected.
+            name: what it is called here and on the network.
+            robot_name: body to drive; the first where the host has several and none is named.
+            keys: follower's action key for each leader's key that differs.
+            method: arm, gamepad, keyboard or phone.
+            max_speed: whole joint ranges a second that the follower may cross, above 0, at most 20.
+        """
+        reason = teleoperator_contract_error(leader)
+        if reason is not None:
+            return error(reason)
+        try:
+            attachment = Attachment(
+                leader=leader,
+                name=identifier("name", name),
+                robot=self.body(robot_name).name,
+                method=choice("method", method, METHODS),
+                keys=dict(keys or {}),
+                max_speed=number("max_speed", max_speed, above=0, high=20),
+            )
+        except ValidationError as exc:
+            return error(str(exc))
+        with self.starting:
+            if name in self.teleoperating():
+                return error(f"{name} teleoperates {self._sessions[name][0].robot} now; stop_teleoperate it first.")
+            self._attached[name] = attachment
+        return success(f"{name} will lead {attachment.robot}.", name=name, robot=attachment.robot)
+
+    def teleoperate(
+        self,
+        name: str = "leader",
+        duration: float | None = None,
+        hz: float = 50.0,
+        publish: bool = False,
+    ) -> Envelope:
+        """Let an attached leader drive its body, and return at once.
+
+        Args:
+            name: as attached.
+            duration: seconds, above 0, at most 3600; None until stopped.
+            hz: frames a second, 1 to 1000.
+            publish: also carry the leader's frames on the network.
+        """
+        try:
+            seconds = None if duration is None else number("duration", duration, above=0, high=3600)
+            rate = number("hz", hz, low=1, high=1000)
+            sink = self._sink(flag("publish", publish))
+            with self.starting:
+                session = self._begin(identifier("name", name), seconds, rate, sink)
+        except MotionRefused as refused:
+            return refused.envelope
+        except ValidationError as exc:
+            return error(str(exc))
+        return success(f"{name} leads {session.robot}.", name=name, robot=session.robot, hz=rate)
+
+    def stop_teleoperate(self, name: str | None = None, timeout: float = STOP_JOIN_S) -> Envelope:
+        """Stop one leader, or all. ``stopped`` is false when a loop outlived the ``timeout`` in seconds."""
+        running = self.teleoperating()
+        asked = running if name is None else {key: each for key, each in running.items() if key == name}
+        if not asked:
+            return success("Nobody teleoperates.", stopped=True, was_running=False)
+        deadline = time.monotonic() + timeout
+        for session in asked.values():
+            session.request_stop()
+        late = [key for key, each in asked.items() if not each.join(max(0.0, deadline - time.monotonic()))]
+        fields = {"stopped": not late, "was_running": True, "leaders": self._rows(asked)}
+        if late:
+            return error(
+                f"{', '.join(late)}: the loop still waits for its leader; it sends no action any more.", **fields
+            )
+        return success(f"Stopped {', '.join(asked)}.", **fields)
+
+    def teleop_status(self) -> Envelope:
+        """One row for each leader that leads or has led: robot, frames, errors, state, steps and rate."""
+        rows = self._rows({name: rollout for name, (rollout, _) in self._sessions.items()})
+        return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
+
+    def teleoperating(self) -> dict[str, Rollout]:
+        """The running sessions by leader."""
+        return {name: rollout for name, (rollout, _) in list(self._sessions.items()) if rollout.running}
+
+    def teleoperated_by(self, robot: str) -> str:
+        """The leader that drives the body of that name now; empty when none does."""
+        return next((name for name, each in self.teleoperating().items() if each.robot == robot), "")
+
+    def teleop_stops(self, deadline: float) -> dict[str, Callable[[], object]]:
+        """For a halt: void every session at once; how to wait for each, until ``deadline`` on the monotonic clock."""
+        running = self.teleoperating()
+        for session in running.values():
+            session.request_stop()
+        return {f"teleoperation {name}": partial(_ended, session, deadline) for name, session in running.items()}
+
+    @cached_property
+    def _attached(self) -> dict[str, Attachment]:
+        return {}
+
+    @cached_property
+    def _sessions(self) -> dict[str, tuple[Rollout, LeaderPolicy]]:
+        return {}
+
+    def _sink(self, publish: bool) -> InputSink | None:
+        if publish and self.input_sink is None:
+            raise ValidationError("publish must be false: no network that carries input streams is attached.")
+        return self.input_sink if publish else None
+
+    def _begin(self, name: str, seconds: float | None, rate: float, sink: InputSink | None) -> Rollout:
+        attachment = self._attached.get(name)
+        if attachment is None:
+            known = ", ".join(self._attached) or "none yet"
+            raise ValidationError(f"name must be an attached leader ({known}), not {name!r}; attach_teleop it first.")
+        body = self.body(attachment.robot)
+        busy = self.occupied(body.name) or self.teleoperated_by(body.name)
+        if busy:
+            raise ValidationError(f"{body.name} is driven by {busy}; stop that first.")
+        policy = LeaderPolicy(
+            attachment.leader,
+            device=name,
+            method=attachment.method,
+            keys=attachment.keys,
+            max_speed=attachment.max_speed,
+            period=1 / rate,
+            sink=sink,
+        )
+        session = Rollout(
+            body,
+            policy,
+            permit=self.gate.permit("teleoperate"),
+            instruction=f"follow {name}",
+            policy_name="teleoperation",
+            duration=seconds,
+            hz=rate,
+        )
+        self._sessions[name] = (session, policy)
+        session.start()
+        return session
+
+    def _rows(self, sessions: Mapping[str, Rollout]) -> dict[str, dict[str, Any]]:
+        rows = {}
+        for name, rollout in sessions.items():
+            policy = self._sessions[name][1]
+            rows[name] = {
+                **rollout.row(),
+                "state": rollout.state,
+                "error": rollout.error or policy.last_error,
+                "frames": policy.frames,
+                "errors": policy.errors,
+                "hz_actual": round(rollout.step_count / rollout.elapsed_s, 2) if rollout.elapsed_s > 0 else 0.0,
+            }
+        return rows
+
+
+def _ended(session: Rollout, deadline: float) -> Envelope:
+    if session.join(max(0.0, deadline - time.monotonic())):
+        return success("Stopped.", stopped=True)
+    return error(_LATE, stopped=False)
