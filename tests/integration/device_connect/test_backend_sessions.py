@@ -1,0 +1,177 @@
+"""One session a process, whoever uses it, and nothing left when the last one goes."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from fixtures.waiting import free_port
+
+from strands_robots.device_connect.backends import LinkConfig
+
+FLEET = """
+import asyncio, json, os, sys, threading
+import psutil
+from fixtures.bare_caller import Caller
+from fixtures.echo_device import EchoDriver
+from strands_robots.device_connect._compat import Runtime
+from strands_robots.device_connect.backends import loopback_config, open_client
+
+COUNT, PORT = int(sys.argv[1]), int(sys.argv[2])
+me = psutil.Process()
+link = loopback_config(PORT)
+before = me.memory_info().rss
+
+class Host(threading.Thread):
+    def __init__(self, number):
+        super().__init__(daemon=True)
+        self.name = f"arm-{number}"
+        self.up = threading.Event()
+
+    def run(self):
+        asyncio.run(self.main())
+
+    async def main(self):
+        self.loop, self.quit = asyncio.get_running_loop(), asyncio.Event()
+        runtime = Runtime(driver=EchoDriver(), device_id=self.name, link=link, allow_insecure=True)
+        task = asyncio.create_task(runtime.run())
+        await runtime.wait_ready(20)
+        self.up.set()
+        await self.quit.wait()
+        await runtime.shutdown()
+
+hosts = [Host(number) for number in range(COUNT)]
+for host in hosts:
+    host.start()
+for host in hosts:
+    assert host.up.wait(20), host.name
+
+async def ask_all():
+    async with Caller(client=await open_client(link)) as caller:
+        names = [host.name for host in hosts]
+        await caller.sees(*names, within=20)
+        for name in names:
+            assert (await caller.call(name, "getStatus", {"value": name}))["result"]["value"] == name
+    async with Caller(servers=(f"tcp/127.0.0.1:{PORT}",)) as bare:
+        await bare.sees(*names, within=20)
+
+asyncio.run(ask_all())
+# Each host has a thread of its own here; those are the test's, not the backend's.
+print(json.dumps({
+    "mb": (me.memory_info().rss - before) / 2**20,
+    "threads": me.num_threads() - COUNT,
+    "descriptors": me.num_fds(),
+}))
+for host in hosts:
+    host.loop.call_soon_threadsafe(host.quit.set)
+for host in hosts:
+    host.join(20)
+    assert not host.is_alive()
+"""
+
+CYCLES = """
+import asyncio, json, sys
+import psutil
+from fixtures.echo_device import EchoDriver
+from strands_robots.device_connect._compat import Runtime
+from strands_robots.device_connect.backends import LinkConfig, sessions
+
+link = LinkConfig(**json.loads(sys.argv[1], object_hook=lambda d: {k: tuple(v) if isinstance(v, list) else v
+                                                                   for k, v in d.items()}))
+me = psutil.Process()
+
+async def once():
+    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
+    task = asyncio.create_task(runtime.run())
+    await runtime.wait_ready(20)
+    await runtime.shutdown()
+    assert task.done()
+
+def cycle():
+    asyncio.run(once())
+    assert not sessions.open_links()
+    return me.num_threads(), me.num_fds()
+
+for _ in range(3):
+    settled = cycle()
+for _ in range(20):
+    after = cycle()
+print(json.dumps({"settled": settled, "after": after}))
+"""
+
+FORGETFUL = """
+import asyncio
+from fixtures.echo_device import EchoDriver
+from strands_robots.device_connect._compat import Runtime
+from strands_robots.device_connect.backends import LinkConfig
+
+async def main():
+    link = LinkConfig(mode="peer", listen=("tcp/127.0.0.1:0",), multicast=False)
+    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
+    runtime.kept = asyncio.create_task(runtime.run())
+    await runtime.wait_ready(20)
+
+loop = asyncio.new_event_loop()
+loop.run_until_complete(main())
+print("leaves without a word", flush=True)
+"""
+
+
+def run(program, *arguments):
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=90, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def nothing_grew(seen):
+    """Zenoh keeps a pool of native threads, which comes and goes by one or two whatever the cycles."""
+    assert seen["after"][0] <= seen["settled"][0] + 2
+    assert seen["after"][1] <= seen["settled"][1] + 2
+
+
+def test_thirty_two_runtimes_on_their_own_loops_share_one_session():
+    used = json.loads(run(FLEET, "32", str(free_port())).splitlines()[-1])
+    assert used["mb"] <= 120
+    assert used["threads"] <= 80
+    # A loop has three descriptors of its own, which are the host's.
+    assert used["descriptors"] - 3 * 32 <= 104
+
+
+@pytest.mark.parametrize("mode", ["peer", "meeting"])
+def test_twenty_cycles_leave_no_thread_and_no_descriptor(mode):
+    link = {"mode": "peer", "multicast": False}
+    link |= {"listen": ["tcp/127.0.0.1:0"]} if mode == "peer" else {"meet_port": free_port()}
+    seen = json.loads(run(CYCLES, json.dumps(link)).splitlines()[-1])
+    nothing_grew(seen)
+
+
+def test_a_process_that_forgets_to_shut_down_still_ends():
+    assert "leaves without a word" in run(FORGETFUL)
+
+
+def test_a_start_that_is_given_up_never_comes_online_later():
+    absent = free_port()
+    program = CYCLES.replace("await runtime.wait_ready(20)", "await give_up(runtime)").replace(
+        "def cycle",
+        "async def give_up(runtime):\n"
+        "    try:\n"
+        "        await runtime.wait_ready(0.15)\n"
+        "    except TimeoutError:\n"
+        "        return\n"
+        "    raise AssertionError('came up')\n\n"
+        "def cycle",
+    )
+    link = {"connect": [f"tcp/127.0.0.1:{absent}"], "connect_timeout_s": 0.3}
+    program = program.replace("range(20)", "range(8)").replace(
+        "    assert not sessions.open_links()\n",
+        "    import time; time.sleep(0.3)\n    assert not sessions.open_links()\n",
+    )
+    seen = json.loads(run(program, json.dumps(link)).splitlines()[-1])
+    nothing_grew(seen)
+
+
+def test_two_links_that_differ_do_not_share():
+    assert LinkConfig(tenant="red") != LinkConfig(tenant="blue")
+    assert hash(LinkConfig()) == hash(LinkConfig())
