@@ -1,0 +1,125 @@
+"""Access to a device's bus: which object is read, one re-entrant lock for each device, joints without cameras.
+
+A serial motor bus carries one exchange at a time, so every read and every write of a device holds
+:func:`bus_lock` of it. A wrapper and the device inside it share one lock.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import weakref
+from collections.abc import Mapping
+from typing import Any
+
+from strands_robots.policies.actions import numbers
+
+_INNER = ("device", "robot")
+_READERS = ("get_joints", "get_observation")
+
+NORMALISED = {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}
+"""LeRobot's normalised motor ranges (``MotorNormMode``)."""
+
+_locks: dict[int, tuple[object, threading.RLock]] = {}
+_guard = threading.Lock()
+
+
+def joint_read_source(robot: Any) -> Any | None:
+    """The object that a robot's joints are read from, or None when it has none.
+
+    A native driver that owns its bus is its own source; a wrapper's is the device inside it (``device``, or
+    ``robot`` as LeRobot's own wrappers call it).
+    """
+    for name in _INNER:
+        inner = getattr(robot, name, None)
+        if inner is not None and inner is not robot and _readable(inner):
+            return joint_read_source(inner)
+    return robot if _readable(robot) else None
+
+
+def bus_lock(device: Any) -> threading.RLock:
+    """The one lock of the bus behind ``device``; the same for a wrapper and what it wraps."""
+    source = joint_read_source(device)
+    key = device if source is None else source
+    with _guard:
+        known = _locks.get(id(key))
+        if known is None:
+            known = (_kept(key), threading.RLock())
+            _locks[id(key)] = known
+        return known[1]
+
+
+def read_joints(device: Any) -> dict[str, float]:
+    """Joint positions by observation key, in the device's unit, read under the bus lock and without its cameras.
+
+    From ``get_joints()`` where the device has it, from the motor bus alone where it is a LeRobot device with one bus,
+    else the numbers of a whole observation. Raises what the device raises.
+    """
+    source = joint_read_source(device)
+    if source is None:
+        return {}
+    with bus_lock(source):
+        own = getattr(source, "get_joints", None)
+        if callable(own):
+            return numbers(own())
+        motors = _motors(source)
+        if motors is not None:
+            positions = source.bus.sync_read("Present_Position")
+            return numbers({f"{name}.pos": positions[name] for name in motors})
+        return numbers(source.get_observation())
+
+
+def action_ranges(device: Any) -> dict[str, tuple[float, float]]:
+    """The range of every action key: the device's ``joint_ranges``, LeRobot's normalised ones, else infinite.
+
+    A LeRobot motor in degrees has the range of its calibration, which LeRobot centres on 0:
+    ``(range_max - range_min) / 2`` encoder counts each way, of 4096 a turn minus one.
+    """
+    declared = getattr(device, "joint_ranges", None)
+    known: Mapping[str, Any] = declared if isinstance(declared, Mapping) else {}
+    motors = _motors(device) or {}
+    ranges: dict[str, tuple[float, float]] = {}
+    for key in device.action_features:
+        if key in known:
+            low, high = known[key]
+            ranges[key] = (float(low), float(high))
+        else:
+            ranges[key] = _motor_range(device, key.removesuffix(".pos"), motors)
+    return ranges
+
+
+def _motor_range(device: Any, motor: str, motors: Mapping[str, Any]) -> tuple[float, float]:
+    described = motors.get(motor)
+    mode = str(getattr(getattr(described, "norm_mode", None), "name", ""))
+    if mode in NORMALISED:
+        return NORMALISED[mode]
+    calibration = getattr(device.bus, "calibration", None) if described is not None else None
+    entry = calibration.get(motor) if isinstance(calibration, Mapping) else None
+    if mode == "DEGREES" and entry is not None:
+        half = (entry.range_max - entry.range_min) / 2 * 360 / 4095
+        return (-half, half)
+    return (-math.inf, math.inf)
+
+
+def _motors(device: Any) -> Mapping[str, Any] | None:
+    """The motors of a device whose one bus gives every number of its observation; else None."""
+    bus = getattr(device, "bus", None)
+    motors = getattr(bus, "motors", None)
+    if not isinstance(motors, Mapping) or not callable(getattr(bus, "sync_read", None)):
+        return None
+    features = getattr(device, "observation_features", {})
+    scalars = {key for key, kind in features.items() if not isinstance(kind, tuple | list)}
+    return motors if scalars == {f"{name}.pos" for name in motors} else None
+
+
+def _readable(candidate: Any) -> bool:
+    return any(callable(getattr(candidate, name, None)) for name in _READERS)
+
+
+def _kept(key: Any) -> object:
+    """A weak reference that forgets the lock with the device; the device itself where it allows none."""
+    number = id(key)
+    try:
+        return weakref.ref(key, lambda _: _locks.pop(number, None))
+    except TypeError:
+        return key
