@@ -128,6 +128,12 @@ def test_a_link_that_cannot_work_is_refused(fields):
         LinkConfig(**fields)
 
 
+def test_a_nats_link_is_authenticated_by_what_its_server_checks():
+    assert not LinkConfig("nats", connect=("nats://h:4222",)).authenticated
+    assert LinkConfig("nats", connect=("nats://user:word@h:4222",)).authenticated
+    assert LinkConfig("nats", jwt="x", nkey_seed="y").authenticated
+
+
 def test_secrets_are_not_shown():
     link = LinkConfig(ca="ca", cert="c", key="SECRET-KEY", jwt="SECRET-JWT", nkey_seed="SECRET-SEED")
     assert "SECRET" not in repr(link)

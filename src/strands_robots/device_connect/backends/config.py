@@ -84,9 +84,9 @@ class LinkConfig:
 
     @property
     def authenticated(self) -> bool:
-        """True when both sides prove who they are: mutual TLS, or a NATS token whose key is proven."""
+        """True when both sides prove who they are: mutual TLS, or credentials that a NATS server checks."""
         if self.transport == "nats":
-            return bool(self.jwt or self.cert)
+            return bool(self.jwt or self.cert or any("@" in url for url in self.connect))
         return bool(self.ca and self.cert)
 
     @property

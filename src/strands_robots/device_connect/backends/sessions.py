@@ -11,12 +11,13 @@ import contextlib
 import json
 import logging
 import random
+import socket
 import threading
 from collections.abc import Callable
 from typing import Any
 
 from ...utils import missing_extra
-from .config import LinkConfig
+from .config import LOOPBACK, LinkConfig
 
 try:
     import zenoh
@@ -62,7 +63,8 @@ def release(shared: SharedSession) -> None:
             return
         if _sessions.get(shared.link) is shared:
             del _sessions[shared.link]
-    shared.close()
+        # Before the next one opens: it may listen on the same port.
+        shared.close()
 
 
 def open_links() -> tuple[LinkConfig, ...]:
@@ -212,14 +214,24 @@ class Meeting:
 
     def _watch(self) -> None:
         while not self._closing.wait(MEETING_CHECK_S * random.uniform(0.5, 1.0)):
-            if self._host is None and not self._somebody_has_it():
-                # Whoever was faster has it now, and the main session's retry finds them.
+            if self._host is None and not self._somebody_has_it() and self._port_is_free():
+                # A faster process may have it by now; the main session's retry finds that one.
                 with contextlib.suppress(zenoh.ZError):
                     self._host = zenoh.open(_zenoh_config(self._link.meeting_host()))
                     logger.info("took over the meeting point %s", self._link.meeting_point)
 
     def _somebody_has_it(self) -> bool:
         return any(str(link.dst) == self._link.meeting_point for link in self._session.info.links())
+
+    def _port_is_free(self) -> bool:
+        with socket.socket() as probe:
+            # As Zenoh binds: what is left of dead connections does not count.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((LOOPBACK, self._link.meet_port or 0))
+            except OSError:
+                return False
+        return True
 
 
 def _open(link: LinkConfig) -> tuple[Any, Meeting | None]:
