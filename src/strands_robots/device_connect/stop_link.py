@@ -1,0 +1,274 @@
+"""The stop lane's own connections to Device Connect: one Zenoh session or one NATS connection for each link.
+
+They take the configuration of a device's link and nothing else of it: no session, loop, queue or lock is shared.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import contextlib
+import json
+import logging
+import threading
+import weakref
+from collections.abc import Awaitable, Callable, Collection
+from dataclasses import replace
+from typing import Any
+
+from device_connect_edge.messaging import MessagingError
+
+from strands_robots.device_connect.backends import LinkConfig, backend_for
+from strands_robots.safety.links import Hear, OnState, StopLink
+
+logger = logging.getLogger(__name__)
+
+RETRY_S = 0.25
+TRY_MS = 1000
+"""How long a client's session tries to open before it looks whether it is still wanted."""
+
+LEASE_MS = 4000
+"""A silent far side is given up after this long; shorter, and a lossy link would flap under a stop."""
+
+
+def stop_link(link: LinkConfig) -> StopLink:
+    """A connection of the lane's own to where ``link`` leads."""
+    return NatsStopLink(link) if link.transport == "nats" else ZenohStopLink(link)
+
+
+def _apart(link: LinkConfig) -> LinkConfig:
+    """``link`` without its meeting port: the lane joins the others there and never hosts them."""
+    if link.meeting_point is None:
+        return link
+    return replace(link, mode="peer", meet_port=None, connect=(*link.connect, link.meeting_point), multicast=False)
+
+
+class _State:
+    """Up or down, told at each change."""
+
+    def __init__(self, on_state: OnState) -> None:
+        self.up = False
+        self._on_state = on_state
+
+    def set(self, up: bool) -> None:
+        if up != self.up:
+            self.up = up
+            self._on_state(up)
+
+
+class ZenohStopLink:
+    """A Zenoh session of its own; callbacks run on Zenoh's receiving thread and only hand over."""
+
+    def __init__(self, link: LinkConfig) -> None:
+        self._link = _apart(link)
+        self._root = f"device-connect/{link.tenant}"
+        self._session: Any = None
+        self._keep: list[Any] = []
+        self._far_sides: set[str] = set()
+        self._state = _State(lambda up: None)
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._put_options: dict[str, Any] = {}
+
+    @property
+    def up(self) -> bool:
+        return self._state.up
+
+    def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
+        self._state = _State(on_state)
+        self._thread = threading.Thread(target=self._open, args=(events, hear), name="stop-link", daemon=True)
+        self._thread.start()
+        _OPEN.add(self)
+
+    def publish(self, source: str, event: str, payload: bytes) -> bool:
+        session = self._session
+        if session is None or not self._state.up:
+            return False
+        try:
+            session.put(f"{self._root}/{source}/event/{event}", payload, **self._put_options)
+        except Exception as exc:  # noqa: BLE001 - the binding has one error for a closed session and a bad key
+            logger.warning("%s was not sent: %s", event, exc)
+            return False
+        return True
+
+    def close(self) -> None:
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join(10.0)
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
+        self._state.set(False)
+        _OPEN.discard(self)
+
+    def _open(self, events: Collection[str], hear: Hear) -> None:
+        import zenoh  # noqa: PLC0415 - an optional package, loaded with the first link
+
+        def direct(sink: Callable[[Any], None]) -> Any:
+            return zenoh.handlers.Callback(sink, None, indirect=False)
+
+        self._put_options = {
+            "priority": zenoh.Priority.REAL_TIME,
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "express": True,
+        }
+        config = self._link.zenoh()
+        config["connect"]["retry"] = {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2}
+        config["transport"]["link"]["tx"]["lease"] = LEASE_MS
+        if not self._link.is_peer:
+            config["connect"]["timeout_ms"] = TRY_MS
+        text = json.dumps(config)
+        session = None
+        while session is None and not self._closing.is_set():
+            try:
+                session = zenoh.open(zenoh.Config.from_json5(text))
+            except zenoh.ZError as exc:
+                logger.debug("the stop lane's session does not open yet: %s", exc)
+                self._closing.wait(RETRY_S)
+        if session is None:
+            return
+
+        def on_sample(sample: Any) -> None:
+            parts = str(sample.key_expr).split("/")
+            if len(parts) == 5:
+                hear(parts[4], parts[2], sample.payload.to_bytes())
+
+        self._keep = [
+            session.declare_subscriber(f"{self._root}/*/event/{event}", direct(on_sample)) for event in events
+        ]
+        self._session = session
+        self._keep.append(session.info.declare_transport_events_listener(direct(self._on_far_side), history=True))
+
+    def _on_far_side(self, event: Any) -> None:
+        zid = str(event.transport.zid)
+        # One thread of Zenoh's tells these, in order.
+        if str(event.kind).endswith("PUT"):
+            self._far_sides.add(zid)
+        else:
+            self._far_sides.discard(zid)
+        self._state.set(bool(self._far_sides) and not self._closing.is_set())
+
+
+class NatsStopLink:
+    """A NATS connection of its own, on an event loop and a thread of its own."""
+
+    def __init__(self, link: LinkConfig) -> None:
+        self._link = link
+        self._root = f"device-connect.{link.tenant}"
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._client: Any = None
+        self._state = _State(lambda up: None)
+        self._sending: set[asyncio.Future[None]] = set()
+        self._quit: asyncio.Event | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def up(self) -> bool:
+        return self._state.up
+
+    def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
+        self._state = _State(on_state)
+        self._loop = asyncio.new_event_loop()
+        self._quit = asyncio.Event()
+        self._thread = threading.Thread(target=self._live, args=(events, hear), name="stop-link", daemon=True)
+        self._thread.start()
+        _OPEN.add(self)
+
+    def publish(self, source: str, event: str, payload: bytes) -> bool:
+        loop = self._loop
+        if loop is None or loop.is_closed() or not self._state.up:
+            return False
+        loop.call_soon_threadsafe(self._send, f"{self._root}.{source}.event.{event}", payload)
+        return True
+
+    def close(self) -> None:
+        loop, quit_, thread = self._loop, self._quit, self._thread
+        if loop is None or quit_ is None or thread is None:
+            return
+        with contextlib.suppress(RuntimeError):  # the loop has ended already
+            loop.call_soon_threadsafe(quit_.set)
+        thread.join(10.0)
+        _OPEN.discard(self)
+
+    def _live(self, events: Collection[str], hear: Hear) -> None:
+        assert self._loop is not None
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._serve(events, hear))
+        except Exception:
+            logger.critical("The stop lane's NATS link ended.", exc_info=True)
+        finally:
+            self._state.set(False)
+            self._loop.close()
+
+    async def _serve(self, events: Collection[str], hear: Hear) -> None:
+        assert self._quit is not None
+        while not self._quit.is_set():
+            client = backend_for(self._link)
+            connecting = asyncio.ensure_future(
+                client.connect(servers=[], reconnect_cb=self._back, disconnect_cb=self._lost)
+            )
+            ending = asyncio.ensure_future(self._quit.wait())
+            await asyncio.wait({connecting, ending}, return_when=asyncio.FIRST_COMPLETED)
+            ending.cancel()
+            if not connecting.done():
+                connecting.cancel()
+                await asyncio.gather(connecting, return_exceptions=True)
+                return
+            try:
+                connecting.result()
+            except MessagingError as exc:
+                logger.debug("the stop lane's connection does not open yet: %s", exc)
+                with contextlib.suppress(TimeoutError):  # not asked to end: try again
+                    await asyncio.wait_for(self._quit.wait(), RETRY_S)
+                continue
+            try:
+                for event in events:
+                    await client.subscribe_with_subject(f"{self._root}.*.event.{event}", _hand_over(hear))
+                # The server has the subscriptions when it has answered this.
+                await client.flush()
+                self._client = client
+                self._state.set(True)
+                await self._quit.wait()
+            finally:
+                self._client = None
+                self._state.set(False)
+                await client.close()
+
+    async def _back(self) -> None:
+        self._state.set(True)
+
+    async def _lost(self) -> None:
+        self._state.set(False)
+
+    def _send(self, subject: str, payload: bytes) -> None:
+        task = asyncio.ensure_future(self._publish(subject, payload))
+        self._sending.add(task)
+        task.add_done_callback(self._sending.discard)
+
+    async def _publish(self, subject: str, payload: bytes) -> None:
+        client = self._client
+        try:
+            if client is not None:
+                await client.publish(subject, payload)
+        except MessagingError as exc:
+            logger.warning("%s was not sent: %s", subject, exc)
+
+
+def _hand_over(hear: Hear) -> Callable[[bytes, str, str | None], Awaitable[None]]:
+    async def on_message(data: bytes, subject: str, reply: str | None) -> None:
+        parts = subject.split(".")
+        if len(parts) == 5:
+            hear(parts[4], parts[2], data)
+
+    return on_message
+
+
+_OPEN: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """A session left open with a subscriber would hang the interpreter's exit."""
+    for link in list(_OPEN):
+        link.close()

@@ -1,0 +1,260 @@
+"""The stop lane on real transports: heard, decided, halted and answered, beside no data plane at all."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.nats_server import NatsServer
+from fixtures.recording_robot import RecordingRobot
+from fixtures.waiting import eventually, free_port
+from fixtures.zenoh_router import ZenohRouter
+
+from strands_robots.audit import read_audit_log
+from strands_robots.device_connect.backends import LinkConfig, loopback_config, sessions
+from strands_robots.device_connect.stop_link import stop_link
+from strands_robots.safety import ed25519
+from strands_robots.safety.decision import Decision, signed_fields
+from strands_robots.safety.lane import StopLane
+from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, StopLink, notification
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.plane import SafetyPlane
+
+Broker = ZenohRouter | NatsServer
+
+
+@pytest.fixture(params=["zenoh router", "nats", "zenoh peers"])
+def network(request: pytest.FixtureRequest) -> Iterator[tuple[LinkConfig, Broker | None]]:
+    if request.param == "nats":
+        with NatsServer() as server:
+            yield LinkConfig(transport="nats", connect=(server.url,)), server
+    elif request.param == "zenoh router":
+        with ZenohRouter() as router:
+            yield LinkConfig(connect=(router.endpoint,), mode="client"), router
+    else:
+        link = loopback_config(free_port())
+        data_plane = sessions.acquire(link)
+        yield link, None
+        sessions.release(data_plane)
+
+
+class Listener:
+    """Somebody else on the network, with a link of the same kind, who may send anything."""
+
+    def __init__(self, link: LinkConfig) -> None:
+        self.got: list[tuple[str, dict[str, Any], float]] = []
+        self.link: StopLink = stop_link(link)
+        self.states: list[tuple[bool, float]] = []
+        self.link.open((VERDICT,), self._hear, lambda up: self.states.append((up, time.monotonic())))
+
+    def send(self, source: str, event: str = ESTOP, raw: bytes | None = None, **params: Any) -> bool:
+        return self.link.publish(source, event, notification(event, params) if raw is None else raw)
+
+    def verdicts(self, epoch: str) -> list[dict[str, Any]]:
+        return [params for _, params, _ in self.got if params["estop_id"] == epoch]
+
+    def _hear(self, event: str, source: str, payload: bytes) -> None:
+        self.got.append((source, json.loads(payload)["params"], time.monotonic()))
+
+
+class Site:
+    """A plane, a lane and some robots, as one process has them."""
+
+    def __init__(self, link: LinkConfig, *names: str, decide: Callable[[], Decision] = Decision) -> None:
+        self.plane = SafetyPlane(deadline_s=0.5)
+        self.lane = StopLane(self.plane, decide)
+        self.robots = {name: RecordingRobot() for name in names}
+        self.entries = [self.plane.register(name, robot) for name, robot in self.robots.items()]
+        self.seats = [self.lane.join(name, link, lambda: stop_link(link)) for name in names]
+
+    def ready(self) -> bool:
+        return all(seat.link.up for seat in self.seats)
+
+    def close(self) -> None:
+        for seat in self.seats:
+            seat.leave()
+        for entry in self.entries:
+            entry.close()
+        for robot in self.robots.values():
+            robot.close()
+
+
+@pytest.fixture
+def open_site(network: tuple[LinkConfig, Broker | None]) -> Iterator[Callable[..., tuple[Site, Listener]]]:
+    made: list[tuple[Site, Listener]] = []
+
+    def one(*names: str, **options: Any) -> tuple[Site, Listener]:
+        site, listener = Site(network[0], *names, **options), Listener(network[0])
+        made.append((site, listener))
+        eventually(lambda: site.ready() and listener.link.up, within=10)
+        if not options.get("decide", Decision)().signed:
+            probe(site, listener)
+        return site, listener
+
+    yield one
+    for site, listener in made:
+        site.close()
+        listener.link.close()
+
+
+def probe(site: Site, listener: Listener) -> None:
+    """Wait until a stop of the listener reaches the site and its verdict comes back, then clear it."""
+    epoch = new_epoch()
+
+    def answered() -> bool:
+        listener.send("probe-1", estop_id=epoch)
+        return bool(listener.verdicts(epoch))
+
+    eventually(answered, within=10)
+    site.plane.clear_local("test")
+
+
+def test_a_stop_is_heard_halts_every_robot_and_each_answers(open_site: Callable[..., tuple[Site, Listener]]) -> None:
+    site, listener = open_site("arm-1", "arm-2", "arm-3")
+    for robot in site.robots.values():
+        robot.start()
+    epoch = new_epoch()
+    listener.send("safety-1", estop_id=epoch, reason="smoke", t=time.time())
+    eventually(lambda: len(listener.verdicts(epoch)) == 3)
+    answers = {each["device_id"]: each for each in listener.verdicts(epoch)}
+    assert set(answers) == set(site.robots)
+    assert all(each["stopped"] is True and each["halted"] == ["policy"] for each in answers.values())
+    assert all(each["epochs"] == [epoch] for each in answers.values())
+    told = {source: at for source, params, at in listener.got if params["estop_id"] == epoch}
+    for name, robot in site.robots.items():
+        assert robot.device.times[-1] <= told[name]
+        assert robot.refuses()
+
+
+def test_a_retransmitted_stop_halts_once_and_is_answered_again(
+    open_site: Callable[..., tuple[Site, Listener]],
+) -> None:
+    site, listener = open_site("arm-1")
+    halts, epoch = len(site.robots["arm-1"].halts), new_epoch()
+    for _ in range(5):
+        listener.send("safety-1", estop_id=epoch)
+        time.sleep(0.03)
+    eventually(lambda: any(each["repeated"] for each in listener.verdicts(epoch)))
+    assert len(site.robots["arm-1"].halts) == halts + 1
+
+
+def test_malformed_oversized_late_and_early_stops_stop_and_the_audit_says_so(
+    open_site: Callable[..., tuple[Site, Listener]],
+) -> None:
+    site, listener = open_site("arm-1")
+    robot = site.robots["arm-1"]
+    before = len(robot.halts)
+    listener.send("safety-1", raw=b"\xff not json")
+    listener.send("safety-1", raw=b"x" * 200_000)
+    listener.send("safety-1", t=time.time() - 3600)
+    listener.send("safety-1", t=time.time() + 3600)
+    eventually(lambda: len(robot.halts) == before + 4)
+    assert len(site.entries[0].epochs) == 4
+    eventually(
+        lambda: (
+            {"late", "ahead", "untimed"}
+            <= {each["payload"].get("timing") for each in read_audit_log() if each["event"] == "remote_estop_engaged"}
+        )
+    )
+
+
+def test_its_own_event_stops_the_neighbour_and_not_itself(open_site: Callable[..., tuple[Site, Listener]]) -> None:
+    site, listener = open_site("arm-1", "arm-2")
+    listener.send("arm-1", estop_id=new_epoch())
+    eventually(site.robots["arm-2"].refuses)
+    assert not site.robots["arm-1"].refuses()
+
+
+def test_a_flood_of_forged_stops_delays_no_true_one_and_stops_nothing(
+    open_site: Callable[..., tuple[Site, Listener]],
+) -> None:
+    key = Ed25519PrivateKey.generate()
+    site, listener = open_site("arm-1", decide=lambda: Decision(allow=("safety-*",), keys=(ed25519.public_half(key),)))
+    robot, done = site.robots["arm-1"], threading.Event()
+
+    def forge() -> None:
+        sig = ed25519.encode(bytes(64))
+        while not done.is_set():
+            for source in ("forger", "safety-9", "safety-1"):
+                listener.send(source, estop_id=new_epoch(), t=1.0, nonce=new_epoch(), sig=sig)
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=forge)
+    thread.start()
+    try:
+        time.sleep(0.3)
+        assert robot.halts == []
+        fields = {"estop_id": new_epoch(), "t": time.time(), "nonce": new_epoch()}
+        message = signed_fields(fields["estop_id"], "safety-1", fields["t"], fields["nonce"])
+        fields["sig"] = ed25519.encode(key.sign(message))
+
+        def stopped() -> bool:
+            listener.send("safety-1", **fields)
+            return robot.refuses()
+
+        eventually(stopped)
+    finally:
+        done.set()
+        thread.join()
+    assert len(robot.halts) == 1
+    refused = [each["payload"] for each in read_audit_log() if each["event"] == "estop_refused"]
+    assert {"forger", "safety-9"} <= {each["source"] for each in refused}
+    assert len(refused) < 10
+
+
+def test_a_broker_that_was_killed_is_noticed_and_the_next_stop_comes_through(
+    network: tuple[LinkConfig, Broker | None], open_site: Callable[..., tuple[Site, Listener]]
+) -> None:
+    broker = network[1]
+    if broker is None:
+        pytest.skip("peers have no broker")
+    site, listener = open_site("arm-1")
+    broker.kill()
+    eventually(lambda: not listener.link.up)
+    assert listener.send("safety-1") is False
+    broker.start()
+    eventually(lambda: site.ready() and listener.link.up, within=15)
+
+    def stopped() -> bool:
+        listener.send("safety-1", estop_id=epoch)
+        return site.robots["arm-1"].refuses()
+
+    epoch = new_epoch()
+    eventually(stopped, within=10)
+
+
+def test_a_check_in_reaches_the_plane_from_who_may(open_site: Callable[..., tuple[Site, Listener]]) -> None:
+    site, listener = open_site("arm-1", decide=lambda: Decision(allow=("safety-*", "probe-*"), keys=()))
+
+    def known() -> dict[str, float]:
+        listener.send("safety-1", CHECK_IN)
+        listener.send("stranger", CHECK_IN)
+        found: dict[str, float] = site.plane.checkin.fields(time.monotonic())["controllers"]  # type: ignore[assignment]
+        return found
+
+    assert set(eventually(known)) == {"safety-1"}
+
+
+def test_the_lane_leaves_no_thread_and_no_connection_behind() -> None:
+    with NatsServer() as server:
+        for link in (LinkConfig(transport="nats", connect=(server.url,)), loopback_config(free_port())):
+            before = threading.active_count()
+            site = Site(link, "arm-1", "arm-2")
+            assert len({id(seat.link) for seat in site.seats}) == 1
+            site.close()
+            assert threading.active_count() == before
+
+
+def test_a_link_that_never_comes_up_closes_at_once() -> None:
+    for link in (
+        LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",)),
+        LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), mode="client", connect_timeout_s=0.5),
+    ):
+        site = Site(link, "arm-1")
+        assert not site.ready()
+        site.close()
