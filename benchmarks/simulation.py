@@ -73,7 +73,8 @@ def fleet(seconds: float) -> Row:
     real, spent = time.monotonic() - began, process.cpu_times()
     after = [moment(world) for world in worlds]
     used = (spent.user + spent.system - cpu.user - cpu.system) / real
-    steps = min(row["step"] for world in worlds for row in world.list_policies_running())
+    rows = [row for world in worlds for row in world.list_policies_running()]
+    rate = min(row["step"] / row["elapsed_s"] for row in rows)
     grown = (process.memory_info().rss - memory) / 1e6
     done.set()
     reader.join()
@@ -81,7 +82,6 @@ def fleet(seconds: float) -> Row:
         world.cleanup()
     pairs = zip(before, after, strict=True)
     factor = min((later.sim_time - sooner.sim_time) / (later.at - sooner.at) for sooner, later in pairs)
-    rate = steps / (real + 1.0)
     return Row(
         f"{FLEET} simulated arms in one process, a 50 Hz rollout each, published at {PUBLISH_HZ} Hz: real-time factor",
         f"{factor:.3f} (slowest arm), {rate:.0f} actions/s each, {100 * used / FLEET:.2f} % of a core "

@@ -143,3 +143,16 @@ def test_a_broken_file_is_refused_and_the_world_stays_as_it_was(empty: Simulatio
     assert answer["status"] == "error"
     assert "cannot be loaded" in answer["reason"]
     assert empty.list_robots() == ["so100"]
+
+
+def test_a_robots_file_does_not_change_the_worlds_time(empty: Simulation, tmp_path: Path) -> None:
+    path = tmp_path / "slow.xml"
+    path.write_text(
+        """<mujoco><option timestep="0.01" gravity="0 0 0" integrator="RK4" impratio="10"/><worldbody>
+        <body name="ball"><freejoint/><geom size="0.05"/></body></worldbody></mujoco>"""
+    )
+    empty.add_robot("so100")
+    assert empty.add_robot("ball", path, position=(0, 0, 2))["status"] == "success"
+    assert empty.step(100)["sim_time"] == pytest.approx(0.2)
+    assert empty.get_features()["timestep"] == 0.002
+    assert empty.tip_position("ball")[2] < 1.9

@@ -130,7 +130,7 @@ def test_the_world_does_not_change_while_a_rollout_runs(
 
 def test_one_robot_runs_one_policy(world: Simulation) -> None:
     world.start_policy("left", "wave")
-    assert "already runs a policy: 'wave'" in world.start_policy("left", "nod")["reason"]
+    assert "left is driven by the policy mock ('wave')" in world.start_policy("left", "nod")["reason"]
 
 
 def test_a_halt_stops_every_rollout_and_nothing_is_written_afterwards(
@@ -246,3 +246,39 @@ def test_cleanup_ends_rollouts_and_leaves_no_thread(world: Simulation) -> None:
     assert world.cleanup()["status"] == "success"
     assert not [t.name for t in threading.enumerate() if t.name.startswith(("rollout", "simulation"))]
     assert "cleaned up" in world.start_policy("left", "wave")["reason"]
+
+
+class Script:
+    """A scripted leader: it swings one joint as time goes by."""
+
+    def __init__(self) -> None:
+        self.began = time.monotonic()
+
+    def get_action(self) -> dict[str, float]:
+        return {"shoulder_pan": 0.5 * min(1.0, time.monotonic() - self.began)}
+
+
+def test_a_leader_drives_one_robot_and_a_halt_ends_it(world: Simulation) -> None:
+    assert world.attach_teleop(Script(), "script", robot_name="right")["status"] == "success"
+    assert world.teleoperate("script")["status"] == "success"
+    eventually(lambda: world.get_observation("right")["shoulder_pan"] > 0.1, what="the robot follows")
+    assert "right is driven by script" in world.start_policy("right", "nod")["reason"]
+    assert world.start_policy("left", "wave")["status"] == "success"
+    assert "script leading right" in world.remove_robot("right")["reason"]
+    verdict = world.halt("test")
+    assert verdict.stopped is True
+    assert sorted(verdict.halted) == ["left", "teleoperation script"]
+    held = world.body("right").targets
+    time.sleep(0.1)
+    assert world.body("right").targets == held
+
+
+def test_a_leader_does_not_take_a_robot_from_a_policy(world: Simulation) -> None:
+    world.attach_teleop(Script(), "script", robot_name="left")
+    world.start_policy("left", "wave")
+    assert "left is driven by the policy" in world.teleoperate("script")["reason"]
+    world.stop_policy("left")
+    assert world.teleoperate("script")["status"] == "success"
+    assert world.stop_teleoperate("script")["stopped"] is True
+    world.cleanup()
+    assert not [t.name for t in threading.enumerate() if t.name.startswith(("rollout", "simulation"))]

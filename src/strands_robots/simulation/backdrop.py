@@ -10,8 +10,8 @@ MAX_WIDTH, MAX_HEIGHT = 1920, 1440
 """Largest picture, in pixels: the size of the off-screen buffer."""
 
 
-def dress(spec: Any, *, floor: bool) -> None:
-    """Add the room to ``spec``; ``floor`` is false where a robot's model brings its own."""
+def dress(spec: Any, *, floor: bool, lights: bool) -> None:
+    """Add the room to ``spec``; ``floor`` and ``lights`` are false where a robot's model brings its own."""
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = MAX_WIDTH, MAX_HEIGHT
     visual.headlight.active = 1
@@ -35,6 +35,15 @@ def dress(spec: Any, *, floor: bool) -> None:
     )
     if floor:
         _floor(spec)
+    if lights:
+        _lights(spec)
+    world = spec.worldbody
+    world.add_camera(name="front", pos=[0.95, 0, 0.28], xyaxes=[0, 1, 0, -0.16, 0, 0.987], fovy=45)
+    world.add_camera(name="side", pos=[0.15, -0.85, 0.25], xyaxes=[1, 0, 0, 0, 0.12, 0.993], fovy=45)
+    world.add_camera(name="top", pos=[0.12, 0, 1.1], xyaxes=[0, -1, 0, 1, 0, 0], fovy=45)
+
+
+def _lights(spec: Any) -> None:
     world = spec.worldbody
     directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     world.add_light(
@@ -48,9 +57,6 @@ def dress(spec: Any, *, floor: bool) -> None:
         diffuse=[0.20, 0.22, 0.25],
         castshadow=False,
     )
-    world.add_camera(name="front", pos=[0.95, 0, 0.28], xyaxes=[0, 1, 0, -0.16, 0, 0.987], fovy=45)
-    world.add_camera(name="side", pos=[0.15, -0.85, 0.25], xyaxes=[1, 0, 0, 0, 0.12, 0.993], fovy=45)
-    world.add_camera(name="top", pos=[0.12, 0, 1.1], xyaxes=[0, -1, 0, 1, 0, 0], fovy=45)
 
 
 def _floor(spec: Any) -> None:

@@ -23,7 +23,7 @@ class Construction(WorldCore):
     def create_world(self, timestep: float = 0.002, gravity: float = -9.81) -> Envelope:
         """Start over with an empty room. ``timestep`` 0.0001 to 0.02 s, ``gravity`` -100 to 100 m/s² along z."""
         plan = checked_plan(timestep, gravity)
-        with self._building:
+        with self.starting:
             self._changeable("create_world")
             self._rebuild(plan)
             self._physics.reset()
@@ -49,7 +49,7 @@ class Construction(WorldCore):
         label = identifier("name", name)
         heading = number("yaw", yaw, low=-6.2831853072, high=6.2831853072)
         source = find(name if model is None else model)
-        with self._building:
+        with self.starting:
             self._changeable("add_robot")
             plan = self._physics.stage.plan
             self._free(label, plan)
@@ -68,7 +68,7 @@ class Construction(WorldCore):
     @answered
     def remove_robot(self, name: str) -> Envelope:
         """Take a robot out of the world; the others keep their state."""
-        with self._building:
+        with self.starting:
             self._changeable("remove_robot")
             label = self.body(identifier("name", name)).name
             self._rebuild(self._physics.stage.plan.without_robot(label))
@@ -98,7 +98,7 @@ class Construction(WorldCore):
             fixed: true for a thing that never moves.
         """
         item = object_plan(name=name, shape=shape, size=size, position=position, color=color, mass=mass, fixed=fixed)
-        with self._building:
+        with self.starting:
             self._changeable("add_object")
             plan = self._physics.stage.plan
             self._free(item.name, plan)
@@ -108,7 +108,7 @@ class Construction(WorldCore):
     @answered
     def remove_object(self, name: str) -> Envelope:
         """Take an object out of the world."""
-        with self._building:
+        with self.starting:
             self._changeable("remove_object")
             plan = self._physics.stage.plan
             names = [o.name for o in plan.objects]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from contextlib import AbstractContextManager
+from typing import Any
 
 from strands_robots.safety.gate import MotionGate
 from strands_robots.simulation.body import RobotBody
@@ -18,7 +20,8 @@ class WorldCore:
 
     def __init__(self, plan: Plan, *, realtime: bool) -> None:
         self.gate = MotionGate()
-        self._building = threading.RLock()
+        # Whoever builds the world or starts a motion holds this; whoever stops one never does.
+        self.starting: AbstractContextManager[Any] = threading.RLock()
         self._physics = Physics(compile_stage(plan))
         self._clock = Clock(self._physics, on_command=realtime)
         self._bodies: dict[str, RobotBody] = {}

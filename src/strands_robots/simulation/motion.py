@@ -16,6 +16,7 @@ from strands_robots.simulation.arguments import answered
 from strands_robots.simulation.body import RobotBody
 from strands_robots.simulation.pictures import Pictures
 from strands_robots.simulation.stage import Plan
+from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
 
 DURATION_MAX_S = 86_400.0
@@ -25,8 +26,8 @@ TEARDOWN_S = 5.0
 """How much longer than its duration :meth:`Rollouts.run_policy` waits for a rollout to end."""
 
 
-class Rollouts(Pictures):
-    """The verbs that start, watch and stop rollouts."""
+class Rollouts(Pictures, TeleopMixin):
+    """The verbs that start, watch and stop rollouts; those of teleoperation come with the mixin."""
 
     def __init__(self, plan: Plan, *, realtime: bool) -> None:
         super().__init__(plan, realtime=realtime)
@@ -55,7 +56,7 @@ class Rollouts(Pictures):
             duration: seconds, above 0 up to a day.
             policy: what that policy's constructor takes.
         """
-        rollout = self._begin(robot_name, instruction, policy_provider, duration, policy)
+        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
         return success(
             f"{rollout.robot} started: {rollout.instruction}",
             robot=rollout.robot,
@@ -74,7 +75,7 @@ class Rollouts(Pictures):
         **policy: Any,
     ) -> Envelope:
         """The same, but wait for the end; an error when the policy failed or did not end in its time."""
-        rollout = self._begin(robot_name, instruction, policy_provider, duration, policy)
+        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
         if not rollout.join((rollout.duration or 0.0) + TEARDOWN_S):
             rollout.request_stop()
             return error(f"{rollout.robot} was still running {TEARDOWN_S:g} s after its time.", **self._row(rollout))
@@ -101,9 +102,15 @@ class Rollouts(Pictures):
         return {} if rollout is None else self._row(rollout)
 
     def moving(self) -> list[str]:
-        return [f"policy on {name}" for name in self._running()]
+        leaders = [f"{leader} leading {session.robot}" for leader, session in self.teleoperating().items()]
+        return [f"policy on {name}" for name in self._running()] + leaders
 
-    def _begin(
+    def occupied(self, robot: str) -> str:
+        """What rollout drives the robot of that name now, for a refusal; empty when none does."""
+        rollout = self._running().get(robot)
+        return "" if rollout is None else f"the policy {rollout.policy_name} ({rollout.instruction!r})"
+
+    def _start_rollout(
         self, robot_name: str, instruction: str, provider: str, duration: float, options: dict[str, Any]
     ) -> Rollout:
         task = text("instruction", instruction)
@@ -114,7 +121,7 @@ class Rollouts(Pictures):
             policy = create_policy(provider, **options)
         except MissingExtraError as missing:
             raise ValidationError(str(missing)) from missing
-        with self._building:
+        with self.starting:
             self._open()
             body = self.body(robot_name)
             self._idle(body.name)
@@ -133,9 +140,9 @@ class Rollouts(Pictures):
             return rollout
 
     def _idle(self, name: str) -> None:
-        rollout = self._rollouts.get(name)
-        if rollout is not None and rollout.running:
-            raise ValidationError(f"{name} already runs a policy: {rollout.instruction!r}. Stop it first.")
+        driver = self.occupied(name) or self.teleoperated_by(name)
+        if driver:
+            raise ValidationError(f"{name} is driven by {driver}; stop that first.")
 
     def _running(self) -> dict[str, Rollout]:
         return {name: rollout for name, rollout in list(self._rollouts.items()) if rollout.running}
@@ -159,7 +166,8 @@ class Rollouts(Pictures):
         running = self._running()
         for rollout in running.values():
             rollout.request_stop()
-        return {name: partial(self._ended, name, rollout, deadline) for name, rollout in running.items()}
+        waits = {name: partial(self._ended, name, rollout, deadline) for name, rollout in running.items()}
+        return {**waits, **self.teleop_stops(deadline)}
 
     def _ended(self, name: str, rollout: Rollout, deadline: float) -> Envelope:
         if rollout.join(max(0.0, deadline - time.monotonic())):

@@ -41,7 +41,7 @@ class Pictures(Construction):
         """
         size = pixels("width", width, MAX_WIDTH), pixels("height", height, MAX_HEIGHT)
         nice = flag("quality", quality)
-        with self._building:
+        with self.starting:
             self._open()
             if self._renderer is None:
                 self._renderer = Renderer()
@@ -101,7 +101,7 @@ class Pictures(Construction):
         return float(x), float(y), float(z)
 
     def _close_pictures(self) -> None:
-        with self._building:
+        with self.starting:
             renderer, self._renderer = self._renderer, None
         if renderer is not None:
             renderer.close()

@@ -15,10 +15,12 @@ from strands_robots.simulation.solids import Face, faces_of
 from strands_robots.simulation.stage import Floats, Stage
 from strands_robots.simulation.views import View
 
+Pixels = NDArray[np.float32]
+
 _LIGHT = np.array([0.42, -0.42, 0.80]) / np.linalg.norm([0.42, -0.42, 0.80])
-_SKY_TOP, _SKY_LOW = np.array([150, 178, 208.0]), np.array([233, 238, 244.0])
+_SKY_TOP, _SKY_LOW = np.array([[150, 178, 208], [233, 238, 244]], dtype=np.float32)
 _TILE_M = 0.1
-_TILE_A, _TILE_B, _SEAM = np.array([206, 211, 218.0]), np.array([197, 203, 212.0]), np.array([178, 186, 196.0])
+_TILE_A, _TILE_B, _SEAM = np.array([[206, 211, 218], [197, 203, 212], [178, 186, 196]], dtype=np.float32)
 _SHADOW_CELL_M = 0.004
 _FINE = 2
 """Drawn this many times larger and averaged: anti-aliasing."""
@@ -36,7 +38,7 @@ def draw(stage: Stage, data: Any, view: View, width: int, height: int) -> NDArra
     return picture
 
 
-def _fill(image: Floats, depth: Floats, face: Face, view: View) -> None:
+def _fill(image: Pixels, depth: Pixels, face: Face, view: View) -> None:
     """Draw one convex face where it is nearer than what is there."""
     towards = view.position - face.points[0]
     if float(face.normal @ towards) <= 0:
@@ -76,39 +78,48 @@ def _shade(face: Face, towards: Floats) -> Floats:
     return face.colour * (0.30 + 0.16 * sky + 0.58 * lit) + 255.0 * 0.18 * face.shine * gloss * (lit > 0)
 
 
-def _background(view: View, wide: int, high: int, shadow_of: list[Face] | None) -> tuple[Floats, Floats]:
+def _background(view: View, wide: int, high: int, shadow_of: list[Face] | None) -> tuple[Pixels, Pixels]:
     """Sky, and the tiled floor with its shadows where there is one; the depth buffer holds one over depth."""
-    ramp = np.linspace(0, 1, high)[:, None, None]
-    image = np.broadcast_to(_SKY_TOP * (1 - ramp) + _SKY_LOW * ramp, (high, wide, 3)).copy()
-    depth = np.zeros((high, wide))
+    ramp = np.linspace(0, 1, high, dtype=np.float32)[:, None, None]
+    image = np.broadcast_to(_SKY_TOP * (1 - ramp) + _SKY_LOW * ramp, (high, wide, 3)).astype(np.float32)
+    depth = np.zeros((high, wide), dtype=np.float32)
     if shadow_of is None:
         return image, depth
     scale = high / 2 / np.tan(np.radians(view.fovy) / 2)
-    across = (np.arange(wide) + 0.5 - wide / 2) / scale
-    down = ((high / 2 - np.arange(high) - 0.5) / scale)[:, None]
-    right, up, back = view.rotation.T
+    across = ((np.arange(wide) + 0.5 - wide / 2) / scale).astype(np.float32)
+    down = ((high / 2 - np.arange(high) - 0.5) / scale).astype(np.float32)[:, None]
+    right, up, back = (axis.astype(np.float32) for axis in view.rotation.T)
     slope = right[2] * across + up[2] * down - back[2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.where(slope < 0, -view.position[2] / slope, np.inf)
-    hit = np.isfinite(distance) & (distance > 0)
-    reach = np.where(hit, distance, 0.0)
-    x = view.position[0] + reach * (right[0] * across + up[0] * down - back[0])
-    y = view.position[1] + reach * (right[1] * across + up[1] * down - back[1])
-    tiles = np.where(((np.floor(x / _TILE_M) + np.floor(y / _TILE_M)) % 2 < 1)[..., None], _TILE_A, _TILE_B)
-    # A seam narrower than a pixel would flicker in the distance: it fades with it.
-    seam = np.minimum(np.abs((x / _TILE_M) % 1 - 0.5), 1) > 0.49
-    seam |= np.minimum(np.abs((y / _TILE_M) % 1 - 0.5), 1) > 0.49
-    strength = np.clip(1.2 - reach / 1.2, 0, 1)[..., None] * seam[..., None]
-    tiles = tiles * (1 - strength) + _SEAM * strength
-    tiles = tiles * (1 - 0.42 * _shadow(shadow_of, x, y))[..., None]
+    rows = np.flatnonzero((slope < -1e-4).any(axis=1))
+    if not len(rows) or view.position[2] <= 0:
+        return image, depth
+    # Above the first row that meets the floor there is sky alone: nothing to compute.
+    below = slice(int(rows[0]), int(rows[-1]) + 1)
+    down, slope, sky = down[below], slope[below], image[below]
+    hit = slope < -1e-4
+    reach = np.where(hit, np.float32(-view.position[2]) / np.where(hit, slope, -1), 0)
+    x = np.float32(view.position[0]) + reach * (right[0] * across + up[0] * down - back[0])
+    y = np.float32(view.position[1]) + reach * (right[1] * across + up[1] * down - back[1])
+    shade = _tiles(x, y, reach) * (1 - 0.42 * _shadow(shadow_of, x, y))[..., None]
     haze = np.clip((reach - 1.0) / 4.0, 0, 1)[..., None]
-    floor = tiles * (1 - haze) + image * haze
-    image[hit] = floor[hit]
-    depth[hit] = 1.0 / distance[hit]
+    image[below] = np.where(hit[..., None], shade * (1 - haze) + sky * haze, sky)
+    depth[below] = np.where(hit, 1 / np.maximum(reach, 1e-6), 0)
     return image, depth
 
 
-def _shadow(faces: list[Face], x: Floats, y: Floats) -> Floats:
+def _tiles(x: Pixels, y: Pixels, reach: Pixels) -> Pixels:
+    """The floor's colours at points (m), seen from ``reach`` metres: a seam narrower than a pixel would flicker in
+    the distance, so it fades with it."""
+    u, v = x / np.float32(_TILE_M), y / np.float32(_TILE_M)
+    column, row = np.floor(u), np.floor(v)
+    seam = np.maximum(np.abs(u - column - 0.5), np.abs(v - row - 0.5)) > 0.485
+    strength = (np.clip(1.2 - reach / 1.2, 0, 1) * seam)[..., None]
+    odd = ((column + row) % 2 < 1)[..., None]
+    tiles: Pixels = np.where(odd, _TILE_A, _TILE_B) * (1 - strength) + _SEAM * strength
+    return tiles
+
+
+def _shadow(faces: list[Face], x: Pixels, y: Pixels) -> Pixels:
     """How much of the light is kept from each floor point: the faces laid down along the light, with a soft edge."""
     laid = [f.points[:, :2] - _LIGHT[:2] / _LIGHT[2] * np.maximum(f.points[:, 2:], 0) for f in faces]
     if not laid:
@@ -116,7 +127,7 @@ def _shadow(faces: list[Face], x: Floats, y: Floats) -> Floats:
     everything = np.concatenate(laid)
     low = everything.min(axis=0) - 0.05
     cells = np.minimum(np.ceil((everything.max(axis=0) + 0.05 - low) / _SHADOW_CELL_M).astype(int), 1500)
-    mask = np.zeros((cells[1], cells[0]))
+    mask = np.zeros((cells[1], cells[0]), dtype=np.float32)
     for points in laid:
         _cover(mask, (points - low) / _SHADOW_CELL_M)
     for axis in (0, 1):
@@ -129,7 +140,7 @@ def _shadow(faces: list[Face], x: Floats, y: Floats) -> Floats:
     return shade
 
 
-def _cover(mask: Floats, points: Floats) -> None:
+def _cover(mask: Pixels, points: Floats) -> None:
     """Fill one convex polygon, given in cells, whichever way round it is."""
     x0, y0 = np.maximum(np.floor(points.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(points.max(axis=0)).astype(int) + 1, mask.shape[::-1])

@@ -16,7 +16,7 @@ _VISIBLE_GROUPS = 3
 """Geometry groups 0 to 2 are shown, as MuJoCo does by default; 3 is collision shapes."""
 
 _ROUND = 20
-_MESH_FACES_MAX = 4000
+_MESH_FACES_MAX = 1000
 
 Patch = tuple[tuple[float, float, float], ...]
 
@@ -117,12 +117,25 @@ def _ellipsoid(x: float, y: float, z: float) -> tuple[Patch, ...]:
     return tuple(tuple((px * x, py * y, pz * z) for px, py, pz in patch) for patch in unit)
 
 
+def _hull(model: Any, mesh: int) -> Any:
+    """Triangles of a mesh's convex hull, of vertices of that mesh; the layout is that of ``mesh_graph`` in MuJoCo's
+    ``mjModel``: two counts, two numbers a vertex, one an edge, then three a face."""
+    start = int(model.mesh_graphadr[mesh])
+    if start < 0:
+        return ()
+    vertices, count = (int(v) for v in model.mesh_graph[start : start + 2])
+    begin = start + 2 + 3 * vertices + 3 * count
+    return model.mesh_graph[begin : begin + 3 * count].reshape(-1, 3)
+
+
 def _mesh(model: Any, mesh: int) -> tuple[Patch, ...]:
     if mesh < 0:
         return ()
     first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     vertices = model.mesh_vert[int(model.mesh_vertadr[mesh]) :]
-    # A mesh of very many faces is thinned: an outline with gaps is better than a picture that takes a minute.
-    stride = max(1, count // _MESH_FACES_MAX)
-    triangles = model.mesh_face[first : first + count : stride]
+    triangles = model.mesh_face[first : first + count]
+    if count > _MESH_FACES_MAX:
+        # A picture that takes a minute is of no use: the convex hull where MuJoCo has one, else every nth face.
+        hull = _hull(model, mesh)
+        triangles = hull if len(hull) else triangles[:: count // _MESH_FACES_MAX]
     return tuple(tuple(tuple(float(v) for v in vertices[i]) for i in corner) for corner in triangles)  # type: ignore[misc]

@@ -88,29 +88,40 @@ def compile_stage(plan: Plan) -> Stage:
     """Build and compile ``plan``. Raises :class:`ValidationError` naming the robot whose model does not fit."""
     spec = mujoco.MjSpec()
     spec.modelname = "world"
-    spec.option.timestep = plan.timestep
-    spec.option.gravity = [0, 0, plan.gravity]
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    _govern(spec, plan)
     homes: dict[str, Floats] = {}
     controls: dict[str, float] = {}
-    own_floor = True
+    if hasattr(mujoco, "mjtConflict"):
+        # Solver options that only a robot's file sets are taken over; timestep, gravity and integrator are the world's.
+        spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
+    own_floor = own_lights = True
     for robot in plan.robots:
         child = robot.source.load()
+        _govern(child, plan)
         own_floor = own_floor and not any(g.type == mujoco.mjtGeom.mjGEOM_PLANE for g in child.worldbody.geoms)
+        own_lights = own_lights and not child.lights
         home, control = _attach(spec, robot, child)
         homes.update(home)
         controls.update(control)
     for item in plan.objects:
         _place(spec, item)
-    backdrop.dress(spec, floor=own_floor)
+    backdrop.dress(spec, floor=own_floor, lights=own_lights)
     try:
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as exc:
         raise ValidationError(f"the world does not compile: {' '.join(str(exc).split())[:300]}") from exc
+    model.opt.timestep = plan.timestep
     robots = {robot.name: map_robot(model, robot.name, robot.source.label) for robot in plan.robots}
     qpos, ctrl = _start(model, homes, controls)
     actuators = tuple(sorted((a for parts in robots.values() for a in parts.actuators.values()), key=lambda a: a.index))
     return Stage(plan, model, robots, qpos, ctrl, actuators)
+
+
+def _govern(spec: Any, plan: Plan) -> None:
+    """The options that the world decides, for itself and for every model in it."""
+    spec.option.timestep = plan.timestep
+    spec.option.gravity = [0, 0, plan.gravity]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats], dict[str, float]]:

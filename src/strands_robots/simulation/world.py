@@ -91,7 +91,7 @@ class Simulation(Rollouts):
         """Halt, then put the world back to its initial state. Refused while the robot is locked."""
         self._open()
         self.gate.permit("reset")
-        with self._building:
+        with self.starting:
             # Nothing starts a rollout while this lock is held.
             verdict = self.halt("reset")
             if not verdict.stopped:
