@@ -1,0 +1,21 @@
+"""The native mesh: robots that find, drive and stop one another over Zenoh, without Device Connect.
+
+Every name is loaded when it is first used, so the package imports with no extra installed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh, mesh_disabled_by_env
+
+__all__ = ["Mesh", "get_local_robots", "init_mesh", "mesh_disabled_by_env"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from strands_robots.mesh import core  # noqa: PLC0415 - the point of this function
+
+    return getattr(core, name)

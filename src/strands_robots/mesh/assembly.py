@@ -1,0 +1,222 @@
+"""How the parts of one mesh peer are put together, and in which order they start and stop."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from strands_robots import settings
+from strands_robots.contract import WorldRobot
+from strands_robots.mesh import camera, session, topics
+from strands_robots.mesh.context import Context
+from strands_robots.mesh.dispatch import Dispatcher
+from strands_robots.mesh.door import PlaneDoor, SafetyDoor
+from strands_robots.mesh.executor import Lanes
+from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.presence import Herald
+from strands_robots.mesh.recorder import AuditSink, Recorder
+from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.rpc import Caller
+from strands_robots.mesh.safety import FleetSafety
+from strands_robots.mesh.scheduler import Scheduler
+from strands_robots.mesh.serving import MotionDoor, Server
+from strands_robots.mesh.state import StateReader, describe
+from strands_robots.mesh.stream import Limiter
+from strands_robots.mesh.subscriptions import Subscriptions
+from strands_robots.mesh.teleop import TeleopDesk
+from strands_robots.mesh.transport.base import Sample, Transport
+from strands_robots.mesh.wire_identity import Identity, from_settings
+from strands_robots.safety.halting import halt_of
+from strands_robots.safety.persistence import simulation_key
+from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.stopping import StopVerdict
+
+if TYPE_CHECKING:
+    from strands_robots.mesh.core import Mesh
+
+logger = logging.getLogger(__name__)
+
+PRUNE_HZ = 1.0
+
+
+@dataclass(slots=True)
+class Parts:
+    """What a peer takes from its process, and a test gives it instead.
+
+    Attributes:
+        acquire: gives the transport, connected, or None; ``release`` gives it back.
+        identity: gives the signer and verifier of a transport.
+        audit: where safety events go; the audit log by default.
+        keep: the lockout outlives the process under the peer's id.
+    """
+
+    acquire: Callable[[], Transport | None] = session.acquire
+    release: Callable[[], None] = session.release_session
+    registry: PeerRegistry = field(default_factory=session.registry)
+    clock: Callable[[], float] = time.time
+    monotonic: Callable[[], float] = time.monotonic
+    identity: Callable[[Transport], Identity] | None = None
+    audit: AuditSink | None = None
+    plane: SafetyPlane | None = None
+    keep: bool = False
+
+
+@dataclass(slots=True)
+class Assembled:
+    """One peer's parts, good for one stay on the mesh."""
+
+    mesh: Mesh
+    context: Context
+    scheduler: Scheduler
+    lanes: Lanes
+    door: SafetyDoor
+    caller: Caller
+    server: Server
+    herald: Herald
+    safety: FleetSafety
+    state: StateReader
+    teleop: TeleopDesk
+    subscriptions: Subscriptions
+    stream_limit: Limiter
+    identity_of: Callable[[Transport], Identity]
+    inputs: dict[str, dict[str, Any]]
+    sensors: list[str] = field(default_factory=list)
+    held: list[Any] = field(default_factory=list)
+
+    def begin(self, transport: Transport) -> None:
+        """Hear before being seen: the safety topics first, then commands, presence, the publishers."""
+        context, peer = self.context, self.context.peer_id
+        context.transport = transport
+        context.identity = self.identity_of(transport)
+        self.lanes.start()
+        hear = transport.declare_subscriber
+        self.held = [
+            # The resumes first: one that the broker kept tells which kept e-stop is over.
+            hear(topics.resume(), self.safety.on_resume),
+            hear(topics.estop(), self.safety.on_estop),
+            hear(topics.command(peer), self.server.on_command),
+            hear(topics.broadcast(), self.server.on_command),
+            hear(topics.responses(peer), self.caller.on_response),
+        ]
+        self.herald.start()
+        every, rates = self.scheduler.every, topics.BY_NAME
+        self.sensors = self.mesh.add_robot_sensors() if self.mesh.robot is not None else []
+        every("describe", rates["presence"].rate_hz, self.herald.refresh)
+        every("presence", rates["presence"].rate_hz, self.herald.announce, quick=True)
+        every("state", rates["state"].rate_hz, self._publish_state)
+        every("prune", PRUNE_HZ, self._prune, quick=True)
+        frames = getattr(self.mesh.robot, "camera_frames", None)
+        if callable(frames):
+            every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), lambda: self._publish_frames(frames))
+        self.herald.refresh()
+        self.scheduler.start()
+        if not _can_resume():
+            logger.info("%s: no resume key is configured; an emergency stop is cleared at this machine only.", peer)
+
+    def end(self, timeout: float) -> None:
+        """Stop what publishes, then what hears, then the workers."""
+        deadline = time.monotonic() + timeout
+        self.teleop.close()
+        alive = self.scheduler.stop(max(0.0, deadline - time.monotonic()))
+        self.caller.close()
+        dropped = self.subscriptions.clear()
+        if dropped:
+            logger.info("%s left the mesh and dropped %d subscriptions.", self.context.peer_id, dropped)
+        self.herald.stop()
+        for each in self.held:
+            each.undeclare()
+        self.held = []
+        alive += self.lanes.stop(max(0.0, deadline - time.monotonic()))
+        self.context.transport = None
+        self.context.audit.close()
+        if alive:
+            logger.warning("%s left the mesh with loops still running: %s.", self.context.peer_id, ", ".join(alive))
+
+    def _publish_state(self) -> None:
+        body = self.state.read()
+        if body is not None:
+            self.context.put(topics.state(self.context.peer_id), body)
+
+    def _publish_frames(self, frames: camera.Frames) -> None:
+        camera.publish_frames(self.context, frames)
+
+    def _prune(self) -> None:
+        self.context.registry.prune()
+
+
+def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assembled:
+    """The parts of ``mesh``; those of a stay before give their door to the safety plane."""
+    peer, robot = mesh.peer_id, mesh.robot
+    recorder = Recorder(peer, parts.audit) if parts.audit is not None else Recorder(peer)
+    context = Context(peer, parts.registry, recorder, Identity(), parts.clock, parts.monotonic)
+    simulated = isinstance(robot, WorldRobot) or mesh.peer_type == "sim"
+    lanes = Lanes(peer)
+    key = simulation_key(peer) if parts.keep and robot is not None else None
+    door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
+    caller = Caller(context)
+    safety = FleetSafety(context, door, caller, lanes.safety)
+    teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, _body(robot), source, device))
+    inputs: dict[str, dict[str, Any]] = {}
+
+    def halt(reason: str) -> StopVerdict:
+        teleop.close()
+        return halt_of(robot, peer, reason) if robot is not None else StopVerdict()
+
+    dispatcher = Dispatcher(robot, halt, closing=lambda: not context.running())
+    desk = {
+        "teleop_status": teleop.status,
+        "teleop_receive": teleop.receive,
+        "teleop_stop": teleop.stop,
+        "ping": lambda command: {},
+        "resume": lambda command: safety.on_resume_command(command["assertion"]),
+    }
+
+    def dispatch(command: dict[str, Any], sample: Sample) -> Any:
+        return (desk.get(command["action"]) or dispatcher)(command)
+
+    approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
+    assembled: Assembled
+
+    def facts() -> dict[str, Any]:
+        told = describe(robot)
+        if inputs:
+            told["inputs"] = list(inputs.values())
+        if assembled.sensors:
+            told["topics"] = assembled.sensors
+        return told
+
+    assembled = Assembled(
+        mesh=mesh,
+        context=context,
+        scheduler=Scheduler(f"mesh-{peer}"),
+        lanes=lanes,
+        door=door,
+        caller=caller,
+        server=Server(context, lanes, approval_door, safety.locked, dispatch),
+        herald=Herald(context, mesh.peer_type, facts),
+        safety=safety,
+        state=StateReader(peer, robot, parts.clock),
+        teleop=teleop,
+        subscriptions=Subscriptions(lanes.delivery),
+        stream_limit=Limiter(settings.number("STRANDS_MESH_STREAM_HZ")),
+        identity_of=parts.identity or identity_of,
+        inputs=inputs,
+    )
+    return assembled
+
+
+def identity_of(transport: Transport) -> Identity:
+    """The identity that the environment asks for on this transport: signed where the session has certificates."""
+    posture = getattr(transport, "posture", None)
+    return from_settings(posture.credentials if posture is not None else None)
+
+
+def _body(robot: Any) -> Any:
+    return getattr(robot, "wrapped", robot)
+
+
+def _can_resume() -> bool:
+    return settings.is_set("STRANDS_MESH_RESUME_PUBLIC_KEY")

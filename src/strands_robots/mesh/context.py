@@ -1,0 +1,50 @@
+"""What the parts of one peer share: its name, its transport, and the things that tests replace."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from strands_robots.mesh.recorder import Recorder
+from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.transport.base import Transport, TransportError
+from strands_robots.mesh.wire_identity import Identity
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Context:
+    """Shared by the parts of one peer.
+
+    Attributes:
+        clock: wall-clock seconds, as stated on the wire.
+        monotonic: seconds, for ages.
+        audit: records refusals; ``audit.always`` records what may never be left out.
+        transport: None while the peer is not on the mesh.
+    """
+
+    peer_id: str
+    registry: PeerRegistry
+    audit: Recorder
+    identity: Identity
+    clock: Callable[[], float] = time.time
+    monotonic: Callable[[], float] = time.monotonic
+    providers: Callable[[], tuple[str, ...]] = tuple
+    transport: Transport | None = field(default=None)
+
+    def running(self) -> bool:
+        return self.transport is not None and self.transport.is_alive()
+
+    def put(self, key: str, payload: Mapping[str, Any]) -> None:
+        """Publish. Raises TransportError when off the mesh, WireError for a message above its topic's size."""
+        transport = self.transport
+        if transport is None:
+            raise TransportError("the mesh is not running.")
+        transport.put(key, payload)
+
+    def session_id(self) -> str | None:
+        return self.transport.session_id if self.transport is not None else None

@@ -1,0 +1,122 @@
+"""Bounded work: commands on a few workers, ``stop`` and ``ping`` each on one of their own."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+
+logger = logging.getLogger(__name__)
+
+Work = Callable[[], None]
+
+
+class Lane:
+    """At most ``workers`` threads and ``depth`` waiting jobs. Threads start with the first job and end with stop.
+
+    Args:
+        drop_oldest: a full lane forgets its oldest job instead of refusing the new one.
+    """
+
+    def __init__(self, name: str, workers: int, depth: int, *, drop_oldest: bool = False) -> None:
+        self._name = name
+        self._workers = workers
+        self._queue: queue.Queue[Work | None] = queue.Queue(depth)
+        self._drop_oldest = drop_oldest
+        self._threads: list[threading.Thread] = []
+        self._lock = threading.Lock()
+        self._open = True
+        self._busy = 0
+        self.dropped = 0
+
+    def start(self) -> None:
+        """Have one thread ready, where the first job must not wait for a thread to start."""
+        with self._lock:
+            if not self._threads:
+                self._add()
+
+    def submit(self, work: Work) -> bool:
+        """Queue a job; False when the lane is full or closed."""
+        if not self._open:
+            return False
+        while True:
+            try:
+                self._queue.put_nowait(work)
+                break
+            except queue.Full:
+                if not self._drop_oldest:
+                    return False
+                self._forget_oldest()
+        with self._lock:
+            if not self._threads or (len(self._threads) < self._workers and self._busy >= len(self._threads)):
+                self._add()
+        return True
+
+    def stop(self, timeout: float) -> list[str]:
+        """Take no more jobs, forget those waiting, and wait for those that run; names of threads still running."""
+        with self._lock:
+            self._open = False
+            threads, self._threads = self._threads, []
+        while not self._queue.empty():
+            self._forget_oldest()
+        for _ in threads:
+            self._queue.put(None)
+        deadline = time.monotonic() + timeout
+        for thread in threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
+        return [thread.name for thread in threads if thread.is_alive()]
+
+    def _add(self) -> None:
+        thread = threading.Thread(target=self._run, name=f"{self._name}-{len(self._threads)}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _forget_oldest(self) -> None:
+        try:
+            self._queue.get_nowait()
+        except queue.Empty:
+            return
+        self.dropped += 1
+
+    def _run(self) -> None:
+        while (work := self._queue.get()) is not None:
+            with self._lock:
+                self._busy += 1
+            try:
+                work()
+            except Exception:
+                logger.exception("%s: a job failed.", self._name)
+            finally:
+                with self._lock:
+                    self._busy -= 1
+
+
+class Lanes:
+    """The lanes of one peer: ``commands`` (4 workers, 32 waiting), ``stop``, ``ping``, ``safety`` and ``delivery``."""
+
+    def __init__(self, peer_id: str) -> None:
+        self.safety = Lane(f"{peer_id}-safety", 1, 256)
+        self.stop_lane = Lane(f"{peer_id}-stop", 1, 64)
+        self.ping = Lane(f"{peer_id}-ping", 1, 256)
+        self.commands = Lane(f"{peer_id}-command", 4, 32)
+        self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)
+
+    def of(self, action: object) -> Lane:
+        """The lane an action runs on."""
+        if action == "stop":
+            return self.stop_lane
+        return self.ping if action == "ping" else self.commands
+
+    def start(self) -> None:
+        self.safety.start()
+        self.stop_lane.start()
+
+    def stop(self, timeout: float) -> list[str]:
+        deadline = time.monotonic() + timeout
+        alive: list[str] = []
+        for lane in (self.commands, self.ping, self.delivery, self.stop_lane, self.safety):
+            alive += lane.stop(max(0.0, deadline - time.monotonic()))
+        return alive

@@ -1,0 +1,170 @@
+"""Teleoperation over the mesh: a leader publishes its actions, a follower applies them.
+
+A frame on ``strands/PEER/input/DEVICE`` is ``peer_id``, ``device``, ``method``, ``t``, ``seq``, ``action`` (numbers by
+joint) and ``events`` (or null).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.mesh import topics
+from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.security import validate_mesh_identifier
+from strands_robots.mesh.stream import numbers
+from strands_robots.mesh.transport.base import TransportError
+from strands_robots.mesh.wire import WireError
+from strands_robots.utils import number, teleoperator_contract_error, text
+
+if TYPE_CHECKING:
+    from strands_robots.mesh.core import Mesh
+
+__all__ = ["INPUT_HZ_DEFAULT", "InputPublisher", "InputReceiver"]
+
+logger = logging.getLogger(__name__)
+
+INPUT_HZ_DEFAULT = 50.0
+INPUT_JOIN_TIMEOUT_S = 2.0
+LOGGED_ERRORS = 5
+
+
+class InputPublisher:
+    """Polls a teleoperator and publishes its actions at a fixed rate, on a thread of its own.
+
+    Raises:
+        ValidationError: ``device_name`` is no identifier.
+        ValueError: ``hz`` is not positive and finite, or ``teleoperator`` has no ``get_action``.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        teleoperator: Any,
+        device_name: str = "leader",
+        method: str = "arm",
+        hz: float = INPUT_HZ_DEFAULT,
+    ) -> None:
+        problem = teleoperator_contract_error(teleoperator)
+        if problem is not None:
+            raise ValueError(problem)
+        self._mesh = mesh
+        self._teleoperator = teleoperator
+        self._device = validate_mesh_identifier(device_name, "device_name")
+        self._method = text("method", method, longest=64)
+        self._hz = number("hz", hz, above=0)
+        self._running = False
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._frames = self._errors = self._event_errors = 0
+        self._started = self._ended = 0.0
+
+    @property
+    def topic(self) -> str:
+        """The key this publisher writes to."""
+        return topics.input_stream(self._mesh.peer_id, self._device)
+
+    @property
+    def device_name(self) -> str:
+        return self._device
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """Counters; ``running`` is what was asked for, ``thread_alive`` what is."""
+        thread = self._thread
+        alive = thread is not None and thread.is_alive()
+        end = time.monotonic() if self._running else self._ended
+        elapsed = end - self._started
+        return {
+            "device": self._device,
+            "method": self._method,
+            "running": self._running,
+            "thread_alive": alive,
+            "frames": self._frames,
+            "errors": self._errors,
+            "event_read_errors": self._event_errors,
+            "hz_actual": round(self._frames / elapsed, 2) if elapsed > 0 else 0.0,
+            "hz_target": self._hz,
+        }
+
+    def start(self) -> None:
+        """Start publishing; already running is fine."""
+        if self._running:
+            return
+        self._running = True
+        self._stopping = threading.Event()
+        self._frames = self._errors = self._event_errors = 0
+        self._started = time.monotonic()
+        self._thread = threading.Thread(
+            target=self._publish_loop, args=(self._stopping,), name=f"mesh-input-{self._device}", daemon=True
+        )
+        self._thread.start()
+        self._mesh.announce_input(self._device, self._method, self._hz)
+
+    def stop(self) -> dict[str, Any]:
+        """Stop, wait at most 2 s for the loop, and return the counters; ``thread_alive`` tells a loop that stayed."""
+        if self._running:
+            self._running, self._ended = False, time.monotonic()
+            self._mesh.announce_input(self._device, None, 0)
+        self._stopping.set()
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(INPUT_JOIN_TIMEOUT_S)
+            if thread.is_alive():
+                logger.warning("%s: the publishing loop outlived its stop; it may send one more frame.", self.topic)
+        return self.stats
+
+    def _publish_loop(self, stopping: threading.Event) -> None:
+        period, due = 1.0 / self._hz, time.monotonic()
+        sequence = 0
+        while not stopping.is_set():
+            sequence += self._publish_one(sequence)
+            due += period
+            left = due - time.monotonic()
+            if left < 0:
+                due -= left  # a late frame shifts the beat: no burst follows
+            elif stopping.wait(left):
+                return
+
+    def _publish_one(self, sequence: int) -> int:
+        try:
+            action = self._teleoperator.get_action()
+            frame = {
+                "peer_id": self._mesh.peer_id,
+                "device": self._device,
+                "method": self._method,
+                "t": self._mesh.now(),
+                "seq": sequence,
+                "action": numbers(action),
+                "events": self._events(),
+            }
+            self._mesh.publish(self.topic, frame)
+        except (TransportError, WireError) as exc:
+            self._note(f"not published: {exc}")
+        except Exception as exc:  # noqa: BLE001 - a device raises what it likes; the loop counts it and goes on
+            self._note(f"{type(exc).__name__}: {exc}")
+        else:
+            self._frames += 1
+            return 1
+        return 0
+
+    def _events(self) -> dict[str, Any] | None:
+        read: Callable[[], Any] | None = getattr(self._teleoperator, "get_teleop_events", None)
+        if not callable(read):
+            return None
+        try:
+            events = read()
+            return {str(key): bool(value) for key, value in events.items()} if events is not None else None
+        except Exception as exc:  # noqa: BLE001 - counted and told; the action is still good
+            self._event_errors += 1
+            if self._event_errors <= LOGGED_ERRORS:
+                logger.warning("%s: events could not be read: %s: %s", self.topic, type(exc).__name__, exc)
+            return None
+
+    def _note(self, problem: str) -> None:
+        self._errors += 1
+        if self._errors <= LOGGED_ERRORS:
+            logger.warning("%s: %s", self.topic, problem)

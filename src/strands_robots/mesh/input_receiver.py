@@ -1,0 +1,260 @@
+"""The follower's half of an input stream: every guard a frame passes before it moves the robot."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from strands_robots import settings
+from strands_robots.envelope import is_error
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, validate_mesh_identifier
+from strands_robots.mesh.transport.base import Sample
+from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.utils import ValidationError
+
+if TYPE_CHECKING:
+    from strands_robots.mesh.core import Mesh
+
+logger = logging.getLogger(__name__)
+
+ApplyFn = Callable[[Any, dict[str, float]], Any]
+
+AUDIT_EVERY = 100
+DEPTH = 8
+LOGGED_ERRORS = 5
+REJECTIONS = ("source", "lockout", "expired", "freshness", "invalid")
+UNITS_FULL_SCALE = {"normalized": 1.0, "radians": 6.283185307179586, "degrees": 360.0, "percent": 100.0}
+
+
+class InputReceiver:
+    """Applies a remote peer's actions to ``robot``.
+
+    Frames are applied one after another on a thread of the stream's own, so that a slow bus holds up neither the
+    transport nor a stop; a bus slower than the leader loses the oldest frames, counted as rate-dropped.
+
+    Raises:
+        ValidationError: ``source_peer_id`` or ``device_name`` is no identifier.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        robot: Any,
+        source_peer_id: str,
+        device_name: str = "leader",
+        apply_fn: ApplyFn | None = None,
+    ) -> None:
+        self._mesh = mesh
+        self._robot = robot
+        self._source = validate_mesh_identifier(source_peer_id, "source_peer_id")
+        self._device = validate_mesh_identifier(device_name, "device_name")
+        self._apply: ApplyFn = apply_fn or (lambda body, action: body.send_action(action))
+        self._limits = joint_limits(robot)
+        self._lane: Lane | None = None
+        self._running = False
+        self._permit: Permit | None = None
+        self._session: str | None = None
+        self._opened = self._ended = 0.0
+        self._sequence = -1
+        self._last: dict[str, tuple[float, float]] = {}
+        self._due = 0.0
+        self._counts: Counter[str] = Counter()
+        self.start_refusal: str | None = None
+
+    @property
+    def topic(self) -> str:
+        """The key this receiver hears."""
+        return topics.input_stream(self._source, self._device)
+
+    @property
+    def running(self) -> bool:
+        return self._running
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """Counters; ``rejected`` is the sum of the ``rejected_*``, each a guard that refused a frame."""
+        counts, elapsed = self._counts, (time.monotonic() if self._running else self._ended) - self._opened
+        rejections = {f"rejected_{why}": counts[why] for why in REJECTIONS}
+        return {
+            "source": self._source,
+            "device": self._device,
+            "running": self._running,
+            "frames_received": counts["received"],
+            "errors": counts["errors"],
+            "out_of_order": counts["out_of_order"],
+            "rate_dropped": counts["rate_dropped"] + (self._lane.dropped if self._lane else 0),
+            "slew_rejected": counts["slew"],
+            "rejected": sum(rejections.values()),
+            **rejections,
+            "hz_actual": round(counts["received"] / elapsed, 2) if elapsed > 0 else 0.0,
+        }
+
+    def start(self) -> None:
+        """Open the stream, bound to the leader's announced session; :attr:`start_refusal` says why it did not."""
+        if self._running:
+            return
+        self.start_refusal = self._open()
+        fields = {"device": self._device, "session": self._session}
+        if self.start_refusal is not None:
+            logger.warning("%s was not opened: %s", self.topic, self.start_refusal)
+            self._mesh.record("input_stream_refused", self._source, **fields, reason=self.start_refusal)
+            return
+        ttl = settings.number("STRANDS_MESH_INPUT_STREAM_TTL_S")
+        self._mesh.record("input_stream_opened", self._source, **fields, lifetime_s=ttl)
+
+    def stop(self) -> dict[str, Any]:
+        """Close the stream, wait at most 2 s for a frame that is being applied, and return the counters."""
+        self._close()
+        lane = self._lane
+        if lane is not None and lane.stop(2.0):
+            logger.warning("%s: an action is still being applied.", self.topic)
+        return self.stats
+
+    def on_frame(self, sample: Sample) -> None:
+        """A frame on the transport's thread: queued for the stream's own."""
+        lane = self._lane
+        if self._running and lane is not None:
+            lane.submit(lambda: self._take(sample))
+
+    def _open(self) -> str | None:
+        session = self._mesh.peer_wire_zid(self._source)
+        if session is None:
+            return f"{self._source} has not announced itself from any session"
+        gate = getattr(self._robot, "gate", None) or getattr(self._mesh.robot, "gate", None)
+        try:
+            self._permit = gate.permit("teleop_receive") if isinstance(gate, MotionGate) else None
+        except MotionRefused as refused:
+            return str(refused)
+        if self._mesh.lockout_epoch is not None:
+            return f"locked by the emergency stop {self._mesh.lockout_epoch}"
+        self._session, self._sequence, self._last, self._due = session, -1, {}, 0.0
+        self._counts = Counter()
+        self._lane = Lane(f"mesh-follow-{self._device}", 1, DEPTH, drop_oldest=True)
+        self._opened, self._running = time.monotonic(), True
+        if not self._mesh.listen(self.topic, self.on_frame, self._name):
+            self._running, self._ended = False, time.monotonic()
+            return "the mesh is not running"
+        return None
+
+    @property
+    def _name(self) -> str:
+        return f"input:{self._source}/{self._device}"
+
+    def _close(self) -> None:
+        if self._running:
+            self._running, self._ended = False, time.monotonic()
+            self._mesh.unsubscribe(self._name)
+
+    def _take(self, sample: Sample) -> None:
+        if not self._running:
+            return
+        if sample.session != self._session:
+            self._counts["source"] += 1
+            return
+        permit = self._permit
+        if self._mesh.lockout_epoch is not None or (permit is not None and not permit.valid):
+            self._counts["lockout"] += 1
+            self._close()
+            return
+        if time.monotonic() - self._opened > settings.number("STRANDS_MESH_INPUT_STREAM_TTL_S"):
+            self._counts["expired"] += 1
+            self._close()
+            self._mesh.record("input_stream_expired", self._source, device=self._device)
+            return
+        try:
+            frame = wire.decode(sample.payload, topics.BY_NAME["input"].max_bytes)
+        except wire.WireError:
+            self._counts["invalid"] += 1
+            return
+        action = self._checked(frame)
+        if action is not None:
+            self._do(action)
+
+    def _checked(self, frame: Mapping[str, Any]) -> dict[str, float] | None:
+        """The action of a frame that passed every guard, in the wire's order; else None, counted."""
+        stamp = wire.finite(frame.get("t"))
+        if stamp is None or not wire.fresh(stamp, self._mesh.now()):
+            self._counts["freshness"] += 1
+            return None
+        if frame.get("action") is None:
+            return None
+        sequence = frame.get("seq")
+        if isinstance(sequence, bool) or not isinstance(sequence, int):
+            self._counts["invalid"] += 1
+            return None
+        if sequence <= self._sequence:
+            self._counts["out_of_order"] += 1
+            return None
+        self._sequence = sequence
+        now = time.monotonic()
+        cap = settings.number("STRANDS_MESH_INPUT_MAX_HZ")
+        if cap > 0:
+            if now < self._due:
+                self._counts["rate_dropped"] += 1
+                return None
+            # Half a period at least, so that a frame that came late does not cost the one after it.
+            self._due = max(self._due + 1.0 / cap, now + 0.5 / cap)
+        try:
+            action = self._validated(frame["action"])
+        except ValidationError as exc:
+            self._counts["invalid"] += 1
+            if self._counts["invalid"] <= LOGGED_ERRORS:
+                logger.warning("%s: %s", self.topic, exc)
+            return None
+        if self._too_fast(action, now, cap):
+            self._counts["slew"] += 1
+            return None
+        return action
+
+    def _validated(self, action: object) -> dict[str, float]:
+        checked = validate_input_frame(action)
+        for joint, value in checked.items():
+            limit = self._limits.get(joint)
+            if limit is not None and abs(value) > limit:
+                raise ValidationError(f"{joint} must be within {limit:g}, not {value:g}.", "TELEOP_VALUE_OUT_OF_RANGE")
+        return checked
+
+    def _too_fast(self, action: Mapping[str, float], now: float, cap: float) -> bool:
+        fastest = settings.number("STRANDS_MESH_INPUT_SLEW_ABS")
+        floor = 1.0 / cap if cap > 0 else 1.0 / 100.0
+        if fastest <= 0:
+            return False
+        for joint, value in action.items():
+            known = self._last.get(joint)
+            if known is not None and abs(value - known[0]) > fastest * max(now - known[1], floor):
+                return True
+        self._last.update({joint: (value, now) for joint, value in action.items()})
+        return False
+
+    def _do(self, action: dict[str, float]) -> None:
+        permit = self._permit
+        if permit is not None and not permit.valid:
+            self._counts["lockout"] += 1
+            return
+        try:
+            answer = self._apply(self._robot, action)
+        except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the frame counts as not applied
+            answer = {"status": "error", "reason": f"{type(exc).__name__}: {exc}"}
+        self._counts["received"] += 1
+        if is_error(answer):
+            self._counts["errors"] += 1
+            if self._counts["errors"] <= LOGGED_ERRORS:
+                logger.warning("%s: not applied: %s", self.topic, answer.get("reason"))
+        if self._counts["received"] % AUDIT_EVERY == 0:
+            self._mesh.record(
+                "input_stream_applied", self._source, device=self._device, frames=self._counts["received"]
+            )
+
+
+def joint_limits(robot: Any) -> dict[str, float]:
+    """Largest magnitude by joint: twice its full scale, where the follower states its units."""
+    units = getattr(robot, "joint_units", None)
+    if not isinstance(units, Mapping):
+        return {}
+    known = {str(joint): UNITS_FULL_SCALE.get(str(unit)) for joint, unit in units.items()}
+    return {joint: min(2 * scale, INPUT_VALUE_ABS) for joint, scale in known.items() if scale is not None}

@@ -1,0 +1,128 @@
+"""Being seen and seeing others: heartbeats, liveliness tokens, and which session speaks for which peer."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.context import Context
+from strands_robots.mesh.transport.base import LiveTransport, Sample, Subscription, TransportError
+from strands_robots.mesh.wire_identity import IdentityError
+
+logger = logging.getLogger(__name__)
+
+
+class Herald:
+    """Announces one peer and hears the others.
+
+    Args:
+        describe: what this peer says of itself besides id, type, host and time; may read the robot slowly, so it
+            is called by :meth:`refresh` and its last answer is what :meth:`announce` sends.
+    """
+
+    def __init__(self, context: Context, peer_type: str, describe: Callable[[], Mapping[str, Any]]) -> None:
+        self._context = context
+        self._type = peer_type
+        self._describe = describe
+        self._facts: dict[str, Any] = {}
+        self._trouble = ""
+        self._held: list[Subscription] = []
+        self._host = socket.gethostname()
+
+    def start(self) -> None:
+        """Hear presence, and show and watch liveliness where the transport has it."""
+        transport = self._context.transport
+        if transport is None:
+            raise TransportError("the mesh is not running.")
+        self._held.append(transport.declare_subscriber(topics.presence("*"), self.on_presence))
+        session = transport.session_id
+        if isinstance(transport, LiveTransport) and session is not None:
+            self._held.append(transport.declare_token(topics.token(self._context.peer_id, session)))
+            self._held.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
+
+    def stop(self) -> None:
+        held, self._held = self._held, []
+        for each in held:
+            with contextlib.suppress(TransportError):  # the session may be gone already, and the subscriber with it
+                each.undeclare()
+
+    def refresh(self) -> None:
+        """Read anew what this peer says of itself; a robot that cannot be read is announced by its name alone."""
+        try:
+            self._facts, trouble = dict(self._describe()), ""
+        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises, the peer is there
+            self._facts, trouble = {}, f"{type(exc).__name__}: {exc}"
+        if trouble and trouble != self._trouble:
+            logger.warning("%s cannot be described: %s", self._context.peer_id, trouble)
+        self._trouble = trouble
+
+    def announce(self) -> None:
+        """Publish one heartbeat."""
+        context = self._context
+        body = {
+            **self._facts,
+            "robot_id": context.peer_id,
+            "robot_type": self._type,
+            "hostname": self._host,
+            "timestamp": context.clock(),
+        }
+        try:
+            context.put(topics.presence(context.peer_id), context.identity.sign(body))
+        except (TransportError, wire.WireError) as exc:
+            logger.warning("%s: presence was not published: %s", context.peer_id, exc)
+
+    def on_presence(self, sample: Sample) -> None:
+        """A heartbeat of somebody: into the registry, or dropped and audited."""
+        context = self._context
+        try:
+            presence = wire.Presence.of(wire.decode(sample.payload, topics.BY_NAME["presence"].max_bytes))
+        except wire.WireError as exc:
+            context.audit("presence_rejected", reason=str(exc))
+            return
+        peer = presence.robot_id
+        if peer == context.peer_id:
+            self._impostor(sample)
+            return
+        if not wire.fresh(presence.timestamp, context.clock()):
+            context.audit("presence_rejected", peer, reason="the timestamp is not fresh")
+            return
+        session, certificate = sample.session, None
+        if context.identity.checks or context.identity.required:
+            try:
+                verified = context.identity.verify(presence.body, peer)
+                certificate = (verified.cert_sha256, verified.common_name)
+            except IdentityError as exc:
+                if context.identity.required:
+                    context.audit("presence_unverified", peer, reason=str(exc))
+                    session = None
+        held = context.registry.conflicts(peer, session)
+        if held is not None:
+            context.audit("presence_identity_conflict", peer, held=held, offered=session)
+            return
+        facts = presence.facts()
+        if context.registry.update(
+            peer, presence.robot_type, presence.hostname, facts, session=session, certificate=certificate
+        ):
+            logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
+
+    def on_token(self, key: str, there: bool) -> None:
+        """A liveliness token came or went. Its going means that the session ended, if our own link holds."""
+        parts = key.split("/")
+        if there or len(parts) != 4:
+            return
+        peer, session = parts[1], parts[3]
+        linked = getattr(self._context.transport, "linked", None)
+        if peer == self._context.peer_id or (callable(linked) and not linked()):
+            # Without a hub every token goes at once, and none of the sessions need have ended.
+            return
+        if self._context.registry.lost(peer, session):
+            logger.info("%s left.", peer)
+
+    def _impostor(self, sample: Sample) -> None:
+        ours = self._context.session_id()
+        if sample.session is not None and ours is not None and sample.session != ours:
+            self._context.audit("presence_identity_conflict", self._context.peer_id, held=ours, offered=sample.session)

@@ -1,0 +1,85 @@
+"""The audit trail as the mesh writes it: a flood of refusals is told as a count.
+
+A hostile peer can make the mesh refuse a thousand messages a second. Each kind of refusal from each peer is
+written a few times a second, and then once with the number of those left out. The sink returns at once; the
+record is written elsewhere.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.audit import log_safety_event
+
+AuditSink = Callable[[str, str, dict[str, Any]], None]
+"""Event type, peer id, payload; returns at once and never raises."""
+
+BURST = 5
+WINDOW_S = 1.0
+KINDS_MAX = 1024
+
+
+@dataclass(slots=True)
+class _Window:
+    since: float
+    written: int = 0
+    left_out: int = 0
+
+
+class Recorder:
+    """Writes the events of one peer to ``sink``; thread-safe."""
+
+    def __init__(
+        self, peer_id: str, sink: AuditSink = log_safety_event, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._peer = peer_id
+        self._sink = sink
+        self._clock = clock
+        self._windows: dict[tuple[str, str], _Window] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, event: str, about: str = "", **payload: Any) -> None:
+        """Record ``event``, which concerns the peer ``about``; in a flood, some of them."""
+        who = about[:128]
+        left_out = self._admit((event, who))
+        if left_out is None:
+            return
+        if left_out:
+            payload["left_out_before"] = left_out
+        if who:
+            payload.setdefault("about", who)
+        self._sink(event, self._peer, payload)
+
+    def always(self, event: str, **payload: Any) -> None:
+        """Record an event that is never left out, such as a stop."""
+        self._sink(event, self._peer, payload)
+
+    def close(self) -> None:
+        """Tell the counts of what was left out and not yet told."""
+        with self._lock:
+            counts = {kind: window.left_out for kind, window in self._windows.items() if window.left_out}
+            self._windows.clear()
+        for (event, about), left_out in counts.items():
+            self._sink(event, self._peer, {"about": about, "left_out": left_out})
+
+    def _admit(self, kind: tuple[str, str]) -> int | None:
+        now = self._clock()
+        with self._lock:
+            window = self._windows.get(kind)
+            if window is None:
+                if len(self._windows) >= KINDS_MAX:
+                    # A peer that invents names shares one window with all the others that do.
+                    kind = (kind[0], "")
+                window = self._windows.setdefault(kind, _Window(now))
+            left_out = 0
+            if now - window.since >= WINDOW_S:
+                left_out, window.left_out, window.written, window.since = window.left_out, 0, 0, now
+            if window.written >= BURST:
+                window.left_out += 1
+                return None
+            window.written += 1
+            return left_out

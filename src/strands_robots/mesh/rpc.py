@@ -1,0 +1,224 @@
+"""Asking other peers: turns, who may answer them, and what their answers are worth."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.attribution import attribute
+from strands_robots.mesh.context import Context
+from strands_robots.mesh.security import validate_command
+from strands_robots.mesh.transport.base import ConfirmingTransport, Sample, TransportError
+from strands_robots.utils import ValidationError, number, shown
+
+logger = logging.getLogger(__name__)
+
+OFFLINE = "offline"
+BROADCAST_RESPONDER = "\x00broadcast"
+"""Expected responder of a broadcast; the NUL keeps it apart from every peer id."""
+
+REPLIES_MAX = 4096
+
+Refusal = dict[str, Any]
+
+
+@dataclass(slots=True)
+class Turn:
+    """One question under way and the replies that counted."""
+
+    expected: str
+    done: threading.Event = field(default_factory=threading.Event)
+    over: threading.Event = field(default_factory=threading.Event)
+    replies: list[dict[str, Any]] = field(default_factory=list)
+    answered: set[tuple[str | None, str]] = field(default_factory=set)
+    via: str = "publish"
+
+
+class Caller:
+    """Sends commands and collects replies for one peer."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._turns: dict[str, Turn] = {}
+        self._lock = threading.Lock()
+
+    def send(self, target: object, command: object, timeout: object) -> dict[str, Any]:
+        """The raw reply of ``target``; or status ``timeout``; or status ``error`` with the refused precondition."""
+        prepared = self._prepare(target, command, timeout)
+        if isinstance(prepared, str):
+            return refused(prepared)
+        peer, clean, seconds = prepared
+        turn_id, turn = self._open(peer)
+        try:
+            problem = self._publish(topics.command(peer), clean, turn_id, turn, seconds)
+            if problem is not None:
+                return refused(problem) | ({"via": turn.via} if problem == OFFLINE else {})
+            if not turn.done.wait(seconds):
+                return {"status": "timeout", "target": peer, "turn_id": turn_id}
+            if not turn.replies:
+                return refused("the mesh was stopped while the reply was awaited.")
+            return turn.replies[0]
+        finally:
+            self._close(turn_id)
+
+    def ping(self, target: object, timeout: object) -> dict[str, Any]:
+        """One ping: status ok, timeout or error; the round trip in milliseconds; how it was delivered."""
+        started = time.perf_counter()
+        reply = self.send(target, {"action": "ping"}, timeout)
+        latency = round((time.perf_counter() - started) * 1000, 3)
+        via = "direct" if self._confirms(target) else "publish"
+        if reply.get("error") == OFFLINE and "type" not in reply:
+            return {"status": OFFLINE, "latency_ms": latency, "via": via, "reason": OFFLINE}
+        if reply.get("status") == "error" and "type" not in reply:
+            return reply
+        if reply.get("status") == "timeout":
+            return {"status": "timeout", "latency_ms": latency, "via": via}
+        if reply.get("type") == "error":
+            return {"status": "error", "error": reply.get("error", ""), "latency_ms": latency, "via": via}
+        return {"status": "ok", "latency_ms": latency, "via": via, "confirmed": via == "direct"}
+
+    def broadcast(
+        self, command: object, timeout: object, expect: Callable[[list[dict[str, Any]]], bool] | None = None
+    ) -> list[dict[str, Any]]:
+        """Every reply that came within ``timeout``; ``[]`` for a refused precondition.
+
+        Args:
+            expect: ends the collection early when it finds the replies complete.
+        """
+        prepared = self._prepare("all", command, timeout)
+        if isinstance(prepared, str):
+            logger.warning("broadcast: %s", prepared)
+            return []
+        _, clean, seconds = prepared
+        turn_id, turn = self._open(BROADCAST_RESPONDER)
+        try:
+            problem = self._publish(topics.broadcast(), clean, turn_id, turn)
+            if problem is not None:
+                logger.warning("broadcast: %s", problem)
+                return []
+            deadline = time.monotonic() + seconds
+            while (left := deadline - time.monotonic()) > 0:
+                if expect is None:
+                    turn.over.wait(left)
+                    break
+                turn.done.wait(left)
+                with self._lock:
+                    turn.done.clear()
+                    replies = list(turn.replies)
+                if turn.over.is_set() or expect(replies):
+                    break
+            with self._lock:
+                return list(turn.replies)
+        finally:
+            self._close(turn_id)
+
+    def on_response(self, sample: Sample) -> None:
+        """A sample on our response topic: counted, or refused and audited."""
+        context = self._context
+        try:
+            body = wire.decode(sample.payload, topics.BY_NAME["response"].max_bytes)
+            reply = wire.Reply.of(body)
+        except wire.WireError as exc:
+            context.audit("response_malformed", reason=str(exc))
+            return
+        with self._lock:
+            turn = self._turns.get(reply.turn_id)
+        if turn is None:
+            return
+        why = self._hijacked(sample, reply, turn)
+        if why is not None:
+            logger.warning("A reply in the name of %s was refused: %s.", shown(reply.responder_id), why)
+            context.audit("response_hijack_rejected", reply.responder_id, turn_id=reply.turn_id, reason=why)
+            return
+        self._count(sample, reply, turn, body)
+
+    def close(self) -> None:
+        """Wake everybody who waits for a reply."""
+        with self._lock:
+            turns = list(self._turns.values())
+        for turn in turns:
+            turn.over.set()
+            turn.done.set()
+
+    def _hijacked(self, sample: Sample, reply: wire.Reply, turn: Turn) -> str | None:
+        parts = sample.key.split("/")
+        if len(parts) != 5:
+            return "the legacy key names no responder"
+        if parts[3] != reply.responder_id or parts[4] != reply.turn_id:
+            return "the topic and the body disagree"
+        if turn.expected not in (BROADCAST_RESPONDER, reply.responder_id):
+            return "it is not the peer that was asked"
+        context = self._context
+        attribution = attribute(context.registry.session_of(reply.responder_id), sample)
+        if not attribution.accepted:
+            return attribution.value
+        if context.identity.required:
+            return context.identity.refusal(reply.body, reply.responder_id)
+        return None
+
+    def _count(self, sample: Sample, reply: wire.Reply, turn: Turn, body: Mapping[str, Any]) -> None:
+        who = (sample.session, reply.responder_id)
+        with self._lock:
+            duplicate = who in turn.answered
+            if not duplicate and len(turn.replies) < REPLIES_MAX:
+                turn.answered.add(who)
+                turn.replies.append({key: value for key, value in body.items() if key != "sig"})
+                turn.done.set()
+        if duplicate:
+            self._context.audit("response_duplicate_rejected", reply.responder_id, turn_id=reply.turn_id)
+
+    def _prepare(self, target: object, command: object, timeout: object) -> tuple[str, dict[str, Any], float] | str:
+        if not self._context.running():
+            return "the mesh is not running."
+        if not isinstance(target, str) or not target or "\x00" in target:
+            return f"target must be a non-empty string without NUL, not {shown(target)}."
+        try:
+            clean = validate_command(command, providers=self._context.providers())
+            seconds = number("timeout", timeout, above=0)
+        except ValidationError as exc:
+            return f"validation: {exc}"
+        if any(part in target for part in "/*$?#"):
+            return f"target must be a peer id, not {shown(target)}."
+        return target, clean, seconds
+
+    def _confirms(self, target: object) -> bool:
+        """Whether this target's commands go by a transport that tells if anybody takes them."""
+        transport: object = self._context.transport
+        return isinstance(transport, ConfirmingTransport) and isinstance(target, str)
+
+    def _publish(
+        self, key: str, command: dict[str, Any], turn_id: str, turn: Turn, seconds: float | None = None
+    ) -> str | None:
+        context = self._context
+        request = wire.Request(context.peer_id, turn_id, command, context.clock())
+        transport: object = context.transport
+        try:
+            body = context.identity.sign(request.to_wire())
+            if seconds is not None and isinstance(transport, ConfirmingTransport):
+                turn.via = "direct"
+                return None if transport.put_confirmed(key, body, seconds) is not False else OFFLINE
+            context.put(key, body)
+        except (wire.WireError, TransportError) as exc:
+            return str(exc)
+        return None
+
+    def _open(self, expected: str) -> tuple[str, Turn]:
+        turn_id, turn = uuid.uuid4().hex, Turn(expected)
+        with self._lock:
+            self._turns[turn_id] = turn
+        return turn_id, turn
+
+    def _close(self, turn_id: str) -> None:
+        with self._lock:
+            self._turns.pop(turn_id, None)
+
+
+def refused(why: str) -> Refusal:
+    """The answer for a command that never left."""
+    return {"status": "error", "error": why, "reason": why}

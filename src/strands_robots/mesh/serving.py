@@ -1,0 +1,190 @@
+"""Answering other peers: what a command passes before it reaches the robot, and the reply."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from strands_robots.envelope import is_error
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.attribution import attribute
+from strands_robots.mesh.context import Context
+from strands_robots.mesh.executor import Lanes
+from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, validate_command
+from strands_robots.mesh.transport.base import Sample, TransportError
+from strands_robots.safety.approval import Approval, Claim
+from strands_robots.utils import ValidationError
+
+logger = logging.getLogger(__name__)
+
+MISSING_COMMAND = "missing or malformed command"
+REPLAYED = "replay rejected"
+LOCKED = "command rejected"
+DISPATCH = "dispatch error"
+BUSY = "busy"
+
+REPLAY_S = wire.FRESH_S + wire.AHEAD_S
+REPLAYS_MAX = 4096
+
+Dispatch = Callable[[dict[str, Any], Sample], Any]
+
+
+class Refused(Exception):  # noqa: N818 - a refusal, not a fault
+    """A command that is answered with an error; ``event`` is its audit record."""
+
+    def __init__(self, text: str, event: str = "command_refused", reason: str = "") -> None:
+        super().__init__(text)
+        self.event = event
+        self.reason = reason or text
+
+
+class Replays:
+    """Which (sender, turn) were carried out lately; bounded by age and number."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._seen: dict[tuple[str, str], float] = {}
+        self._lock = threading.Lock()
+
+    def first(self, sender: str, turn: str) -> bool:
+        now = self._clock()
+        with self._lock:
+            while self._seen and now - next(iter(self._seen.values())) > REPLAY_S:
+                del self._seen[next(iter(self._seen))]
+            if (sender, turn) in self._seen:
+                return False
+            while len(self._seen) >= REPLAYS_MAX:
+                del self._seen[next(iter(self._seen))]
+            self._seen[sender, turn] = now
+            return True
+
+
+class MotionDoor:
+    """Who may move metal over the wire: the sender whose session is proven, with the operator's approval.
+
+    Args:
+        hardware: False for a simulation, which is exempt.
+    """
+
+    def __init__(self, context: Context, *, hardware: bool, approval: Approval | None = None) -> None:
+        self._context = context
+        self._approval = approval or Approval()
+        self.hardware = hardware
+
+    def claim(self, action: str, request: wire.Request, sample: Sample) -> Claim:
+        """Leave to do ``action``. Raises Refused; a one-shot grant is spent only by a sender that is proven."""
+        if not self.hardware or action not in MOTION:
+            return Claim()
+        why = self._unattributed(request, sample)
+        if why is None:
+            claim = self._approval.claim(action, self._context.peer_id)
+            if claim is not None:
+                return claim
+            why = "the operator has not approved it"
+        refusal = self._approval.refusal(action, self._context.peer_id)
+        raise Refused(refusal, "wire_motion_refused", why)
+
+    def _unattributed(self, request: wire.Request, sample: Sample) -> str | None:
+        context = self._context
+        if context.identity.required:
+            return context.identity.refusal(request.body, request.sender_id)
+        found = attribute(context.registry.session_of(request.sender_id), sample)
+        return None if found.proven else f"the sender is not attributed: {found.value}"
+
+
+class Server:
+    """Receives commands for one peer and replies.
+
+    Args:
+        locked: whether the lockout holds this peer.
+        dispatch: carries out a validated command and returns its result.
+    """
+
+    def __init__(
+        self, context: Context, lanes: Lanes, door: MotionDoor, locked: Callable[[], bool], dispatch: Dispatch
+    ) -> None:
+        self._context = context
+        self._lanes = lanes
+        self._door = door
+        self._locked = locked
+        self._dispatch = dispatch
+        self._replays = Replays(context.monotonic)
+
+    def on_command(self, sample: Sample) -> None:
+        """A sample on our command topic or on the broadcast topic; returns at once."""
+        context = self._context
+        try:
+            body = wire.decode(sample.payload, topics.BY_NAME["cmd"].max_bytes)
+            if body.get("sender_id") == context.peer_id:
+                return
+            request = wire.Request.of(body)
+        except wire.WireError as exc:
+            context.audit("command_rejected", reason=str(exc))
+            return
+        action = request.command.get("action") if isinstance(request.command, dict) else None
+        if not self._lanes.of(action).submit(lambda: self._serve(request, sample)):
+            context.audit("command_refused", request.sender_id, reason=BUSY)
+            self._reply(request, error=BUSY)
+
+    def _serve(self, request: wire.Request, sample: Sample) -> None:
+        audit = self._context.audit
+        try:
+            command, claim = self._admit(request, sample)
+        except Refused as refused:
+            named = request.command.get("action") if isinstance(request.command, dict) else None
+            action = named if isinstance(named, str) else ""
+            audit(refused.event, request.sender_id, action=action[:32], reason=refused.reason)
+            self._reply(request, error=str(refused))
+            return
+        action = command["action"]
+        try:
+            result = self._dispatch(command, sample)
+        except Exception:
+            logger.exception("%s: %s of %s failed.", self._context.peer_id, action, request.sender_id)
+            claim.give_back()
+            audit("command_refused", request.sender_id, action=action, reason=DISPATCH)
+            self._reply(request, error=DISPATCH)
+            return
+        if is_error(result):
+            claim.give_back()
+        else:
+            claim.spend()
+        self._reply(request, result=result)
+        if action in CHANGING:
+            event = "command_refused" if is_error(result) else "command_executed"
+            audit(event, request.sender_id, action=action, turn_id=request.turn_id)
+
+    def _admit(self, request: wire.Request, sample: Sample) -> tuple[dict[str, Any], Claim]:
+        if not isinstance(request.command, dict):
+            raise Refused(MISSING_COMMAND)
+        try:
+            command = validate_command(request.command, providers=self._context.providers())
+        except ValidationError as exc:
+            raise Refused(f"validation: {exc}") from None
+        action = command["action"]
+        if action not in ANSWERED_WHILE_LOCKED and self._locked():
+            raise Refused(LOCKED, reason="locked by an emergency stop")
+        # A stop that comes twice stops twice: refusing one as a replay could only leave a robot moving.
+        if action in CHANGING and action != "stop":
+            if request.timestamp is None or not wire.fresh(request.timestamp, self._context.clock()):
+                raise Refused(REPLAYED, reason="the timestamp is not fresh")
+            if not self._replays.first(request.sender_id, request.turn_id):
+                raise Refused(REPLAYED, reason="the turn was carried out before")
+        return command, self._door.claim(action, request, sample)
+
+    def _reply(self, request: wire.Request, *, result: Any = None, error: str = "") -> None:
+        context = self._context
+        reply = wire.Reply(
+            "error" if error else "response", context.peer_id, request.turn_id, result, error, context.clock()
+        )
+        key = topics.response(request.sender_id, context.peer_id, request.turn_id)
+        try:
+            context.put(key, context.identity.sign(reply.to_wire()))
+        except wire.WireError as exc:
+            logger.warning("%s: the reply to %s cannot be sent: %s", context.peer_id, request.sender_id, exc)
+            if not error:
+                self._reply(request, error=DISPATCH)
+        except TransportError as exc:
+            logger.warning("%s: the reply to %s was not sent: %s", context.peer_id, request.sender_id, exc)

@@ -1,0 +1,108 @@
+"""What the user of a mesh subscribed to, delivered off the transport's thread."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.transport.base import Sample, Subscription, Transport, TransportError
+
+logger = logging.getLogger(__name__)
+
+DataCallback = Callable[[str, dict[str, Any]], None]
+SampleCallback = Callable[[str, dict[str, Any], str | None], None]
+
+INBOX_MAX = 256
+
+
+@dataclass(slots=True)
+class _Entry:
+    topic: str
+    handle: Subscription
+
+
+class Subscriptions:
+    """Named subscriptions of one peer. Callbacks run one after another on the delivery lane.
+
+    A callback that is slow loses the oldest messages; it never holds up a command or a stop.
+    """
+
+    def __init__(self, lane: Lane) -> None:
+        self._lane = lane
+        self._lock = threading.Lock()
+        self._entries: dict[str, _Entry] = {}
+        self.inbox: dict[str, deque[dict[str, Any]]] = {}
+
+    def add(
+        self,
+        transport: Transport,
+        topic: str,
+        name: str,
+        *,
+        callback: DataCallback | None = None,
+        on_sample: SampleCallback | None = None,
+        direct: Callable[[Sample], None] | None = None,
+    ) -> bool:
+        """Subscribe under ``name``, replacing what had that name; False when the transport refused.
+
+        Args:
+            direct: hears the raw sample on the transport's thread instead, for parts of the mesh.
+        """
+        heard = direct or self._deliverer(topic, callback, name, on_sample)
+        try:
+            handle = transport.declare_subscriber(topic, heard)
+        except TransportError as exc:
+            logger.warning("subscribe %s: %s", topic, exc)
+            return False
+        self.remove(name)
+        with self._lock:
+            self._entries[name] = _Entry(topic, handle)
+            if callback is None and on_sample is None and direct is None:
+                self.inbox.setdefault(name, deque(maxlen=INBOX_MAX))
+        return True
+
+    def remove(self, name: str) -> bool:
+        """Undeclare; False when there is none of that name."""
+        with self._lock:
+            entry = self._entries.pop(name, None)
+            self.inbox.pop(name, None)
+        if entry is None:
+            return False
+        with contextlib.suppress(TransportError):  # the session may be gone, and the subscriber with it
+            entry.handle.undeclare()
+        return True
+
+    def clear(self) -> int:
+        """Undeclare all of them; how many there were."""
+        names = list(self._entries)
+        return sum(self.remove(name) for name in names)
+
+    def _deliverer(
+        self, topic: str, callback: DataCallback | None, name: str, on_sample: SampleCallback | None
+    ) -> Callable[[Sample], None]:
+        def deliver(sample: Sample) -> None:
+            try:
+                data = wire.decode(sample.payload, topics.topic_of(sample.key).max_bytes)
+            except wire.WireError as exc:
+                logger.debug("%s: %s", sample.key, exc)
+                return
+            if on_sample is not None:
+                on_sample(sample.key, data, sample.session)
+            elif callback is not None:
+                callback(sample.key, data)
+            else:
+                box = self.inbox.get(name)
+                if box is not None:
+                    box.append({"key": sample.key, **data})
+
+        def heard(sample: Sample) -> None:
+            self._lane.submit(lambda: deliver(sample))
+
+        return heard

@@ -1,0 +1,86 @@
+"""What a transport of the mesh is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+
+class TransportError(RuntimeError):
+    """A transport cannot connect or publish; the message says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One message as it arrived.
+
+    Attributes:
+        session: id of the publisher's session, None where the publisher or the transport names none.
+        sessionless: the transport has no sessions at all, so a missing one says nothing (MQTT).
+        retained: it is older than our subscription; the broker kept it for late joiners.
+    """
+
+    key: str
+    payload: bytes
+    session: str | None = None
+    sessionless: bool = False
+    retained: bool = False
+
+
+Callback = Callable[[Sample], None]
+"""Called on the transport's own thread: it returns at once and does not raise."""
+
+LivenessCallback = Callable[[str, bool], None]
+"""Called with the key of a liveliness token and whether it is there."""
+
+
+@runtime_checkable
+class Subscription(Protocol):
+    """A handle on a subscriber."""
+
+    def undeclare(self) -> None:
+        """No callback starts after this returns; twice is once."""
+
+
+@runtime_checkable
+class Transport(Protocol):
+    """Publish and subscribe on the mesh's keys, without the namespace."""
+
+    @property
+    def session_id(self) -> str | None:
+        """Id of our session on this transport, None where it has none or is closed."""
+
+    def connect(self) -> None:
+        """Open. Raises TransportError when that is not possible; already open is fine."""
+
+    def close(self) -> None:
+        """Close; every subscriber goes with it. Twice is once."""
+
+    def is_alive(self) -> bool:
+        """True between connect and close, as far as the transport can tell."""
+
+    def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
+        """Publish. Raises TransportError when closed, WireError for a message above its topic's size."""
+
+    def declare_subscriber(self, key: str, callback: Callback) -> Subscription:
+        """Hear a key expression; ``*`` is one segment, ``**`` any number. Raises TransportError when closed."""
+
+
+@runtime_checkable
+class LiveTransport(Protocol):
+    """A transport that can tell at once when a session ends."""
+
+    def declare_token(self, key: str) -> Subscription:
+        """Show ``key`` as alive until it is undeclared or this session ends."""
+
+    def watch_tokens(self, key: str, callback: LivenessCallback) -> Subscription:
+        """Hear tokens come and go, those that are there already included."""
+
+
+@runtime_checkable
+class ConfirmingTransport(Protocol):
+    """A transport that can tell whether a message has a taker."""
+
+    def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
+        """Publish; True when somebody hears the key, False when nobody does, None when that is not known."""

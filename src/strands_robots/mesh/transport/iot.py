@@ -1,0 +1,266 @@
+"""The mesh over MQTT 5 with mutual TLS, as AWS IoT Core speaks it.
+
+A key is a topic; ``*`` becomes ``+`` and ``**`` becomes ``#``. MQTT names no sessions: which client may write to which
+topic is the broker's policy, so a reply is as good as that policy. Quality of service and retention come from the
+topic table. Proven against a local broker; not verified against AWS.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from strands_robots import settings
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.transport.base import Callback, Sample, TransportError
+from strands_robots.utils import missing_extra
+
+logger = logging.getLogger(__name__)
+
+CONNECT_S = 15.0
+ACKNOWLEDGE_S = 5.0
+KEEP_ALIVE_S = 35
+DEFAULT_PORT = 8883
+NO_SUBSCRIBERS = 16
+"""MQTT 5 reason code of a PUBACK: nobody has subscribed to the topic."""
+
+CERT_NAMES = ("cert.pem", "certificate.pem.crt", "{thing}.pem", "{thing}.cert.pem")
+KEY_NAMES = ("key.pem", "private.pem.key", "{thing}.key", "{thing}.private.key")
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """Where to connect and as whom: ``thing`` is client id, certificate name and peer id."""
+
+    host: str
+    port: int
+    thing: str
+    cert: Path
+    key: Path
+    ca: Path | None
+
+    @classmethod
+    def from_settings(cls) -> Account:
+        """Raises TransportError for what is not stated or not there."""
+        endpoint, thing = settings.raw("STRANDS_IOT_ENDPOINT"), settings.raw("STRANDS_IOT_THING_NAME")
+        folder = settings.raw("STRANDS_IOT_CERT_DIR")
+        stated = {
+            "STRANDS_IOT_ENDPOINT": endpoint,
+            "STRANDS_IOT_THING_NAME": thing,
+            "STRANDS_IOT_CERT_DIR": folder,
+        }
+        absent = [name for name, value in stated.items() if not value]
+        if absent:
+            raise TransportError(f"the iot backend needs {', '.join(absent)}.")
+        host, _, port = endpoint.partition(":")
+        if port and not port.isdigit():
+            raise TransportError(f"STRANDS_IOT_ENDPOINT must be host or host:port, not {endpoint!r}.")
+        ca = settings.raw("STRANDS_IOT_CA_FILE")
+        base = Path(folder).expanduser()
+        return cls(
+            host,
+            int(port or DEFAULT_PORT),
+            thing,
+            _first(base, CERT_NAMES, thing),
+            _first(base, KEY_NAMES, thing),
+            Path(ca).expanduser() if ca else None,
+        )
+
+
+class _Subscriber:
+    def __init__(self, owner: IotMqttTransport, key: str, callback: Callback) -> None:
+        self.owner, self.key, self.callback = owner, key, callback
+
+    def undeclare(self) -> None:
+        self.owner.leave(self)
+
+
+class IotMqttTransport:
+    """One MQTT 5 client as a transport. It reconnects by itself and subscribes anew where the broker forgot it."""
+
+    def __init__(self, account: Account | None = None) -> None:
+        self._account = account
+        self._client: Any = None
+        self._crt: Any = None
+        self._up = threading.Event()
+        self._failed: str = ""
+        self._lock = threading.Lock()
+        self._subscribers: list[_Subscriber] = []
+
+    @property
+    def session_id(self) -> str | None:
+        return None
+
+    def connect(self) -> None:
+        if self._client is not None:
+            return
+        try:
+            from awscrt import mqtt5  # noqa: PLC0415 - optional, loaded when used
+            from awsiot import mqtt5_client_builder  # noqa: PLC0415 - optional, loaded when used
+        except ImportError:
+            raise missing_extra("The MQTT mesh", "iot") from None
+        account = self._account = self._account or Account.from_settings()
+        self._crt = mqtt5
+        flow = mqtt5.ExtendedValidationAndFlowControlOptions
+        local = account.host in ("127.0.0.1", "localhost", "::1")
+        self._client = mqtt5_client_builder.mtls_from_path(
+            endpoint=account.host,
+            port=account.port,
+            cert_filepath=str(account.cert),
+            pri_key_filepath=str(account.key),
+            ca_filepath=str(account.ca) if account.ca else None,
+            client_id=account.thing,
+            keep_alive_interval_sec=KEEP_ALIVE_S,
+            # The limits of AWS's broker are a hundred messages a second; a broker on this machine has none.
+            extended_validation_and_flow_control_options=flow.NONE if local else flow.AWS_IOT_CORE_DEFAULTS,
+            on_publish_received=self._received,
+            on_lifecycle_connection_success=self._connected,
+            on_lifecycle_connection_failure=self._refused,
+            on_lifecycle_disconnection=self._disconnected,
+        )
+        self._client.start()
+        if not self._up.wait(CONNECT_S):
+            self.close()
+            raise TransportError(
+                f"no MQTT connection to {account.host}:{account.port} in {CONNECT_S:g} s: {self._failed or 'no answer'}"
+            )
+
+    def close(self) -> None:
+        client, self._client = self._client, None
+        with self._lock:
+            self._subscribers.clear()
+        self._up.clear()
+        if client is not None:
+            client.stop()
+
+    def is_alive(self) -> bool:
+        return self._client is not None and self._up.is_set()
+
+    def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
+        self._publish(key, payload)
+
+    def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
+        """Publish and say whether anybody has subscribed to the topic; None where the broker did not tell in time."""
+        future = self._publish(key, payload)
+        if future is None:
+            return None
+        try:
+            acknowledged = future.result(timeout).puback
+        except FutureTimeoutError:
+            return None
+        except Exception as exc:  # noqa: BLE001 - the client raises errors of its own kind
+            raise TransportError(f"{key}: {exc}") from None
+        code = int(acknowledged.reason_code) if acknowledged is not None else 0
+        if code >= 128:
+            raise TransportError(f"{key}: the broker refused the message, reason {code}.")
+        return code != NO_SUBSCRIBERS
+
+    def declare_subscriber(self, key: str, callback: Callback) -> _Subscriber:
+        subscriber = _Subscriber(self, key, callback)
+        with self._lock:
+            self._subscribers.append(subscriber)
+        try:
+            self._subscribe(key).result(ACKNOWLEDGE_S)
+        except TransportError:
+            self._forget(subscriber)
+            raise
+        except Exception as exc:  # noqa: BLE001 - the client raises errors of its own kind
+            self._forget(subscriber)
+            raise TransportError(f"{key}: the broker did not take the subscription: {exc}") from None
+        return subscriber
+
+    def leave(self, subscriber: _Subscriber) -> None:
+        """Drop a subscriber, and the subscription with the last one of its topic."""
+        last = self._forget(subscriber)
+        client = self._client
+        if last and client is not None:
+            packet = self._crt.UnsubscribePacket(topic_filters=[filter_of(subscriber.key)])
+            with contextlib.suppress(Exception):  # a broker that is away has no subscription to drop
+                client.unsubscribe(packet)
+
+    def _forget(self, subscriber: _Subscriber) -> bool:
+        with self._lock:
+            if subscriber not in self._subscribers:
+                return False
+            self._subscribers.remove(subscriber)
+            return all(each.key != subscriber.key for each in self._subscribers)
+
+    def _subscribe(self, key: str) -> Future[Any]:
+        client = self._require()
+        quality = self._crt.QoS.AT_LEAST_ONCE if (topics.topic_of(key).qos or 0) else self._crt.QoS.AT_MOST_ONCE
+        wanted = self._crt.Subscription(topic_filter=filter_of(key), qos=quality)
+        answer: Future[Any] = client.subscribe(self._crt.SubscribePacket(subscriptions=[wanted]))
+        return answer
+
+    def _publish(self, key: str, payload: bytes | Mapping[str, Any]) -> Future[Any] | None:
+        topic = topics.topic_of(key)
+        if topic.qos is None:
+            return None
+        data = payload if isinstance(payload, bytes) else wire.encode(payload, topic.max_bytes)
+        if len(data) > topic.max_bytes:
+            raise wire.TooLargeError(f"{key}: a message of {len(data)} bytes is above the topic's {topic.max_bytes}.")
+        client = self._require()
+        packet = self._crt.PublishPacket(topic=key, payload=data, qos=self._crt.QoS(topic.qos), retain=topic.retain)
+        try:
+            future: Future[Any] = client.publish(packet)
+        except Exception as exc:  # noqa: BLE001 - the client raises errors of its own kind
+            raise TransportError(f"{key}: {exc}") from None
+        return future if topic.qos else None
+
+    def _require(self) -> Any:
+        client = self._client
+        if client is None:
+            raise TransportError("the MQTT client is closed.")
+        return client
+
+    def _received(self, data: Any) -> None:
+        packet = data.publish_packet
+        key = packet.topic
+        sample = Sample(key, bytes(packet.payload or b""), None, sessionless=True, retained=bool(packet.retain))
+        with self._lock:
+            hearers = [each for each in self._subscribers if topics.matches(each.key, key)]
+        for each in hearers:
+            try:
+                each.callback(sample)
+            except Exception:
+                logger.exception("A subscriber of %s failed.", each.key)
+
+    def _connected(self, data: Any) -> None:
+        returning = self._up.is_set() or bool(self._failed)
+        self._up.set()
+        settled = getattr(data, "negotiated_settings", None)
+        if returning and not getattr(settled, "rejoined_session", False):
+            with self._lock:
+                keys = {each.key for each in self._subscribers}
+            for key in keys:
+                self._subscribe(key)
+        self._failed = ""
+
+    def _refused(self, data: Any) -> None:
+        self._failed = str(getattr(data, "exception", "refused"))
+
+    def _disconnected(self, data: Any) -> None:
+        self._up.clear()
+        self._failed = "disconnected"
+        if self._client is not None:
+            logger.warning("The MQTT broker is gone; the mesh connects again by itself.")
+
+
+def filter_of(key: str) -> str:
+    """The MQTT topic filter of a key expression."""
+    return "/".join({"*": "+", "**": "#"}.get(part, part) for part in key.split("/"))
+
+
+def _first(folder: Path, names: tuple[str, ...], thing: str) -> Path:
+    for name in names:
+        path = folder / name.format(thing=thing)
+        if path.is_file():
+            return path
+    raise TransportError(f"STRANDS_IOT_CERT_DIR: {folder} holds none of {', '.join(names)}.".format(thing=thing))

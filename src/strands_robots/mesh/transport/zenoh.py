@@ -1,0 +1,242 @@
+"""The mesh over Zenoh: one session per process, a loopback hub that survives the process that held it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Mapping
+from itertools import count
+from typing import Any
+
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.transport import zenoh_config
+from strands_robots.mesh.transport.base import Callback, LivenessCallback, Sample, TransportError
+from strands_robots.mesh.transport.posture import Posture, from_settings
+from strands_robots.utils import missing_extra
+
+logger = logging.getLogger(__name__)
+
+OPEN_S = 5.0
+RESCUE_EVERY_S = 0.2
+PUBLISHERS_MAX = 256
+
+
+class ZenohTransport:
+    """A Zenoh session as a transport.
+
+    Without stated endpoints the first process of the machine is the hub on the loopback port and the others are
+    its clients. When the hub dies, the survivors race for the port: whoever binds it relays for the others, and
+    no session is reopened, so every subscriber and every session id stays.
+
+    Args:
+        posture: endpoints and certificates; the environment's by default.
+    """
+
+    def __init__(self, posture: Posture | None = None) -> None:
+        self._posture = posture
+        self._id = secrets.token_hex(16).lstrip("0") or "1"
+        self._session: Any = None
+        self._relay: Any = None
+        self._zenoh: Any = None
+        self._links: Any = None
+        self._numbers = count()
+        self._publishers: dict[str, tuple[Any, Any]] = {}
+        self._closing = threading.Event()
+        self._rescuing = threading.Lock()
+        self._lock = threading.Lock()
+
+    @property
+    def session(self) -> Any:
+        """The ``zenoh.Session``, None while closed."""
+        return self._session
+
+    @property
+    def session_id(self) -> str | None:
+        return self._id if self._session is not None else None
+
+    @property
+    def posture(self) -> Posture | None:
+        """What the session was opened with; None before the first connect where none was given."""
+        return self._posture
+
+    def connect(self) -> None:
+        with self._lock:
+            if self._session is not None:
+                return
+            try:
+                import zenoh  # noqa: PLC0415 - an optional dependency, loaded when it is used
+            except ImportError:
+                raise missing_extra("The Zenoh mesh", "mesh") from None
+            self._zenoh = zenoh
+            posture = self._posture = self._posture or from_settings()
+            self._closing.clear()
+            if posture.hub is None:
+                self._session = self._open(zenoh_config.explicit(posture, self._id))
+            else:
+                self._session = self._open_on_loopback(posture)
+            if not posture.verified:
+                logger.info("The mesh runs without certificates, on this machine alone or by the operator's opt-in.")
+
+    def close(self) -> None:
+        self._closing.set()
+        with self._lock:
+            session, relay, links = self._session, self._relay, self._links
+            self._session = self._relay = self._links = None
+            publishers, self._publishers = self._publishers, {}
+        for publisher, _ in publishers.values():
+            with contextlib.suppress(*self.errors()):  # closing the session takes it along anyway
+                publisher.undeclare()
+        for each in (links,):
+            if each is not None:
+                with contextlib.suppress(*self.errors()):  # likewise
+                    each.undeclare()
+        for each in (session, relay):
+            if each is not None:
+                each.close()
+        with self._rescuing:  # a rescue that was under way has seen the closing flag when this is free
+            late, self._relay = self._relay, None
+        if late is not None:
+            late.close()
+
+    def is_alive(self) -> bool:
+        session = self._session
+        return session is not None and not session.is_closed()
+
+    def linked(self) -> bool:
+        """Whether any other Zenoh session is connected to ours."""
+        session = self._session
+        if session is None:
+            return False
+        return bool(session.info.peers_zid() or session.info.routers_zid())
+
+    def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
+        topic = topics.topic_of(key)
+        data = payload if isinstance(payload, bytes) else wire.encode(payload, topic.max_bytes)
+        if len(data) > topic.max_bytes:
+            raise wire.TooLargeError(f"{key}: a message of {len(data)} bytes is above the topic's {topic.max_bytes}.")
+        try:
+            publisher, source = self._publishers.get(key) or self._publisher(key, topic)
+            publisher.put(data, source_info=self._zenoh.SourceInfo(source, next(self._numbers) & 0xFFFFFFFF))
+        except self.errors() as exc:
+            raise TransportError(f"{key}: {exc}") from None
+
+    def declare_subscriber(self, key: str, callback: Callback) -> Any:
+        def heard(sample: Any) -> None:
+            if sample.kind != self._zenoh.SampleKind.PUT:
+                return
+            source = sample.source_info
+            session = str(source.source_id.zid) if source is not None else None
+            try:
+                callback(Sample(str(sample.key_expr), sample.payload.to_bytes(), session))
+            except Exception:
+                logger.exception("A subscriber of %s failed.", key)
+
+        return self._declare(lambda session, direct: session.declare_subscriber(key, direct), heard, key)
+
+    def declare_token(self, key: str) -> Any:
+        session = self._require()
+        try:
+            return session.liveliness().declare_token(key)
+        except self.errors() as exc:
+            raise TransportError(f"{key}: {exc}") from None
+
+    def watch_tokens(self, key: str, callback: LivenessCallback) -> Any:
+        def heard(sample: Any) -> None:
+            try:
+                callback(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+            except Exception:
+                logger.exception("A watcher of %s failed.", key)
+
+        def declare(session: Any, direct: Any) -> Any:
+            return session.liveliness().declare_subscriber(key, direct, history=True)
+
+        return self._declare(declare, heard, key)
+
+    def errors(self) -> tuple[type[BaseException], ...]:
+        """What Zenoh raises for a fault of the transport."""
+        return (self._zenoh.ZError,) if self._zenoh is not None else (TransportError,)
+
+    def _require(self) -> Any:
+        session = self._session
+        if session is None:
+            raise TransportError("the Zenoh session is closed.")
+        return session
+
+    def _declare(self, declare: Any, heard: Any, key: str) -> Any:
+        # A direct callback runs on Zenoh's own thread; an indirect one would cost a thread for each subscriber.
+        direct = self._zenoh.handlers.Callback(heard, indirect=False)
+        try:
+            return declare(self._require(), direct)
+        except self.errors() as exc:
+            raise TransportError(f"{key}: {exc}") from None
+
+    def _publisher(self, key: str, topic: topics.Topic) -> tuple[Any, Any]:
+        zenoh = self._zenoh
+        session = self._require()
+        publisher = session.declare_publisher(
+            key,
+            # One peer that stopped reading must not hold up what is meant for the others.
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH if topic.urgent else zenoh.Priority.DATA,
+            express=topic.urgent,
+        )
+        found = (publisher, publisher.id)
+        with self._lock:
+            while len(self._publishers) >= PUBLISHERS_MAX:
+                oldest, _ = self._publishers.pop(next(iter(self._publishers)))
+                oldest.undeclare()
+            self._publishers[key] = found
+        return found
+
+    def _open(self, config: dict[str, Any]) -> Any:
+        try:
+            return self._zenoh.open(self._zenoh.Config.from_json5(json.dumps(config)))
+        except self._zenoh.ZError as exc:
+            raise TransportError(f"Zenoh session: {exc}") from None
+
+    def _open_on_loopback(self, posture: Posture) -> Any:
+        deadline = time.monotonic() + OPEN_S
+        while True:
+            with contextlib.suppress(TransportError):  # somebody else is the hub
+                session = self._open(zenoh_config.hub(posture, self._id))
+                logger.info("This process is the mesh's hub on %s.", posture.hub)
+                return session
+            try:
+                session = self._open(zenoh_config.child(posture, self._id))
+            except TransportError as exc:
+                if time.monotonic() < deadline:
+                    continue  # the hub died in between, or is coming up
+                raise TransportError(
+                    f"{posture.hub} is taken and no mesh of ours answers there ({exc}); set STRANDS_MESH_PORT."
+                ) from None
+            self._watch_hub(session)
+            return session
+
+    def _watch_hub(self, session: Any) -> None:
+        def changed(event: Any) -> None:
+            if event.kind != self._zenoh.SampleKind.PUT and not self._closing.is_set():
+                threading.Thread(target=self._rescue, name="mesh-rescue", daemon=True).start()
+
+        direct = self._zenoh.handlers.Callback(changed, indirect=False)
+        self._links = session.info.declare_transport_events_listener(direct, history=False)
+
+    def _rescue(self) -> None:
+        """Until our session has a hub again, try to be one."""
+        if not self._rescuing.acquire(blocking=False):
+            return
+        try:
+            posture = self._posture
+            while posture is not None and not self._closing.is_set() and not self.linked():
+                if self._relay is None:
+                    with contextlib.suppress(TransportError):  # another survivor was quicker
+                        self._relay = self._open(zenoh_config.hub(posture))
+                        logger.warning("The mesh's hub is gone; this process relays on %s now.", posture.hub)
+                self._closing.wait(RESCUE_EVERY_S)
+        finally:
+            self._rescuing.release()
+        if not self._closing.is_set() and not self.linked():
+            self._rescue()  # the link went again after the last look

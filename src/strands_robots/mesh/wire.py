@@ -1,0 +1,263 @@
+"""Messages of the mesh as typed values, and their JSON.
+
+Decoding never raises anything but :class:`WireError`, whatever the bytes: the receiver drops the message and
+audits the reason. Times are wall-clock seconds as the sender states them; they are never used as ages.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from strands_robots.utils import ValidationError, identifier, shown
+
+FRESH_S = 60.0
+AHEAD_S = 5.0
+
+
+class WireError(ValueError):
+    """Bytes that are no message of this wire, and why."""
+
+
+class TooLargeError(WireError):
+    """A message above its topic's size."""
+
+
+def encode(payload: Mapping[str, Any], limit: int) -> bytes:
+    """UTF-8 JSON. A number that is not finite becomes null, because JSON has none.
+
+    Raises:
+        TooLargeError: more than ``limit`` bytes.
+        WireError: a value that JSON cannot hold.
+    """
+    try:
+        data = json.dumps(payload, allow_nan=False, separators=(",", ":")).encode()
+    except ValueError:
+        data = _encode_finite(payload)
+    except (TypeError, RecursionError) as exc:
+        raise WireError(f"payload cannot be JSON: {exc}") from None
+    if len(data) > limit:
+        raise TooLargeError(f"a message of {len(data)} bytes is above the topic's {limit}.")
+    return data
+
+
+def decode(data: bytes, limit: int) -> dict[str, Any]:
+    """The JSON object in ``data``.
+
+    Raises:
+        WireError: too long, not UTF-8, not JSON, not an object, or a number that is not finite.
+    """
+    if len(data) > limit:
+        raise TooLargeError(f"a message of {len(data)} bytes is above the topic's {limit}.")
+    try:
+        value = json.loads(data, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as exc:
+        raise WireError(f"not JSON: {type(exc).__name__}") from None
+    if not isinstance(value, dict):
+        raise WireError(f"not an object but a {type(value).__name__}")
+    return value
+
+
+def canonical(value: object) -> bytes:
+    """Sorted compact JSON: the bytes that signatures cover."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def finite(value: object) -> float | None:
+    """A finite JSON number as a float, or None; a boolean is no number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def fresh(stamp: float, now: float) -> bool:
+    """Whether a sender's wall-clock time is at most 60 s old and 5 s ahead."""
+    return -AHEAD_S <= now - stamp <= FRESH_S
+
+
+def _refuse_constant(word: str) -> float:
+    raise WireError(f"{word} is no JSON number")
+
+
+def _encode_finite(payload: Mapping[str, Any]) -> bytes:
+    try:
+        return json.dumps(_scrubbed(payload), allow_nan=False, separators=(",", ":")).encode()
+    except (TypeError, ValueError, RecursionError) as exc:
+        raise WireError(f"payload cannot be JSON: {exc}") from None
+
+
+def _scrubbed(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _scrubbed(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_scrubbed(entry) for entry in value]
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class Presence:
+    """A heartbeat: who is there and what it can do. ``body`` is the message as it came, signature included."""
+
+    robot_id: str
+    robot_type: str
+    hostname: str
+    timestamp: float
+    body: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> Presence:
+        """Raises WireError for a missing id or time; type and host are text of at most 256 characters."""
+        return cls(
+            _identifier(body, "robot_id"),
+            _label(body.get("robot_type"), "robot"),
+            _label(body.get("hostname"), ""),
+            _time(body, "timestamp"),
+            body,
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """What a registry keeps besides id, type and host."""
+        known = {"robot_id", "robot_type", "hostname", "sig"}
+        return {key: value for key, value in self.body.items() if key not in known}
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A command to one peer or to all of them. ``command`` is anything until it is validated."""
+
+    sender_id: str
+    turn_id: str
+    command: Any
+    timestamp: float | None
+    body: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_wire(self) -> dict[str, Any]:
+        return {
+            "sender_id": self.sender_id,
+            "turn_id": self.turn_id,
+            "command": self.command,
+            "timestamp": self.timestamp,
+        }
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> Request:
+        """Raises WireError for a sender or a turn that is no identifier; a time may be missing."""
+        sender, turn = _identifier(body, "sender_id"), _identifier(body, "turn_id")
+        return cls(sender, turn, body.get("command"), finite(body.get("timestamp")), body)
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What a peer answers in a turn: ``result`` of a response, ``error`` text of an error."""
+
+    type: Literal["response", "error"]
+    responder_id: str
+    turn_id: str
+    result: Any = None
+    error: str = ""
+    timestamp: float = 0.0
+    body: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_wire(self) -> dict[str, Any]:
+        said: dict[str, Any] = {"error": self.error} if self.type == "error" else {"result": self.result}
+        head = {"type": self.type, "responder_id": self.responder_id, "turn_id": self.turn_id}
+        return {**head, **said, "timestamp": self.timestamp}
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> Reply:
+        """Raises WireError for another ``type`` or an id that is none."""
+        kind = body.get("type")
+        if kind not in ("response", "error"):
+            raise WireError(f"type must be response or error, not {shown(kind)}")
+        responder, turn = _identifier(body, "responder_id"), _identifier(body, "turn_id")
+        words = body.get("error")
+        error = words if isinstance(words, str) else ""
+        return cls(kind, responder, turn, body.get("result"), error, finite(body.get("timestamp")) or 0.0, body)
+
+
+@dataclass(frozen=True, slots=True)
+class EstopNotice:
+    """A fleet e-stop. ``source_zid`` is None where the transport names no sessions."""
+
+    peer_id: str
+    t: float
+    estop_id: str | None
+    source_zid: str | None
+    counts: Mapping[str, Any] = field(default_factory=dict)
+    body: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_wire(self) -> dict[str, Any]:
+        body = {"peer_id": self.peer_id, "t": self.t, "estop_id": self.estop_id, **self.counts}
+        return body | ({"source_zid": self.source_zid} if self.source_zid is not None else {})
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> EstopNotice:
+        """Raises WireError for an empty issuer or a time that is no finite number."""
+        issuer = body.get("peer_id")
+        if not isinstance(issuer, str) or not issuer.strip() or len(issuer) > 256:
+            raise WireError(f"peer_id must name the issuer, not {shown(issuer)}")
+        zid, epoch = body.get("source_zid"), body.get("estop_id")
+        return cls(
+            issuer,
+            _time(body, "t"),
+            epoch if isinstance(epoch, str) and is_hex(epoch, 32) else None,
+            zid if isinstance(zid, str) else None,
+            body=body,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ResumeRelay:
+    """A signed resume on its way to the fleet."""
+
+    peer_id: str
+    t: float
+    assertion: Any
+    source_zid: str | None
+
+    def to_wire(self) -> dict[str, Any]:
+        body = {"peer_id": self.peer_id, "t": self.t, "assertion": self.assertion}
+        return body | ({"source_zid": self.source_zid} if self.source_zid is not None else {})
+
+    @classmethod
+    def of(cls, body: Mapping[str, Any]) -> ResumeRelay:
+        """Raises WireError for a relaying peer that is no identifier or a time that is no finite number."""
+        zid = body.get("source_zid")
+        return cls(
+            _identifier(body, "peer_id"),
+            _time(body, "t"),
+            body.get("assertion"),
+            zid if isinstance(zid, str) else None,
+        )
+
+
+def is_hex(text: str, length: int) -> bool:
+    """Lower-case hexadecimal of exactly ``length`` digits."""
+    return len(text) == length and all(c in "0123456789abcdef" for c in text)
+
+
+def _identifier(body: Mapping[str, Any], name: str) -> str:
+    try:
+        return identifier(name, body.get(name))
+    except ValidationError as exc:
+        raise WireError(str(exc)) from None
+
+
+def _time(body: Mapping[str, Any], name: str) -> float:
+    value = finite(body.get(name))
+    if value is None:
+        raise WireError(f"{name} must be a finite number, not {shown(body.get(name))}")
+    return value
+
+
+def _label(value: object, default: str) -> str:
+    return value[:256] if isinstance(value, str) else default

@@ -1,0 +1,318 @@
+"""Signed messages: a peer's certificate vouches for what it publishes.
+
+The session id on a sample is chosen by its publisher, so it is a hint. Under ``sig`` a message carries the leaf
+certificate and a signature over the canonical JSON of the message without ``sig`` and of the signature's own
+fields. A certificate's common name speaks for the peer id that equals it, or starts with it and ``__``.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import datetime
+import hashlib
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from strands_robots import settings
+from strands_robots.mesh import wire
+from strands_robots.utils import ValidationError, identifier, missing_extra, shown
+
+if TYPE_CHECKING:
+    from cryptography import x509
+
+    from strands_robots.mesh.transport.posture import Credentials
+
+logger = logging.getLogger(__name__)
+
+VERSION = 1
+CERT_MAX_BYTES = 4096
+SIG_MAX_BYTES = 2048
+SALT_BYTES = 32
+NONCE_S = 65.0
+NONCES_MAX = 4096
+FIELDS = frozenset({"v", "alg", "cert", "t", "nonce", "sig"})
+ALGORITHMS = ("rsa-pss-sha256", "ecdsa-sha256", "ed25519")
+
+
+class IdentityError(ValueError):
+    """A signature that does not count, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """Whose certificate signed: its SHA-256 in hex and its common name."""
+
+    cert_sha256: str
+    common_name: str
+
+    def speaks_for(self, peer_id: str) -> bool:
+        return peer_id == self.common_name or peer_id.startswith(f"{self.common_name}__")
+
+
+class Signer:
+    """Signs what this peer publishes.
+
+    Raises:
+        ValueError: the files hold no certificate and matching private key of a kind in :data:`ALGORITHMS`.
+    """
+
+    def __init__(self, cert: Path, key: Path, clock: Callable[[], float] = time.time) -> None:
+        x509, serialization = _cryptography()
+        certificate = x509.load_pem_x509_certificate(cert.read_bytes())
+        self._key: Any = serialization.load_pem_private_key(key.read_bytes(), None)
+        if self._key.public_key() != certificate.public_key():
+            raise ValueError(f"{key} is not the private key of {cert}.")
+        self._der = certificate.public_bytes(serialization.Encoding.DER)
+        if len(self._der) > CERT_MAX_BYTES:
+            raise ValueError(f"{cert} is above {CERT_MAX_BYTES} bytes.")
+        self._digest = hashlib.sha256(self._der).hexdigest()
+        self._encoded = base64.b64encode(self._der).decode()
+        self._algorithm = _algorithm_of(self._key.public_key())
+        self._clock = clock
+        self.common_name = _common_name(certificate)
+
+    def sign(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """``body`` with its ``sig``."""
+        bare = {key: value for key, value in body.items() if key != "sig"}
+        head = {"v": VERSION, "alg": self._algorithm, "t": self._clock(), "nonce": secrets.token_hex(16)}
+        signature = _make(self._key, self._algorithm, _signed_bytes(bare, head, self._digest))
+        encoded = base64.urlsafe_b64encode(signature).decode().rstrip("=")
+        return {**bare, "sig": {**head, "cert": self._encoded, "sig": encoded}}
+
+
+class Verifier:
+    """Checks signed messages against the roots of a PEM file; every (certificate, nonce) counts once.
+
+    Args:
+        roots: PEM certificates that may issue a peer's certificate, directly.
+        clock: wall-clock seconds, for the times on the wire and a certificate's validity.
+        monotonic: seconds, by which used nonces age.
+    """
+
+    def __init__(
+        self,
+        roots: bytes,
+        clock: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        x509, _ = _cryptography()
+        self._roots: list[Any] = list(x509.load_pem_x509_certificates(roots)) if roots.strip() else []
+        self._clock = clock
+        self._monotonic = monotonic
+        self._used: dict[tuple[str, str], float] = {}
+        self._lock = threading.Lock()
+
+    def verify(self, body: Mapping[str, Any]) -> Verified:
+        """Whose signature is on ``body``.
+
+        Raises:
+            IdentityError: it does not count; the message says why.
+        """
+        sig = _shape(body.get("sig"))
+        if not self._roots:
+            raise IdentityError("no root certificate is configured")
+        der, signature = _decode(sig["cert"], CERT_MAX_BYTES), _decode(sig["sig"], SIG_MAX_BYTES, url=True)
+        certificate = _parse(der)
+        name = _common_name(certificate)
+        self._issued(certificate)
+        stamp = wire.finite(sig["t"])
+        if stamp is None or not wire.fresh(stamp, self._clock()):
+            raise IdentityError("the signature is not fresh")
+        public = certificate.public_key()
+        if _algorithm_of(public) != sig["alg"]:
+            raise IdentityError("the certificate's key does not fit the algorithm")
+        digest = hashlib.sha256(der).hexdigest()
+        bare = {key: value for key, value in body.items() if key != "sig"}
+        head = {key: sig[key] for key in ("v", "alg", "t", "nonce")}
+        try:
+            covered = _signed_bytes(bare, head, digest)
+        except (ValueError, TypeError, RecursionError):
+            raise IdentityError("the message has no canonical form") from None
+        _check(public, sig["alg"], signature, covered)
+        self._use(digest, sig["nonce"])
+        return Verified(digest, name)
+
+    def _issued(self, certificate: x509.Certificate) -> None:
+        now = datetime.datetime.fromtimestamp(self._clock(), datetime.UTC)
+        if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
+            raise IdentityError("the certificate is not valid now")
+        for root in self._roots:
+            try:
+                certificate.verify_directly_issued_by(root)
+            except Exception as exc:  # noqa: BLE001 - each root refuses in its own way; the next one is asked
+                logger.debug("Not issued by %s: %s", root.subject, exc)
+            else:
+                return
+        raise IdentityError("no configured root issued the certificate")
+
+    def _use(self, digest: str, nonce: str) -> None:
+        now = self._monotonic()
+        with self._lock:
+            if (digest, nonce) in self._used:
+                raise IdentityError("the nonce was used before")
+            for key in [key for key, at in self._used.items() if now - at > NONCE_S][:64]:
+                del self._used[key]
+            while len(self._used) >= NONCES_MAX:
+                del self._used[next(iter(self._used))]
+            self._used[digest, nonce] = now
+
+
+class Identity:
+    """This peer's signer and verifier, and whether unsigned messages still count."""
+
+    def __init__(self, signer: Signer | None = None, verifier: Verifier | None = None, required: bool = False) -> None:
+        self._signer = signer
+        self._verifier = verifier
+        self.required = required
+
+    def sign(self, body: dict[str, Any]) -> dict[str, Any]:
+        """``body``, signed when this peer holds a certificate."""
+        return self._signer.sign(body) if self._signer is not None else body
+
+    def verify(self, body: Mapping[str, Any], peer_id: str) -> Verified:
+        """Who signed ``body`` and may speak for ``peer_id``. Raises IdentityError when nobody did."""
+        if self._verifier is None:
+            raise IdentityError("this peer has no roots to check signatures against")
+        verified = self._verifier.verify(body)
+        if not verified.speaks_for(peer_id):
+            raise IdentityError(f"the certificate of {verified.common_name} does not speak for {shown(peer_id)}")
+        return verified
+
+    def refusal(self, body: Mapping[str, Any], peer_id: str) -> str | None:
+        """Why ``body`` does not count as signed by ``peer_id``, or None."""
+        try:
+            self.verify(body, peer_id)
+        except IdentityError as exc:
+            return str(exc)
+        return None
+
+    @property
+    def checks(self) -> bool:
+        """Whether there are roots to check a signature against."""
+        return self._verifier is not None
+
+
+def from_settings(credentials: Credentials | None) -> Identity:
+    """The identity the environment asks for: signed when there are certificates, unless it is told otherwise."""
+    word = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY").lower()
+    signer, verifier = None, None
+    if credentials is not None:
+        signer = Signer(credentials.cert, credentials.key)
+        verifier = Verifier(credentials.ca.read_bytes())
+    if word not in ("0", "1", "auto"):
+        logger.warning("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY=%r is none of 1, 0 and auto; taken as 1.", word)
+        word = "1"
+    return Identity(signer, verifier, required=word == "1" or (word == "auto" and verifier is not None))
+
+
+def _cryptography() -> tuple[Any, Any]:
+    try:
+        from cryptography import x509  # noqa: PLC0415 - optional, loaded when used
+        from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - optional, loaded when used
+    except ImportError:
+        raise missing_extra("A signed identity", "mesh") from None
+    return x509, serialization
+
+
+def _shape(sig: object) -> dict[str, Any]:
+    if not isinstance(sig, dict) or set(sig) != FIELDS:
+        raise IdentityError("not signed, or not with exactly the fields of a signature")
+    version, algorithm, nonce = sig["v"], sig["alg"], sig["nonce"]
+    if isinstance(version, bool) or version != VERSION or algorithm not in ALGORITHMS:
+        raise IdentityError("unknown version or algorithm")
+    if not isinstance(nonce, str) or not 1 <= len(nonce) <= 128 or not nonce.isascii():
+        raise IdentityError("the nonce must be 1 to 128 ASCII characters")
+    return sig
+
+
+def _decode(text: object, most: int, *, url: bool = False) -> bytes:
+    if not isinstance(text, str) or not text.isascii() or len(text) > most * 4 // 3 + 4:
+        raise IdentityError("the certificate or the signature is no base64 of an allowed length")
+    bare = text.rstrip("=")
+    try:
+        data = base64.b64decode(bare + "=" * (-len(bare) % 4), altchars=b"-_" if url else None, validate=True)
+    except (binascii.Error, ValueError):
+        raise IdentityError("the certificate or the signature is no base64") from None
+    if not 0 < len(data) <= most:
+        raise IdentityError("the certificate or the signature is too long")
+    return data
+
+
+def _parse(der: bytes) -> Any:
+    x509, _ = _cryptography()
+    try:
+        certificate = x509.load_der_x509_certificate(der)
+        certificate.public_key()
+    except Exception as exc:  # noqa: BLE001 - hostile bytes make the parser raise several kinds
+        raise IdentityError(f"the certificate cannot be read: {type(exc).__name__}") from None
+    return certificate
+
+
+def _common_name(certificate: x509.Certificate) -> str:
+    x509, _ = _cryptography()
+    names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
+    if len(names) != 1:
+        raise IdentityError("the certificate must have exactly one common name")
+    try:
+        return identifier("common name", names[0].value)
+    except ValidationError:
+        raise IdentityError("the certificate's common name is no peer id") from None
+
+
+def _algorithm_of(public: Any) -> str:
+    from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa  # noqa: PLC0415 - optional, loaded when used
+
+    if isinstance(public, ed25519.Ed25519PublicKey):
+        return "ed25519"
+    if isinstance(public, ec.EllipticCurvePublicKey):
+        return "ecdsa-sha256"
+    if isinstance(public, rsa.RSAPublicKey):
+        return "rsa-pss-sha256"
+    raise IdentityError("the certificate's key is of no known kind")
+
+
+def _signed_bytes(body: Mapping[str, Any], head: Mapping[str, Any], digest: str) -> bytes:
+    return wire.canonical({"body": body, "sig": {**head, "cert_sha256": digest}})
+
+
+def _make(key: Any, algorithm: str, message: bytes) -> bytes:
+    from cryptography.hazmat.primitives import hashes  # noqa: PLC0415 - optional, loaded when used
+    from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - optional, loaded when used
+
+    if algorithm == "ed25519":
+        signature: bytes = key.sign(message)
+    elif algorithm == "ecdsa-sha256":
+        signature = key.sign(message, ec.ECDSA(hashes.SHA256()))
+    else:
+        signature = key.sign(message, _pss(), hashes.SHA256())
+    return signature
+
+
+def _check(public: Any, algorithm: str, signature: bytes, message: bytes) -> None:
+    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - optional, loaded when used
+    from cryptography.hazmat.primitives import hashes  # noqa: PLC0415 - optional, loaded when used
+    from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - optional, loaded when used
+
+    try:
+        if algorithm == "ed25519":
+            public.verify(signature, message)
+        elif algorithm == "ecdsa-sha256":
+            public.verify(signature, message, ec.ECDSA(hashes.SHA256()))
+        else:
+            public.verify(signature, message, _pss(), hashes.SHA256())
+    except InvalidSignature:
+        raise IdentityError("the signature does not fit the message") from None
+
+
+def _pss() -> Any:
+    from cryptography.hazmat.primitives import hashes  # noqa: PLC0415 - optional, loaded when used
+    from cryptography.hazmat.primitives.asymmetric import padding  # noqa: PLC0415 - optional, loaded when used
+
+    return padding.PSS(mgf=padding.MGF1(hashes.SHA256()), salt_length=SALT_BYTES)
