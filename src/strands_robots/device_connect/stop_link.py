@@ -158,6 +158,7 @@ class NatsStopLink:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._client: Any = None
         self._state = _State(lambda up: None)
+        self._living = threading.Event()
         self._sending: set[asyncio.Future[None]] = set()
         self._quit: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
@@ -168,10 +169,9 @@ class NatsStopLink:
 
     def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
         self._state = _State(on_state)
-        self._loop = asyncio.new_event_loop()
-        self._quit = asyncio.Event()
         self._thread = threading.Thread(target=self._live, args=(events, hear), name="stop-link", daemon=True)
         self._thread.start()
+        self._living.wait()
         _OPEN.add(self)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
@@ -191,36 +191,21 @@ class NatsStopLink:
         _OPEN.discard(self)
 
     def _live(self, events: Collection[str], hear: Hear) -> None:
-        assert self._loop is not None
-        asyncio.set_event_loop(self._loop)
         try:
-            self._loop.run_until_complete(self._serve(events, hear))
+            with asyncio.Runner() as runner:
+                self._loop, self._quit = runner.get_loop(), asyncio.Event()
+                self._living.set()
+                runner.run(self._serve(events, hear, self._quit))
         except Exception:
             logger.critical("The stop lane's NATS link ended.", exc_info=True)
         finally:
+            self._living.set()
             self._state.set(False)
-            self._loop.close()
 
-    async def _serve(self, events: Collection[str], hear: Hear) -> None:
-        assert self._quit is not None
-        while not self._quit.is_set():
+    async def _serve(self, events: Collection[str], hear: Hear, quit_: asyncio.Event) -> None:
+        while not quit_.is_set():
             client = backend_for(self._link)
-            connecting = asyncio.ensure_future(
-                client.connect(servers=[], reconnect_cb=self._back, disconnect_cb=self._lost)
-            )
-            ending = asyncio.ensure_future(self._quit.wait())
-            await asyncio.wait({connecting, ending}, return_when=asyncio.FIRST_COMPLETED)
-            ending.cancel()
-            if not connecting.done():
-                connecting.cancel()
-                await asyncio.gather(connecting, return_exceptions=True)
-                return
-            try:
-                connecting.result()
-            except MessagingError as exc:
-                logger.debug("the stop lane's connection does not open yet: %s", exc)
-                with contextlib.suppress(TimeoutError):  # not asked to end: try again
-                    await asyncio.wait_for(self._quit.wait(), RETRY_S)
+            if not await self._connected(client, quit_):
                 continue
             try:
                 for event in events:
@@ -229,11 +214,29 @@ class NatsStopLink:
                 await client.flush()
                 self._client = client
                 self._state.set(True)
-                await self._quit.wait()
+                await quit_.wait()
             finally:
                 self._client = None
                 self._state.set(False)
                 await client.close()
+
+    async def _connected(self, client: Any, quit_: asyncio.Event) -> bool:
+        """Try once, as long as the link is wanted; False after a pause when it did not come up."""
+        trying = asyncio.ensure_future(client.connect(servers=[], reconnect_cb=self._back, disconnect_cb=self._lost))
+        ending = asyncio.ensure_future(quit_.wait())
+        await asyncio.wait({trying, ending}, return_when=asyncio.FIRST_COMPLETED)
+        ending.cancel()
+        if not trying.done():
+            trying.cancel()
+        outcome: list[object] = await asyncio.gather(trying, return_exceptions=True)
+        problem = outcome[0]
+        if isinstance(problem, MessagingError):
+            logger.debug("the stop lane's connection does not open yet: %s", problem)
+            with contextlib.suppress(TimeoutError):  # not asked to end: try again
+                await asyncio.wait_for(quit_.wait(), RETRY_S)
+        elif isinstance(problem, Exception):
+            raise problem
+        return problem is None
 
     async def _back(self) -> None:
         self._state.set(True)

@@ -149,11 +149,16 @@ def test_malformed_oversized_late_and_early_stops_stop_and_the_audit_says_so(
     site, listener = open_site("arm-1")
     robot = site.robots["arm-1"]
     before = len(robot.halts)
-    listener.send("safety-1", raw=b"\xff not json")
-    listener.send("safety-1", raw=b"x" * 200_000)
-    listener.send("safety-1", t=time.time() - 3600)
-    listener.send("safety-1", t=time.time() + 3600)
-    eventually(lambda: len(robot.halts) == before + 4)
+    late, early = new_epoch(), new_epoch()
+
+    def four() -> bool:
+        listener.send("safety-1", raw=b"\xff not json")
+        listener.send("safety-1", raw=b"x" * 200_000)
+        listener.send("safety-1", estop_id=late, t=time.time() - 3600)
+        listener.send("safety-1", estop_id=early, t=time.time() + 3600)
+        return len(robot.halts) >= before + 4
+
+    eventually(four)
     assert len(site.entries[0].epochs) == 4
     eventually(
         lambda: (
