@@ -31,20 +31,16 @@ from .config import LinkConfig
 from .dispatch import CommandDesk, Inbox, OrderedFeed
 from .errors import NoResponderError
 from .threads import on_a_thread
+from .zenoh_ask import LARGE_BYTES, ask
 from .zenoh_intake import Handle, Intake
 
 logger = logging.getLogger(__name__)
-
-LARGE_BYTES = 2**16
-"""From here on, which is more than one batch, a message goes out on a thread: it may wait for room."""
 
 REPLY_TTL_S = 60.0
 """Seconds a query outside a command waits for its reply before it is given up."""
 
 _REPLY = "_strands_reply/"
 
-# A queue of its own beside telemetry. Not express: each express message takes a whole batch of that queue.
-_CALL = {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
 _EVENT = {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA}
 
 
@@ -162,10 +158,14 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             NotConnectedError: closed, or a client without its router.
         """
         deadline = time.monotonic() + timeout
-        tries = self._tries if self._link.is_peer else 1
-        for left in reversed(range(tries)):
-            remaining = deadline - time.monotonic()
-            answer = await self._ask(key_of(subject), data, max(remaining, 0.001), subject, timeout)
+        for left in reversed(range(self._tries if self._link.is_peer else 1)):
+            shared, inbox = self._session(), self._inbox
+            remaining = max(deadline - time.monotonic(), 0.001)
+            assert inbox is not None
+            try:
+                answer = await ask(shared.session, inbox, key_of(subject), data, remaining, of_peers=self._link.is_peer)
+            except RequestTimeoutError as error:
+                raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
             if answer is not None:
                 return answer
             if left == 0 or deadline - time.monotonic() <= self._retry_delay:
@@ -209,57 +209,6 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
         if self._shared is None or not self._shared.linked:
             raise NotConnectedError("closed" if self._closed else "not connected to Zenoh")
         return self._shared
-
-    async def _ask(self, key: str, data: bytes, remaining: float, subject: str, patience: float) -> bytes | None:
-        shared, inbox = self._session(), self._inbox
-        assert inbox is not None
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[bytes | None] = loop.create_future()
-        failure: list[str] = []
-
-        def on_deadline() -> None:
-            failure.append("Timeout")
-            _settle(future, None)
-
-        def on_reply(reply: Any) -> None:
-            if reply.ok is not None:
-                inbox.put(_settle, future, reply.ok.payload.to_bytes())
-            else:
-                failure.append(reply.err.payload.to_bytes()[:200].decode(errors="replace"))
-
-        token: Any = zenoh.CancellationToken()
-        options: dict[str, Any] = dict(_CALL)
-        if self._link.is_peer:
-            options["target"] = zenoh.QueryTarget.ALL
-        options["consolidation"] = zenoh.ConsolidationMode.NONE
-        get = partial(
-            shared.session.get,
-            key,
-            sessions.direct(on_reply, partial(inbox.put, _settle, future, None)),
-            payload=data,
-            timeout=remaining,
-            cancellation_token=token,
-            **options,
-        )
-        # Zenoh keeps the deadline itself; this is for the case that it does not.
-        deadline = loop.call_later(remaining + 0.05, on_deadline)
-        try:
-            if len(data) < LARGE_BYTES:
-                get()
-            else:
-                await on_a_thread(get)
-            answer = await future
-        except zenoh.ZError as error:
-            raise PublishError(f"cannot ask {subject}: {error}") from error
-        finally:
-            deadline.cancel()
-            if failure or future.cancelled():
-                token.cancel()
-        if answer is None and "Timeout" in failure:
-            raise RequestTimeoutError(f"no reply on {subject} within {patience:g} s")
-        if answer is None and failure:
-            raise PublishError(f"{subject} refused: {failure[-1]}")
-        return answer
 
     def _declare(
         self,
@@ -346,8 +295,3 @@ def answer_query(query: Any, data: bytes) -> None:
     with contextlib.suppress(zenoh.ZError):  # the caller's link is gone; nobody is left to tell
         query.reply(query.key_expr, data)
     query.drop()
-
-
-def _settle(future: asyncio.Future[bytes | None], value: bytes | None) -> None:
-    if not future.done():
-        future.set_result(value)
