@@ -163,6 +163,12 @@ class FleetClient:
         """
         return self._wait(self._call(device, function, dict(params or {}), timeout), timeout + 3.0)
 
+    def request(self, device: str, data: bytes, timeout: float = 10.0) -> bytes:
+        """Send bytes as they are on a device's command topic; its reply, as it is. Raises :class:`MessagingError`."""
+        subject = self._subject(f"{device_id('device', device)}.cmd")
+        reply: bytes = self._wait(self._messaging.request(subject, data, timeout=timeout), timeout + 1.0)
+        return reply
+
     def events(
         self, device: str = "*", timeout: float | None = None, ready: threading.Event | None = None
     ) -> Generator[Event, None, None]:

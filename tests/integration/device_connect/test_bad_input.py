@@ -1,0 +1,159 @@
+"""Whatever is sent to a live device: a clear refusal, no motion, no dead handler."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import psutil
+import pytest
+from fixtures.toy_robots import ToyRobot, ToyWorld
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.device_connect.client import CallRefusedError
+
+BAD_TEXT: list[Any] = ["", " ", "x" * 2001, "a\u0000b", "\n", None, 5, True, [], {}, ["x"]]
+BAD_NUMBER: list[Any] = [0, -1, True, "5", None, [], {}, 10**400]
+ARGUMENTS: dict[str, dict[str, dict[str, list[Any]]]] = {
+    "sim-1": {
+        "execute": {
+            "instruction": BAD_TEXT,
+            "policy_provider": [*BAD_TEXT, "a b", "../x", "no_such"],
+            "duration": [*BAD_NUMBER, 3601],
+            "robot_name": ["nobody", "x" * 200, "\u0007", 5, True, None, []],
+        },
+        "step": {"n_steps": [*BAD_NUMBER, 1.5, 100_001]},
+    },
+    "metal-1": {
+        "execute": {
+            "instruction": BAD_TEXT,
+            "policy_provider": [*BAD_TEXT, "a b", "no_such"],
+            "duration": [*BAD_NUMBER, 3601],
+            "policy_port": [-1, 65536, 1.5, True, "80", None, [], 10**400],
+        },
+    },
+}
+CASES = [
+    (device, function, name, value)
+    for device, functions in ARGUMENTS.items()
+    for function, names in functions.items()
+    for name, values in names.items()
+    for value in values
+]
+NO_ARGUMENTS = {"sim-1": ["stop", "getStatus", "getFeatures", "reset"], "metal-1": ["stop", "getStatus", "getState"]}
+
+
+class Site:
+    def __init__(self) -> None:
+        link = loopback_config(free_port())
+        self.world, self.robot = ToyWorld(), ToyRobot()
+        self.runtimes = [
+            init_device_connect_sync(self.world, peer_id="sim-1", link=link),
+            init_device_connect_sync(self.robot, peer_id="metal-1", link=link),
+        ]
+        self.fleet = FleetClient(link, "tester").__enter__()
+
+    def raw(self, device: str, data: bytes, within: float = 5.0) -> dict[str, Any]:
+        """Send ``data`` as it is on a device's command topic; the decoded reply."""
+        return json.loads(self.fleet.request(device, data, within))  # type: ignore[no-any-return]
+
+    def refusal(self, device: str, function: str, params: dict[str, Any]) -> str:
+        """Why the device refused, in its envelope or in JSON-RPC's own error."""
+        try:
+            answer = self.fleet.call(device, function, params)
+        except CallRefusedError as exc:
+            return str(exc)
+        assert answer["status"] == "error"
+        return str(answer["reason"])
+
+    @property
+    def moving(self) -> bool:
+        return bool(self.world.rollouts or self.robot.rollouts)
+
+    def close(self) -> None:
+        self.fleet.close()
+        for runtime in self.runtimes:
+            stop_device_connect(runtime)
+        self.world.close()
+        self.robot.close()
+
+
+@pytest.fixture(scope="module")
+def site() -> Iterator[Site]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
+        patch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "execute")
+        made = Site()
+        yield made
+        made.close()
+
+
+@pytest.fixture(autouse=True)
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
+    monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "execute")
+
+
+@pytest.mark.parametrize(("device", "function", "name", "value"), CASES)
+def test_an_argument_out_of_its_domain_is_refused(
+    site: Site, device: str, function: str, name: str, value: Any
+) -> None:
+    base = {"instruction": "wave"} if function == "execute" else {}
+    answer = site.fleet.call(device, function, {**base, name: value})
+    assert answer["status"] == "error"
+    assert name in answer["reason"] or "policy" in answer["reason"]
+    assert not site.moving
+
+
+@pytest.mark.parametrize("word", ["NaN", "Infinity", "-Infinity", "1e999", "[" * 10_000 + "]" * 10_000])
+def test_what_is_no_json_number_or_value_never_moves(site: Site, word: str) -> None:
+    request = (
+        '{"jsonrpc":"2.0","id":"1","method":"execute","params":{"instruction":"wave","duration":'
+        + word
+        + ',"_dc_meta":{"source_device":"tester"}}}'
+    )
+    answer = site.raw("sim-1", request.encode())
+    assert "error" in answer or answer["result"]["status"] == "error"
+    assert not site.moving
+
+
+@pytest.mark.parametrize("device", ["sim-1", "metal-1"])
+@pytest.mark.parametrize("params", [{"extra": 1}, {"self": 1}, {"function_name": "x"}, {"instruction": "wave", "x": 1}])
+def test_extra_parameters_are_refused_on_every_function(site: Site, device: str, params: dict[str, Any]) -> None:
+    for function in [*NO_ARGUMENTS[device], "execute"]:
+        assert "takes" in site.refusal(device, function, params)
+    assert not site.moving
+
+
+def test_a_missing_parameter_is_refused_by_name(site: Site) -> None:
+    assert "instruction" in site.fleet.call("sim-1", "execute")["reason"]
+
+
+@pytest.mark.parametrize("source", [None, "", 5, [], {}, {"name": "tester"}, "x" * 300, "tester\u0000"])
+def test_a_caller_whose_name_is_no_name_does_not_move(site: Site, source: Any) -> None:
+    request = {
+        "jsonrpc": "2.0",
+        "id": "1",
+        "method": "execute",
+        "params": {"instruction": "wave", "_dc_meta": {"source_device": source}},
+    }
+    answer = site.raw("sim-1", json.dumps(request).encode())
+    assert "error" in answer or answer["result"]["status"] == "error"
+    assert not site.moving
+
+
+def test_ten_megabytes_are_refused_and_given_back(site: Site) -> None:
+    me = psutil.Process()
+    site.refusal("sim-1", "execute", {"instruction": "x" * 10_000_000})
+    before = me.memory_info().rss
+    for _ in range(5):
+        assert len(site.refusal("sim-1", "execute", {"instruction": "x" * 10_000_000})) < 500
+    eventually(lambda: me.memory_info().rss < before + 40_000_000)
+
+
+def test_the_devices_answer_and_move_after_all_that(site: Site) -> None:
+    for device in ("sim-1", "metal-1"):
+        assert site.fleet.call(device, "execute", {"instruction": "wave", "duration": 5})["status"] == "success"
+        assert site.fleet.stop(device)["status"] == "success"

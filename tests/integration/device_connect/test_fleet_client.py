@@ -1,0 +1,203 @@
+"""The fleet as the command line sees it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from device_connect_edge.drivers import DeviceDriver, rpc
+from fixtures.nats_server import NatsServer
+from fixtures.toy_robots import ToyWorld
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.device_connect import (
+    FleetClient,
+    LinkConfig,
+    init_device_connect_sync,
+    loopback_config,
+    stop_device_connect,
+)
+from strands_robots.device_connect.client import CallRefusedError, Event, NoAnswerError, NoSuchDeviceError
+from strands_robots.utils import ValidationError
+
+
+@pytest.fixture
+def link(monkeypatch: pytest.MonkeyPatch) -> LinkConfig:
+    monkeypatch.delenv("DEVICE_CONNECT_RPC_ALLOW", raising=False)
+    return loopback_config(free_port())
+
+
+@pytest.fixture
+def fleet(link: LinkConfig) -> Iterator[FleetClient]:
+    with FleetClient(link, "tester") as client:
+        yield client
+
+
+@pytest.fixture
+def worlds(link: LinkConfig) -> Iterator[dict[str, ToyWorld]]:
+    made = {name: ToyWorld(name) for name in ("arm-1", "arm-2", "arm-3")}
+    runtimes = [init_device_connect_sync(world, peer_id=name, link=link) for name, world in made.items()]
+    yield made
+    for runtime in runtimes:
+        stop_device_connect(runtime)
+    for world in made.values():
+        world.close()
+
+
+class Stubborn(DeviceDriver):  # type: ignore[misc]
+    """A device that refuses to stop, and one function that never answers."""
+
+    device_type = "stubborn"
+
+    @rpc()
+    async def stop(self) -> dict[str, Any]:
+        """Stop."""
+        return {"status": "error", "stopped": False, "reason": "no brakes"}
+
+    @rpc()
+    async def think(self) -> dict[str, Any]:
+        """Think."""
+        await __import__("asyncio").sleep(60)
+        return {}
+
+
+class Head(DeviceDriver):  # type: ignore[misc]
+    """A device whose stop is called stopMotion."""
+
+    device_type = "head"
+    stopped = 0
+
+    @rpc()
+    async def stopMotion(self) -> dict[str, Any]:
+        """Stop."""
+        self.stopped += 1
+        return {"status": "success"}
+
+
+def test_the_first_look_is_complete(link: LinkConfig, worlds: dict[str, ToyWorld]) -> None:
+    for _ in range(3):
+        with FleetClient(link) as fresh:
+            assert [peer.id for peer in fresh.peers()] == ["arm-1", "arm-2", "arm-3"]
+
+
+def test_a_peer_says_what_it_is_and_what_it_can(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+    peer = fleet.peers()[0]
+    assert (peer.id, peer.type, peer.model) == ("arm-1", "strands_sim", "arm-1")
+    assert peer.status["availability"] == "idle"
+    assert "execute" in {function["name"] for function in peer.functions}
+    assert "policyComplete" in peer.events
+
+
+def test_a_call_names_its_caller(fleet: FleetClient, worlds: dict[str, ToyWorld], monkeypatch: Any) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
+    assert fleet.call("arm-1", "execute", {"instruction": "wave"})["robot_name"] == "left"
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "somebody-else")
+    assert "tester" in fleet.call("arm-1", "execute", {"instruction": "wave"})["reason"]
+
+
+def test_nobody_there_and_no_answer_are_two_things(fleet: FleetClient, link: LinkConfig) -> None:
+    began = time.monotonic()
+    with pytest.raises(NoSuchDeviceError, match="arm-9"):
+        fleet.call("arm-9", "getStatus", timeout=20)
+    assert time.monotonic() - began < 5
+    runtime = init_device_connect_sync(Stubborn(), peer_id="thinker", link=link)
+    with pytest.raises(NoAnswerError, match="thinker"):
+        fleet.call("thinker", "think", timeout=0.3)
+    stop_device_connect(runtime)
+
+
+def test_an_unknown_function_is_a_refusal_with_its_code(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+    with pytest.raises(CallRefusedError) as refused:
+        fleet.call("arm-1", "fly")
+    assert refused.value.code == -32601
+
+
+@pytest.mark.parametrize("device", ["", "a.b", "*", "a/b", "x" * 200])
+def test_an_id_out_of_domain_is_refused_before_it_is_sent(fleet: FleetClient, device: str) -> None:
+    with pytest.raises(ValidationError, match="device"):
+        fleet.call(device, "getStatus")
+
+
+def test_events_come_as_they_happen(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+    heard: list[Event] = []
+    with fleet.subscription("arm-2", heard.append):
+        fleet.call("arm-2", "execute", {"instruction": "wave", "duration": 0.3})
+        eventually(lambda: any(event.name == "policyComplete" for event in heard))
+    assert {event.device for event in heard} == {"arm-2"}
+    steps = [event.payload["step"] for event in heard if event.name == "streamStep"]
+    assert steps == sorted(steps)
+    count = len(heard)
+    time.sleep(0.3)
+    assert len(heard) == count
+
+
+def test_events_of_the_fleet_can_be_walked_through(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+    seen: set[str] = set()
+    ready = threading.Event()
+    for event in fleet.events("*", timeout=3, ready=ready):
+        assert ready.is_set()
+        seen.add(event.device)
+        if len(seen) == 3:
+            break
+    assert seen == set(worlds)
+
+
+def test_stop_is_true_only_for_an_affirmative_answer(
+    fleet: FleetClient, link: LinkConfig, worlds: dict[str, ToyWorld]
+) -> None:
+    fleet.call("arm-1", "execute", {"instruction": "wave"})
+    assert fleet.stop("arm-1")["stopped"] == ["left"]
+    head = Head()
+    runtimes = [
+        init_device_connect_sync(Stubborn(), peer_id="stubborn", link=link),
+        init_device_connect_sync(head, peer_id="head", link=link),
+    ]
+    assert fleet.stop("stubborn")["status"] == "error"
+    assert fleet.stop("head")["status"] == "success"
+    assert fleet.stop("nobody")["status"] == "error"
+    fleet.call("arm-2", "execute", {"instruction": "wave"})
+    answers = fleet.stop_all()
+    assert set(answers) == {"arm-1", "arm-2", "arm-3", "stubborn", "head"}
+    assert {name for name, answer in answers.items() if answer["status"] != "success"} == {"stubborn"}
+    assert not worlds["arm-2"].rollouts["left"].running
+    assert head.stopped == 2
+    for runtime in runtimes:
+        stop_device_connect(runtime)
+
+
+def test_no_network_is_an_error_within_its_deadline() -> None:
+    nobody = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=0.5)
+    began = time.monotonic()
+    with pytest.raises(Exception, match=r"127\.0\.0\.1"), FleetClient(nobody):
+        pass
+    assert time.monotonic() - began < 3
+    eventually(lambda: not any(t.name == "fleet-client" for t in threading.enumerate()))
+
+
+def test_the_same_over_nats(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DEVICE_CONNECT_RPC_ALLOW", raising=False)
+    with NatsServer() as server:
+        link = LinkConfig(transport="nats", connect=(server.url,))
+        world = ToyWorld()
+        runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
+        with FleetClient(link) as fleet:
+            assert [peer.id for peer in fleet.peers()] == ["arm-1"]
+            assert fleet.call("arm-1", "execute", {"instruction": "wave"})["status"] == "success"
+            assert fleet.stop("arm-1")["stopped"] == ["left"]
+            with pytest.raises(NoSuchDeviceError):
+                fleet.call("arm-2", "stop")
+            server.kill()
+            server.start()
+            eventually(lambda: answers(fleet), within=5)
+        stop_device_connect(runtime)
+        world.close()
+
+
+def answers(fleet: FleetClient) -> bool:
+    try:
+        return fleet.call("arm-1", "getStatus", timeout=1)["status"] == "success"
+    except Exception:  # noqa: BLE001 - any failure means not yet
+        return False
