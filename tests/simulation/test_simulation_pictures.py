@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -153,3 +156,48 @@ def test_without_opengl_the_error_names_the_packages_and_a_picture_is_still_made
     picture, how = world.picture("overview", 64, 48)
     assert how == "projection"
     assert picture.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("libraries", "chosen"), [(("egl", "osmesa"), "egl"), (("osmesa",), "osmesa"), ((), "disable")]
+)
+def test_without_a_display_the_library_that_is_there_is_chosen(
+    monkeypatch: pytest.MonkeyPatch, libraries: tuple[str, ...], chosen: str
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(gl, "loads", lambda backend: backend in libraries)
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    gl.prepare.cache_clear()
+    try:
+        assert gl.prepare() == chosen
+    finally:
+        gl.prepare.cache_clear()
+
+
+@pytest.mark.parametrize("asked", ["egl", "osmesa", "glfw"])
+def test_a_backend_that_was_asked_for_and_cannot_load_leaves_physics_alone(
+    monkeypatch: pytest.MonkeyPatch, asked: str
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", asked)
+    monkeypatch.setattr(gl, "loads", lambda backend: False)
+    gl.prepare.cache_clear()
+    try:
+        assert gl.prepare() == ("glfw" if asked == "glfw" else "disable")
+    finally:
+        gl.prepare.cache_clear()
+
+
+def test_a_world_without_opengl_is_stepped_and_projected() -> None:
+    code = (
+        "from strands_robots.simulation import Simulation\n"
+        "s = Simulation(); s.add_robot('so100'); s.step(10); print(s.picture('overview', 64, 48)[1])"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ran.stdout == "projection\n"

@@ -282,3 +282,15 @@ def test_a_leader_does_not_take_a_robot_from_a_policy(world: Simulation) -> None
     assert world.stop_teleoperate("script")["stopped"] is True
     world.cleanup()
     assert not [t.name for t in threading.enumerate() if t.name.startswith(("rollout", "simulation"))]
+
+
+def test_a_single_action_does_not_fight_a_policy(world: Simulation) -> None:
+    world.start_policy("left", "wave")
+    assert "left is driven by the policy" in world.send_action({"gripper": 1.0}, "left")["reason"]
+    assert world.send_action({"gripper": 1.0}, "right")["status"] == "success"
+
+
+def test_a_cleaned_up_world_follows_no_leader(world: Simulation) -> None:
+    world.attach_teleop(Script(), "script")
+    world.cleanup()
+    assert "cleaned up" in world.teleoperate("script")["reason"]

@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.envelope import Envelope, success
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import PermitVoidError
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.simulation.arguments import STEPS_MAX, answered
@@ -18,6 +18,13 @@ from strands_robots.simulation.views import camera_names
 from strands_robots.utils import ValidationError, flag, text, whole
 
 logger = logging.getLogger(__name__)
+
+
+class _Closed:
+    """The latch of a world that is gone."""
+
+    def refusal(self, verb: str) -> Envelope:
+        return error(f"{verb} is refused: this simulation was cleaned up; make a new one.")
 
 
 class Simulation(Rollouts):
@@ -62,6 +69,7 @@ class Simulation(Rollouts):
         self._open()
         body = self.body(robot_name)
         permit = self.gate.permit("send_action")
+        self._idle(body.name)
         try:
             sent = body.send_action(action, permit)
         except PermitVoidError as void:
@@ -155,8 +163,10 @@ class Simulation(Rollouts):
         """Halt, stop the clock and free the pictures. A second call does nothing."""
         if self._closed:
             return success("Already cleaned up.")
+        with self.starting:
+            self._closed = True
+            self.gate.attach(_Closed())
         verdict = self.halt("cleanup")
-        self._closed = True
         self._clock.close()
         self._close_pictures()
         return verdict.envelope()
