@@ -1,0 +1,128 @@
+"""A real MuJoCo simulation on the network, from discovery to the stop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.device_connect import (
+    FleetClient,
+    LinkConfig,
+    SimulationDeviceDriver,
+    init_device_connect_sync,
+    loopback_config,
+    stop_device_connect,
+)
+from strands_robots.device_connect.bringup import driver_for
+from strands_robots.device_connect.client import Event
+from strands_robots.simulation import Simulation
+
+
+@pytest.fixture(scope="module")
+def link() -> LinkConfig:
+    return loopback_config(free_port())
+
+
+@pytest.fixture(scope="module")
+def sim(link: LinkConfig) -> Iterator[Simulation]:
+    world = Simulation()
+    world.create_world()
+    world.add_robot("left", "so100")
+    world.add_robot("right", "so100")
+    runtime = init_device_connect_sync(world, peer_id="sim-1", link=link)
+    yield world
+    stop_device_connect(runtime)
+    world.cleanup()
+
+
+@pytest.fixture
+def fleet(link: LinkConfig, sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[FleetClient]:
+    monkeypatch.delenv("DEVICE_CONNECT_RPC_ALLOW", raising=False)
+    with FleetClient(link, "tester") as client:
+        yield client
+        client.stop("sim-1")
+
+
+def test_the_simulation_is_served_as_one_whatever_the_peer_type(sim: Simulation) -> None:
+    assert isinstance(driver_for(sim, "robot"), SimulationDeviceDriver)
+
+
+def test_its_features_and_state_reach_a_caller(fleet: FleetClient) -> None:
+    features = fleet.call("sim-1", "getFeatures")
+    assert features["status"] == "success"
+    assert "left" in str(features)
+    state = fleet.call("sim-1", "getStatus")
+    assert set(state["robots"]) == {"left", "right"}
+    assert state["running_policies"] == {} or state["running_policies"] == []
+
+
+def test_physics_is_stepped_and_reset_by_hand(fleet: FleetClient) -> None:
+    before = fleet.call("sim-1", "getStatus")["step_count"]
+    assert fleet.call("sim-1", "step", {"n_steps": 10})["status"] == "success"
+    assert fleet.call("sim-1", "getStatus")["step_count"] == before + 10
+    assert fleet.call("sim-1", "reset")["status"] == "success"
+    assert fleet.call("sim-1", "getStatus")["sim_time"] == pytest.approx(0.0, abs=0.1)
+
+
+def test_an_arm_moves_and_stands_still_after_the_stop(fleet: FleetClient, sim: Simulation) -> None:
+    heard: list[Event] = []
+    with fleet.subscription("sim-1", heard.append):
+        answer = fleet.call("sim-1", "execute", {"instruction": "wave", "duration": 20})
+        assert answer["status"] == "success", answer
+        assert answer["robot_name"] == "left"
+        start = joints(fleet)
+        eventually(lambda: far(joints(fleet), start) > 0.02)
+        assert "stop that first" in fleet.call("sim-1", "execute", {"instruction": "again"})["reason"]
+        began = time.monotonic()
+        stopped = fleet.stop("sim-1")
+        took = time.monotonic() - began
+        assert stopped["status"] == "success", stopped
+        assert stopped["stopped"] == ["left"]
+        assert stopped["not_stopped"] == []
+        assert took < 1.0
+        eventually(lambda: any(event.name == "policyComplete" for event in heard))
+    names = {event.name for event in heard}
+    assert {"policyStarted", "streamStep", "stateUpdate", "observationUpdate", "policyComplete"} <= names
+    complete = next(event.payload for event in heard if event.name == "policyComplete")
+    assert (complete["robot_name"], complete["state"]) == ("left", "stopped")
+    steps = [event.payload for event in heard if event.name == "streamStep"]
+    assert [step["step"] for step in steps] == sorted(step["step"] for step in steps)
+    assert all(
+        isinstance(v, float) for step in steps for v in (*step["observation"].values(), *step["action"].values())
+    )
+    assert sim.list_policies_running() == []
+
+
+def test_two_robots_move_at_once_and_one_stop_halts_both(fleet: FleetClient) -> None:
+    for name in ("left", "right"):
+        answer = fleet.call("sim-1", "execute", {"instruction": "wave", "robot_name": name, "duration": 20})
+        assert answer["status"] == "success", answer
+    assert sorted(fleet.stop("sim-1")["stopped"]) == ["left", "right"]
+
+
+def test_nothing_is_lost_of_a_stream(fleet: FleetClient) -> None:
+    heard: list[Event] = []
+    with fleet.subscription("sim-1", heard.append):
+        fleet.call("sim-1", "execute", {"instruction": "wave", "duration": 3})
+        eventually(lambda: any(event.name == "policyComplete" for event in heard), within=20)
+    complete = next(event.payload for event in heard if event.name == "policyComplete")
+    steps = [event.payload["step"] for event in heard if event.name == "streamStep"]
+    assert complete["state"] == "completed"
+    assert len(steps) == len(set(steps))
+    assert abs(len(steps) - complete["steps"]) <= 1
+
+
+def joints(fleet: FleetClient) -> dict[str, float]:
+    from strands_robots.device_connect.wire import numbers  # noqa: PLC0415 - beside its only use
+
+    robots: dict[str, Any] = fleet.call("sim-1", "getStatus")["robots"]
+    return numbers(robots["left"].get("joints", robots["left"]))
+
+
+def far(now: dict[str, float], then: dict[str, float]) -> float:
+    assert now
+    return max(abs(now[name] - then[name]) for name in now)
