@@ -16,6 +16,7 @@ from typing import Any, Protocol, runtime_checkable
 from strands_robots.drivers.reachy.envelope import Target
 from strands_robots.drivers.reachy.feed import Sink
 from strands_robots.drivers.reachy.rest import CONNECT_S, DaemonUnreachable, checked_host, dialled
+from strands_robots.drivers.reachy.websocket import open_socket
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
 
 logger = logging.getLogger(__name__)
@@ -66,30 +67,19 @@ class WebSocketLink:
         self._host, self._port = checked_host(host), api_port
         self._full_target, self._can_stop = full_target, can_stop
         self._socket: Any = None
+        self._stack = contextlib.ExitStack()
         self._gone = threading.Event()
 
     def open(self, sink: Sink) -> None:
-        try:
-            from websockets.exceptions import WebSocketException  # noqa: PLC0415 - optional, loaded by the first link
-            from websockets.sync.client import connect  # noqa: PLC0415
-        except ImportError as exc:
-            raise missing_extra("Reachy Mini", "reachy") from exc
-        url = f"ws://{dialled(self._host)}:{self._port}/ws/sdk"
-        try:
-            # No compression: a frame of 300 bytes costs more to inflate than to carry. No keepalive: data is the sign.
-            self._socket = connect(
-                url, compression=None, ping_interval=None, open_timeout=CONNECT_S, close_timeout=0.5, proxy=None
-            )
-        except (OSError, WebSocketException, TimeoutError) as exc:
-            raise DaemonUnreachable(f"{url} did not open: {exc}.") from exc
+        self._stack = contextlib.ExitStack()
+        self._socket = open_socket(self._stack, self._host, self._port, "/ws/sdk")
         self._gone.clear()
         threading.Thread(target=self._read, args=(self._socket, sink), name="reachy-link", daemon=True).start()
 
     def close(self) -> None:
         self._gone.set()
-        current, self._socket = self._socket, None
-        if current is not None:
-            current.close()
+        self._socket = None
+        self._stack.close()
 
     @property
     def closed(self) -> bool:

@@ -15,11 +15,13 @@ from dataclasses import dataclass, field
 
 from strands_robots import settings
 from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
-from strands_robots.drivers.reachy.connection import RUNNING_PATH, Connection, running_moves
+from strands_robots.drivers.reachy.connection import Connection
 from strands_robots.drivers.reachy.envelope import STREAM_HZ, Target
 from strands_robots.drivers.reachy.gestures import Frames, Gesture, ramp
+from strands_robots.drivers.reachy.moves import DaemonMoves
 from strands_robots.drivers.reachy.pose import HeadPose
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonFault, DaemonUnreachable
+from strands_robots.drivers.reachy.updates import End, MoveUpdates
 from strands_robots.envelope import error, success
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.safety.stopping import StopVerdict, halt_each
@@ -27,7 +29,6 @@ from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
 
-STOP_PATH = "/api/move/stop"
 FRAME_S = 1 / STREAM_HZ
 POLL_S = 0.1
 REST_MOVE_LONGEST_S = 600.0
@@ -69,6 +70,7 @@ class Motions:
 
     def __init__(self, connection: Connection, gate: MotionGate, robot: str, *, automatic_body_yaw: bool) -> None:
         self._connection, self._gate, self._robot = connection, gate, robot
+        self._moves = DaemonMoves(connection)
         self._automatic_body_yaw = automatic_body_yaw
         self._turn = threading.Lock()
         self._write = threading.Lock()
@@ -139,12 +141,16 @@ class Motions:
         """
         with self._turn:
             motion = self._begin(name, of_daemon=True, limp=before is not None)
+            updates = None
             try:
+                updates = MoveUpdates(self._connection.host, self._connection.port)
                 if before is not None:
                     before()
                 motion.still_permitted()
                 motion.uuid = _uuid(path, self._connection.rest.post(path))
             except Exception as exc:
+                if updates is not None:
+                    updates.close()
                 motion.posted.set()
                 self._end(motion, "error", str(exc))
                 raise
@@ -153,10 +159,13 @@ class Motions:
             try:
                 motion.still_permitted()
             except MotionRefused:
-                self._stop_move(motion.uuid, time.monotonic() + 1.0)
+                updates.close()
+                self._moves.stop(motion.uuid, time.monotonic() + 1.0)
                 self._end(motion, "stopped")
                 raise
-            threading.Thread(target=self._watch, args=(motion, reached), name="reachy-move", daemon=True).start()
+            threading.Thread(
+                target=self._watch, args=(motion, updates, reached), name="reachy-move", daemon=True
+            ).start()
             return motion.uuid
 
     def torque(self, change: Callable[[], None], name: str) -> None:
@@ -194,7 +203,7 @@ class Motions:
     def moving(self) -> bool:
         """A motion of ours runs, or the daemon plays a move, by its own word now. Raises :class:`DaemonError`."""
         motion = self._current
-        return (motion is not None and motion.running) or bool(self._running(time.monotonic() + 1.0))
+        return (motion is not None and motion.running) or bool(self._moves.running(time.monotonic() + 1.0))
 
     def _begin(self, name: str, *, of_daemon: bool = False, limp: bool = False) -> Motion:
         """The next motion, once nothing else of this robot moves. The turn is held."""
@@ -231,7 +240,7 @@ class Motions:
             else:
                 moves.discard(before.uuid)
         for uuid in moves:
-            self._stop_move(uuid, time.monotonic() + 2.0)
+            self._moves.stop(uuid, time.monotonic() + 2.0)
             self._forget()
         if before is not None and ours and not before.done.wait(2.0):
             raise MotionRefused(error(f"{name} refused: {before.name} did not end.", running=before.name))
@@ -316,34 +325,28 @@ class Motions:
 
     # The daemon's moves.
 
-    def _watch(self, motion: Motion, reached: Reached) -> None:
+    def _watch(self, motion: Motion, updates: MoveUpdates, reached: Reached) -> None:
         """Follow a move of the daemon to its end, and look whether it arrived: its word `completed` proves nothing."""
+        end: End | None = None
         deadline = time.monotonic() + REST_MOVE_LONGEST_S
-        while not motion.cancelled.wait(POLL_S) and time.monotonic() < deadline:
-            try:
-                if motion.uuid not in running_moves(self._connection.rest.get(RUNNING_PATH)):
-                    # Joints come at 37 to 50 Hz: a tenth of a second later they show the end.
-                    motion.cancelled.wait(POLL_S)
-                    if not motion.cancelled.is_set():
-                        why = reached()
-                        self._end(motion, "error" if why else "completed", why)
-                        return
-                    break
-            except (DaemonError, ValidationError) as exc:
-                self._end(motion, "unknown", str(exc))
-                return
-        self._end(motion, "stopped" if motion.cancelled.is_set() else "unknown")
-
-    def _stop_move(self, uuid: str, deadline: float) -> None:
-        """Stop one move of the daemon; a move that has ended meanwhile is answered with a bare 500."""
         try:
-            self._connection.stop_rest.post(STOP_PATH, {"uuid": uuid}, deadline - time.monotonic())
-        except DaemonFault:
-            if uuid in self._running(deadline):
-                raise
-
-    def _running(self, deadline: float) -> frozenset[str]:
-        return running_moves(self._connection.stop_rest.get(RUNNING_PATH, deadline - time.monotonic()))
+            while end is None and not motion.cancelled.is_set() and time.monotonic() < deadline:
+                end = updates.wait(motion.uuid, POLL_S)
+            if end is not None and end.state == "completed":
+                # Joints come at 37 to 50 Hz: a tenth of a second later they show the end.
+                motion.cancelled.wait(POLL_S)
+                why = reached()
+                end = End("error", why) if why else end
+        except (DaemonError, ValidationError) as exc:
+            end = End("unknown", str(exc))
+        finally:
+            updates.close()
+        if motion.cancelled.is_set():
+            self._end(motion, "stopped")
+        elif end is None:
+            self._end(motion, "unknown", f"no end was told in {REST_MOVE_LONGEST_S:g} s")
+        else:
+            self._end(motion, end.state, end.detail or ("somebody else stopped it" if end.state == "stopped" else ""))
 
     def _still(self, motion: Motion | None, deadline: float) -> object:
         """After this no frame of a permit given before reaches the link. None when nothing was streaming."""
@@ -360,21 +363,13 @@ class Motions:
         if self._connection.connects == 0 and (motion is None or not motion.of_daemon):
             # Never connected: nothing was ever asked of this daemon.
             return None
-        ours = {motion.uuid} if motion is not None and motion.uuid else set()
-        for uuid in ours:
-            self._stop_move(uuid, deadline)
-        others = self._running(deadline) - ours
-        for uuid in others:
-            self._stop_move(uuid, deadline)
-        if self._connection.alive:
-            self._connection.link().stop_move()
-        if not ours and not others:
+        asked, left = self._moves.stop_all(motion.uuid if motion is not None else "", deadline)
+        if not asked:
             return None
         self._forget()
-        left = self._running(deadline)
         if left:
             return error(f"the daemon still runs {', '.join(sorted(left))}", stopped=False)
-        return success(f"stopped {len(ours | others)} moves", stopped=True, moves=sorted(ours | others))
+        return success(f"stopped {len(asked)} moves", stopped=True, moves=sorted(asked))
 
 
 def _uuid(path: str, answer: object) -> str:

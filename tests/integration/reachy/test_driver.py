@@ -1,0 +1,270 @@
+"""The driver on a daemon: the same suite on the stand-in, in the mock-up, in MuJoCo, and in the Zenoh era."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+
+import pytest
+from fixtures.reachy_daemon.process import Daemon
+from fixtures.waiting import eventually
+from tests.integration.reachy.conftest import Connect
+
+from strands_robots.drivers.reachy import ReachyDriver
+from strands_robots.drivers.reachy.envelope import Target
+from strands_robots.drivers.reachy.pose import HeadPose
+from strands_robots.safety.gate import MotionRefused
+
+
+def finished(reachy: ReachyDriver, within: float = 12.0) -> dict[str, str]:
+    motion = reachy.motions.current
+    assert motion is not None
+    eventually(motion.done.is_set, within, f"the end of {motion.name}")
+    return motion.facts()
+
+
+def running(daemon: Daemon) -> list[str]:
+    return [move["uuid"] for move in daemon.request("GET", "/api/move/running").json()]
+
+
+def test_the_link_is_the_one_of_the_era_whatever_the_badge_says(daemon: Daemon, reachy: ReachyDriver) -> None:
+    facts = reachy.facts()
+    assert facts["link"] == ("zenoh" if daemon.kind.zenoh else "websocket")
+    assert facts["version"] == daemon.kind.version
+    assert facts["connected"] and facts["daemon_state"] == "running" and facts["motor_mode"] == "enabled"
+    assert reachy.get_joints()["age_s"] < 1.5
+
+
+def test_a_far_target_is_reached_by_a_ramp_that_does_not_hold_the_caller(reachy: ReachyDriver) -> None:
+    reachy.go(Target(HeadPose(), 0.0, (-0.17, 0.17)))
+    finished(reachy)
+    started = time.monotonic()
+    answer = reachy.go(Target(HeadPose(pitch=0.3, yaw=0.4), 0.2, (0.8, -0.8)), "look")
+    assert answer["ramp"] is True
+    assert time.monotonic() - started < 0.25
+    assert finished(reachy)["state"] == "completed"
+
+    def arrived() -> bool:
+        seen = reachy.get_observation()
+        return abs(seen["antenna_right"] - 0.8) < 0.1 and abs(seen["body_yaw"] - 0.2) < 0.1
+
+    eventually(arrived, 4.0, "antennas and body there")
+    eventually(lambda: (reachy.facts()["head_error_rad"] or 9) < 0.1, 4.0, "head there")
+
+
+def test_an_action_is_cut_to_one_frames_step_and_what_was_sent_is_returned(reachy: ReachyDriver) -> None:
+    reachy.go(Target(antennas=(0.0, 0.0)))
+    finished(reachy)
+    assert reachy.send_action({"antenna_left": 1.0})["antenna_left"] == pytest.approx(0.3)
+    assert reachy.send_action({"antenna_left": 1.0})["antenna_left"] == pytest.approx(0.6)
+    eventually(lambda: abs(reachy.get_observation()["antenna_left"] - 0.6) < 0.1, 4.0, "there")
+
+
+def test_waking_up_enables_the_motors_and_arrives_upright(daemon: Daemon, reachy: ReachyDriver) -> None:
+    daemon.request("POST", "/api/motors/set_mode/disabled")
+    assert reachy.wake_up()["motor_mode"] == "enabled"
+    assert finished(reachy) == {"name": "wakeUp", "state": "completed", "detail": ""}
+
+
+def test_going_to_sleep_ends_with_the_motors_off(daemon: Daemon, reachy: ReachyDriver) -> None:
+    reachy.sleep()
+    end = finished(reachy)
+    if daemon.kind.simulation == "mujoco":
+        # MuJoCo's backend knows no torque: the driver must say so, not pretend.
+        assert end["detail"] == "the motors are enabled"
+        return
+    assert end == {"name": "sleep", "state": "completed", "detail": ""}
+    assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
+    with pytest.raises(MotionRefused, match="motors are disabled"):
+        reachy.gesture("nod")
+
+
+@pytest.mark.parametrize("gesture", ["nod", "shake", "happy"])
+def test_a_gesture_returns_at_once_and_runs_to_its_end(reachy: ReachyDriver, gesture: str) -> None:
+    started = time.monotonic()
+    reachy.gesture(gesture)
+    assert time.monotonic() - started < 0.25
+    assert reachy.facts()["moving"] == gesture
+    assert finished(reachy) == {"name": gesture, "state": "completed", "detail": ""}
+
+
+def test_a_halt_ends_a_gesture_and_no_frame_follows(reachy: ReachyDriver) -> None:
+    reachy.gesture("shake")
+    eventually(lambda: reachy.motions.frames_sent > 5, 2.0, "frames")
+    verdict = reachy.halt("test")
+    sent = reachy.motions.frames_sent
+    assert verdict.stopped is True
+    assert verdict.halted == ("shake",)
+    assert finished(reachy)["state"] == "stopped"
+    time.sleep(0.1)
+    assert reachy.motions.frames_sent == sent
+
+
+def test_a_halt_stops_a_move_of_the_daemon(daemon: Daemon, reachy: ReachyDriver) -> None:
+    reachy.wake_up()
+    assert len(running(daemon)) == 1
+    verdict = reachy.halt("test")
+    assert (verdict.stopped, verdict.halted) == (True, ("moves of the daemon",))
+    assert running(daemon) == []
+    assert finished(reachy)["state"] == "stopped"
+
+
+def test_a_halt_stops_the_moves_that_somebody_else_started_too(daemon: Daemon, reachy: ReachyDriver) -> None:
+    for antenna in (1.0, -1.0):
+        daemon.request("POST", "/api/move/goto", json={"antennas": [antenna, antenna], "duration": 5.0})
+    eventually(lambda: reachy.facts()["foreign_moves"] == 2, 4.0, "they are seen")
+    assert reachy.halt("test").halted == ("moves of the daemon",)
+    assert running(daemon) == []
+
+
+def test_a_new_move_stops_the_one_before_it(daemon: Daemon, reachy: ReachyDriver) -> None:
+    reachy.wake_up()
+    first = reachy.motions.current
+    assert first is not None
+    reachy.gesture("nod")
+    assert first.facts() == {"name": "wakeUp", "state": "stopped", "detail": "replaced by nod"}
+    assert running(daemon) == []
+    reachy.wake_up()
+    assert len(running(daemon)) == 1
+    reachy.library.names("emotions")
+    reachy.halt("test")
+
+
+def test_many_callers_at_once_leave_one_move(daemon: Daemon, reachy: ReachyDriver) -> None:
+    callers = [threading.Thread(target=verb) for verb in (reachy.wake_up, reachy.sleep, reachy.wake_up) * 2]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(20)
+    assert len(running(daemon)) <= 1
+    assert reachy.halt("test").stopped
+    assert running(daemon) == []
+
+
+def test_a_recorded_move_plays_and_an_unknown_one_does_not(reachy: ReachyDriver) -> None:
+    assert sorted(reachy.library.names("emotions")["moves"]) == ["no1", "yes1"]
+    assert reachy.library.play("yes1", "emotions")["move"] == "yes1"
+    assert "no move 'nope'" in reachy.library.play("nope", "emotions")["reason"]
+    assert finished(reachy)["name"] == "yes1"
+
+
+def test_an_uncached_library_is_unknown_and_not_empty(reachy: ReachyDriver) -> None:
+    answer = reachy.library.names("dances")
+    assert answer["status"] == "error"
+    assert answer["reason"].startswith("The catalogue of dances is unknown")
+    assert "moves" not in answer
+
+
+def test_an_uncached_library_is_not_asked_for_while_the_robot_moves(reachy: ReachyDriver) -> None:
+    reachy.gesture("nod")
+    assert "could freeze its daemon" in reachy.library.play("x1", "dances")["reason"]
+    assert finished(reachy)["state"] == "completed"
+
+
+def test_an_emergency_stop_holds_or_releases_and_says_which(daemon: Daemon, reachy: ReachyDriver) -> None:
+    reachy.gesture("nod")
+    held = reachy.emergency_stop("test")
+    assert (held["stopped"], held["torque"], held["halted"]) == (True, "held", ["nod"])
+    released = reachy.emergency_stop("test", release=True)
+    if daemon.kind.simulation == "mujoco":
+        assert "Torque was not released" in released["reason"]
+        return
+    assert released["torque"] == "released"
+    assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
+
+
+def test_torque_of_single_motors_is_sent_and_said_to_be_unverified(reachy: ReachyDriver) -> None:
+    answer = reachy.motors.torque(True, "17, stewart_1", "enableMotors")
+    assert answer["motors"] == ["right_antenna", "stewart_1"]
+    assert answer["verified"] is False
+
+
+def test_the_imu_is_there_on_a_wireless_and_said_to_be_missing_elsewhere(daemon: Daemon, reachy: ReachyDriver) -> None:
+    if not daemon.kind.wireless:
+        assert reachy.get_imu()["reason"] == "This Reachy Mini has no IMU."
+        return
+    eventually(lambda: reachy.get_imu()["status"] == "success", 2.0, "a sample")
+    imu = reachy.get_imu()
+    assert imu["accelerometer"] == [0.0, 0.0, 9.81]
+    assert imu["age_s"] < 1.5
+
+
+def test_a_locked_robot_refuses_every_motion(reachy: ReachyDriver) -> None:
+    class Locked:
+        def refusal(self, verb: str) -> dict[str, object]:
+            return {"status": "error", "reason": f"{verb} refused: locked"}
+
+    reachy.gate.attach(Locked())
+    for verb in (
+        lambda: reachy.gesture("nod"),
+        reachy.wake_up,
+        reachy.sleep,
+        lambda: reachy.go(Target(HeadPose(yaw=0.1))),
+        lambda: reachy.send_action({"head_yaw": 0.1}),
+        lambda: reachy.library.play("yes1", "emotions"),
+        lambda: reachy.motors.torque(True, "", "enableMotors"),
+    ):
+        with pytest.raises(MotionRefused, match="locked"):
+            verb()
+
+
+def test_two_drivers_on_one_robot_see_and_stop_one_another(daemon: Daemon, connect: Connect) -> None:
+    one, two = connect(), connect()
+    one.wake_up()
+    eventually(lambda: two.facts()["foreign_moves"] == 1, 4.0, "the other's move is seen")
+    two.gesture("nod")
+    assert running(daemon) == []
+    first = one.motions.current
+    assert first is not None
+    eventually(first.done.is_set, 4.0, "the first driver learns it")
+    assert (first.state, first.detail) == ("stopped", "somebody else stopped it")
+
+
+def test_after_disconnect_nothing_reaches_the_robot(reachy: ReachyDriver) -> None:
+    reachy.gesture("shake")
+    reachy.disconnect()
+    sent = reachy.motions.frames_sent
+    with pytest.raises(MotionRefused, match="disconnected"):
+        reachy.go(Target(HeadPose(yaw=0.1)))
+    time.sleep(0.1)
+    assert reachy.motions.frames_sent == sent
+
+
+def test_a_target_out_of_reach_never_leaves_the_driver(reachy: ReachyDriver) -> None:
+    before = reachy.motions.frames_sent
+    with pytest.raises(ValueError, match="together be at most 60 degrees"):
+        reachy.go(Target(HeadPose(pitch=math.radians(40), roll=math.radians(30))))
+    assert reachy.motions.frames_sent == before
+
+
+def test_a_restarted_daemon_is_found_again_and_moves(daemon: Daemon, reachy: ReachyDriver) -> None:
+    before = reachy.connection.connects
+    daemon.request("POST", "/api/daemon/restart")
+    if daemon.kind.zenoh:
+        # The Zenoh session outlives this by itself: there may be nothing to reconnect.
+        state = lambda: daemon.request("GET", "/api/daemon/status").json()["state"]  # noqa: E731
+        eventually(lambda: state() != "running", 3, "it goes down")
+        eventually(lambda: state() == "running", 15, "it is back")
+    else:
+        eventually(lambda: reachy.connection.connects > before, 15, "a new link")
+    eventually(lambda: reachy.is_connected, 15, "joint data again")
+    reachy.gesture("nod")
+    assert finished(reachy)["state"] == "completed"
+
+
+def test_a_killed_daemon_is_unavailable_and_comes_back(daemon: Daemon, reachy: ReachyDriver) -> None:
+    reachy.gesture("shake")
+    daemon.kill()
+    try:
+        eventually(lambda: not reachy.is_connected, 4.0, "it is noticed")
+        with pytest.raises(MotionRefused):
+            reachy.gesture("nod")
+        assert reachy.get_joints()["status"] == "error"
+        verdict = reachy.halt("test")
+        assert verdict.stopped is not True
+    finally:
+        daemon.start()
+    eventually(lambda: reachy.is_connected, 10.0, "it is back")
+    reachy.gesture("nod")
+    assert finished(reachy)["state"] == "completed"
