@@ -25,7 +25,7 @@ TICK_S = 0.005
 SETTLE_S = 2.0
 """How long physics goes on after a single command."""
 
-MAX_BEHIND_S = 0.1
+MAX_BEHIND_S = 0.25
 """A world that is further behind real time than this lets the rest go, so that it cannot starve the others."""
 
 

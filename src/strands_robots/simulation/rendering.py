@@ -7,6 +7,7 @@ and its own copy of the data, so that it never holds up physics.
 
 from __future__ import annotations
 
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -37,6 +38,8 @@ class Renderer:
         self._stage: Stage | None = None
         self._data: Any = None
         self._contexts: dict[tuple[int, int, bool], Any] = {}
+        # A program that ends without cleanup frees them while OpenGL is still there.
+        weakref.finalize(self, _free, self._contexts)
 
     def render(self, snapshot: Snapshot, camera: object, width: int, height: int, *, quality: bool) -> Picture:
         """An RGB picture (height, width, 3).
@@ -52,12 +55,12 @@ class Renderer:
 
     def close(self) -> None:
         """Free every context and end the thread."""
-        self._thread.submit(self._free).result()
+        self._thread.submit(_free, self._contexts).result()
         self._thread.shutdown()
 
     def _render(self, snapshot: Snapshot, camera: str, width: int, height: int, quality: bool) -> Picture:
         if self._stage is not snapshot.stage:
-            self._free()
+            _free(self._contexts)
             self._stage = snapshot.stage
             self._data = mujoco.MjData(snapshot.stage.model)
         renderer = self._context(snapshot.stage, width, height, quality)
@@ -89,9 +92,10 @@ class Renderer:
             raise RenderingError(f"no OpenGL picture (MUJOCO_GL={BACKEND or 'unset'}: {why}); {gl.remedy()}.") from exc
         return self._contexts[key]
 
-    def _free(self) -> None:
-        while self._contexts:
-            self._contexts.popitem()[1].close()
+
+def _free(contexts: dict[tuple[int, int, bool], Any]) -> None:
+    while contexts:
+        contexts.popitem()[1].close()
 
 
 def _mujoco_camera(view: View) -> Any:

@@ -104,6 +104,7 @@ class Recording:
 
     def save_picture(self, path: str | Path, width: int = 960, height: int = 720) -> Path:
         """The world as it is now, larger, with the whole path."""
+        self.trace()
         picture, self.how = self._world.picture(self._camera, width, height, path=self.path)
         return save_picture(picture, path)
 
