@@ -7,8 +7,9 @@ import threading
 from typing import Any
 
 import pytest
+from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
-from tests.mesh.peers import Arm, Fleet, World
+from tests.mesh.peers import Fleet
 
 from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.safety.approval import Grants, state_dir

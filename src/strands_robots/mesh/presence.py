@@ -115,8 +115,8 @@ class Herald:
         if there or len(parts) != 4:
             return
         peer, session = parts[1], parts[3]
-        linked = getattr(self._context.transport, "linked", None)
-        if peer == self._context.peer_id or (callable(linked) and not linked()):
+        anchored = getattr(self._context.transport, "anchored", None)
+        if peer == self._context.peer_id or (callable(anchored) and not anchored()):
             # Without a hub every token goes at once, and none of the sessions need have ended.
             return
         if self._context.registry.lost(peer, session):

@@ -121,10 +121,10 @@ class BridgeTransport:
         watch: Callable[[str, LivenessCallback], Subscription] = getattr(self._local, "watch_tokens", _nothing)
         return watch(key, callback) if self._local.is_alive() else _Both([])
 
-    def linked(self) -> bool:
-        """Whether the local leg has company."""
-        linked = getattr(self._local, "linked", None)
-        return bool(linked()) if callable(linked) else True
+    def anchored(self) -> bool:
+        """Whether the local leg can tell who is alive."""
+        anchored = getattr(self._local, "anchored", None)
+        return bool(anchored()) if callable(anchored) else True
 
     def _legs(self, topic: topics.Topic) -> list[Transport]:
         return [self._local, self._cloud] if topic.name in self._bridged else [self._local]

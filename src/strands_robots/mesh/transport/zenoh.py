@@ -43,6 +43,7 @@ class ZenohTransport:
         self._relay: Any = None
         self._zenoh: Any = None
         self._links: Any = None
+        self._hub = False
         self._numbers = count()
         self._publishers: dict[str, tuple[Any, Any]] = {}
         self._closing = threading.Event()
@@ -74,6 +75,7 @@ class ZenohTransport:
             self._zenoh = zenoh
             posture = self._posture = self._posture or from_settings()
             self._closing.clear()
+            self._hub = False
             if posture.hub is None:
                 self._session = self._open(zenoh_config.explicit(posture, self._id))
             else:
@@ -112,6 +114,12 @@ class ZenohTransport:
         if session is None:
             return False
         return bool(session.info.peers_zid() or session.info.routers_zid())
+
+    def anchored(self) -> bool:
+        """Whether others' liveliness can be told: we listen ourselves, or the hub we depend on is there."""
+        posture = self._posture
+        listens = self._hub or (posture is not None and bool(posture.listen))
+        return listens or self.linked()
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         topic = topics.topic_of(key)
@@ -203,6 +211,7 @@ class ZenohTransport:
         while True:
             with contextlib.suppress(TransportError):  # somebody else is the hub
                 session = self._open(zenoh_config.hub(posture, self._id))
+                self._hub = True
                 logger.info("This process is the mesh's hub on %s.", posture.hub)
                 return session
             try:

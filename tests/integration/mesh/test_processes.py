@@ -1,0 +1,122 @@
+"""Peers in real processes over real Zenoh on loopback, with no configuration but a port."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+from fixtures.waiting import accepts, eventually
+from tests.integration.mesh.conftest import Join
+
+from strands_robots.mesh.resume_authority import keygen
+
+
+def test_two_processes_without_configuration_see_and_command_each_other(join: Join) -> None:
+    arm, sim = join("arm-1", "arm"), join("sim-1")
+    arm.sees("sim-1")
+    sim.sees("arm-1")
+    assert arm.ask("ping", "sim-1")["status"] == "ok"
+    command = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
+    assert arm.ask("send", "sim-1", command, 5)["result"]["status"] == "success"
+    assert sim.ask("moving") == ["left"]
+    refused = sim.ask("send", "arm-1", command, 5)
+    assert "operator approval" in refused["error"]
+    assert arm.ask("zid", "sim-1") != sim.ask("zid", "arm-1")
+
+
+def test_a_killed_peer_is_seen_gone_within_a_second_and_may_come_back(join: Join) -> None:
+    hub, child = join("hub", "none"), join("child")
+    hub.sees("child")
+    killed = time.monotonic()
+    child.kill()
+    eventually(lambda: "child" not in hub.ask("reachable"), within=2)
+    assert time.monotonic() - killed < 1.0
+    again = join("child")
+    hub.sees("child", within=3)
+    assert hub.ask("ping", "child")["status"] == "ok"
+    again.sees("hub")
+
+
+def test_the_children_of_a_dead_hub_find_each_other_within_two_seconds(join: Join, port: int) -> None:
+    hub = join("hub", "none")
+    children = [join(f"child-{number}") for number in range(3)]
+    for child in children:
+        child.sees(*(other.peer_id for other in children if other is not child))
+    hub.kill()
+    dead = time.monotonic()
+    eventually(lambda: accepts(port), within=2, what="a survivor takes the port")
+    eventually(lambda: children[0].ask("ping", "child-1", 0.5)["status"] == "ok", within=2)
+    assert time.monotonic() - dead < 2.0
+    assert children[1].ask("ping", "child-2")["status"] == "ok"
+    # A process that comes later, the old hub's included, finds the survivor.
+    late = join("hub", "none")
+    late.sees("child-0", "child-1", "child-2")
+    assert late.ask("ping", "child-2")["status"] == "ok"
+
+
+def test_a_suspended_peer_is_out_of_reach_and_back_when_it_goes_on(join: Join) -> None:
+    hub, child = join("hub", "none"), join("child")
+    hub.sees("child")
+    child.signal(signal.SIGSTOP)
+    eventually(lambda: "child" not in hub.ask("reachable"), within=12)
+    child.signal(signal.SIGCONT)
+    hub.sees("child", within=10)
+
+
+def test_an_emergency_stop_halts_and_locks_every_process_until_the_signed_resume(join: Join, tmp_path: object) -> None:
+    key, passphrase = f"{tmp_path}/operator.pem", "Correct-Horse-7-Battery"
+    trusted = {"STRANDS_MESH_RESUME_PUBLIC_KEY": keygen(key, passphrase)}
+    console = join("console", "none", **trusted)
+    robots = [join(f"arm-{number}", "arm", **trusted) for number in range(4)]
+    console.sees(*(robot.peer_id for robot in robots))
+    for robot in robots:
+        robot.ask("start", "wave")
+    issued, answers = console.ask("estop")
+    assert answers[0]["responder_id"] == "console"
+    assert len(answers) == 5
+    epoch = console.ask("epoch")
+    for robot in robots:
+        assert robot.ask("epoch") == epoch
+        assert robot.ask("moving") is False
+        halted = robot.ask("halts")[1]
+        assert 0 <= halted - issued < 1.0
+    refused = console.ask("send", "arm-0", {"action": "start", "policy_provider": "mock"}, 5)
+    assert refused["error"] == "command rejected"
+    assert console.ask("send", "arm-0", {"action": "status"}, 5)["type"] == "response"
+    assert console.ask("resume", key, passphrase) == {"status": "ok"}
+    for robot in robots:
+        eventually(lambda robot=robot: robot.ask("epoch") is None, within=3, what=f"{robot.peer_id} is free")
+    assert console.ask("epoch") is None
+
+
+def test_a_fleet_stops_right_after_its_hub_died(join: Join) -> None:
+    hub, console = join("hub", "none"), join("console", "none")
+    robots = [join(f"arm-{number}", "arm") for number in range(2)]
+    console.sees("arm-0", "arm-1")
+    hub.kill()
+    killed = time.time()
+    eventually(lambda: console.ask("ping", "arm-0", 0.3)["status"] == "ok", within=2)
+    console.ask("estop")
+    for robot in robots:
+        eventually(lambda robot=robot: robot.ask("epoch"), within=1)
+        assert robot.ask("halts")[1] - killed < 3.5
+
+
+def test_a_locked_robot_comes_back_locked_from_a_restart(join: Join) -> None:
+    console, robot = join("console", "none"), join("arm-1", "arm")
+    console.sees("arm-1")
+    console.ask("estop")
+    eventually(lambda: robot.ask("epoch"), within=2)
+    epoch = robot.ask("epoch")
+    robot.kill()
+    assert join("arm-1", "arm").ask("epoch") == epoch
+
+
+def test_leaving_and_joining_again_leaves_no_thread(join: Join) -> None:
+    peer = join("sim-1")
+    before = peer.ask("threads")
+    for _ in range(3):
+        assert peer.ask("restart") is True
+    assert len(peer.ask("threads")) <= len(before)
+    mine = [name for name in before if "sim-1" in name or name.startswith("mesh")]
+    assert len(mine) <= 6
