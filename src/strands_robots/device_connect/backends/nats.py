@@ -1,7 +1,7 @@
 """Device Connect over NATS: the framework's wire, with commands side by side and a connect that ends.
 
-A ``nats-py`` client belongs to one event loop, so runtimes share a connection where they share a loop; each further
-loop costs one descriptor and no thread.
+A ``nats-py`` client belongs to one event loop and a device's credentials to one device, so each client has a connection
+of its own: one descriptor, no thread, some 0.3 MB.
 """
 
 from __future__ import annotations
