@@ -5,6 +5,11 @@ Exit codes: 0 done, 1 refused or failed, 2 wrong usage, 3 nobody answered, 130 C
 
 from __future__ import annotations
 
+import logging
+import os
+import sys
+from typing import NoReturn
+
 __all__ = ["main"]
 
 
@@ -12,4 +17,22 @@ def main() -> None:
     """Entry point of the ``strands-robots`` command."""
     from strands_robots.cli.app import build  # noqa: PLC0415 - importing the package stays free
 
-    build()()
+    try:
+        build()()
+    except SystemExit as ended:
+        _leave(ended.code)
+
+
+def _leave(code: object) -> NoReturn:
+    """End the process with everything written.
+
+    Native network threads may still be letting go of callbacks; where the interpreter is taken down under them, the
+    C library aborts the process, and a script would read -6 in place of the exit code.
+    """
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            code = code or 1
+    os._exit(code if isinstance(code, int) else int(code is not None))

@@ -15,6 +15,9 @@ from strands_robots.cli.output import label, plain
 WIDTH = 32
 """Characters of one bar."""
 
+NAME_WIDTH = 18
+"""Characters of a joint's name."""
+
 MOST = 24
 """Joints that are drawn; the rest is counted."""
 
@@ -57,7 +60,7 @@ def bar(value: float, limits: Range = TURN, width: int = WIDTH) -> Text:
 def joints_table(joints: Mapping[str, object], limits: Mapping[str, Range]) -> Table:
     """Every joint with its bar and its value; values that are no finite number are left out."""
     grid = Table.grid(padding=(0, 2))
-    grid.add_column(max_width=24, no_wrap=True, overflow="ellipsis")
+    grid.add_column(width=NAME_WIDTH, no_wrap=True, overflow="ellipsis")
     grid.add_column(no_wrap=True)
     grid.add_column(justify="right", no_wrap=True)
     drawn = {str(name): float(value) for name, value in joints.items() if _finite(value)}
@@ -72,6 +75,7 @@ def joints_table(joints: Mapping[str, object], limits: Mapping[str, Range]) -> T
 def progress(title: str, done: float, total: float) -> Table:
     """A titled progress bar in seconds."""
     grid = Table.grid(padding=(0, 2))
+    grid.add_column(width=NAME_WIDTH, no_wrap=True, overflow="ellipsis")
     grid.add_row(
         Text(plain(title, 60), style="bold"),
         ProgressBar(total=max(total, 1e-9), completed=min(max(done, 0.0), total), width=WIDTH),

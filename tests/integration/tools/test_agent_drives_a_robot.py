@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
-from fixtures.scripted_model import ScriptedModel, Use, tool_results
+from fixtures.scripted_model import ScriptedModel
 from fixtures.toy_robots import ToyWorld
 from fixtures.waiting import eventually, free_port
 from strands import Agent
@@ -31,21 +32,22 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[ToyWorld]:
         stop_device_connect(runtime)
 
 
-def results(*uses: Use) -> list[dict[str, object]]:
-    model = ScriptedModel([*uses, "That is all."])
+def results(*asked: dict[str, Any]) -> list[dict[str, Any]]:
+    """What the tool answered to each of an agent's uses of it, a turn each."""
+    model = ScriptedModel([*(("robot_mesh", each) for each in asked), "That is all."])
     agent = Agent(model=model, tools=[robot_mesh], callback_handler=None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         agent("go")
-    return tool_results(agent.messages)
+    return [block["toolResult"] for message in agent.messages for block in message["content"] if "toolResult" in block]
 
 
 def test_an_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
     told = results(
-        Use("robot_mesh", {"action": "peers"}),
-        Use("robot_mesh", {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20}),
-        Use("robot_mesh", {"action": "status", "target": "toys"}),
-        Use("robot_mesh", {"action": "stop", "target": "toys"}),
+        {"action": "peers"},
+        {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20},
+        {"action": "status", "target": "toys"},
+        {"action": "stop", "target": "toys"},
     )
     assert [each["status"] for each in told] == ["success"] * 4
     assert "toys" in str(told[0]["content"])
@@ -56,8 +58,8 @@ def test_an_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
 
 def test_an_emergency_stop_reaches_every_robot_and_names_it(world: ToyWorld) -> None:
     told = results(
-        Use("robot_mesh", {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20}),
-        Use("robot_mesh", {"action": "emergency_stop", "instruction": "smoke"}),
+        {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20},
+        {"action": "emergency_stop", "instruction": "smoke"},
     )
     assert told[1]["status"] == "success"
     assert "toys" in str(told[1]["content"])
@@ -67,13 +69,13 @@ def test_an_emergency_stop_reaches_every_robot_and_names_it(world: ToyWorld) -> 
 def test_a_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None:
     world.start_policy("left", "wave", duration=20)
     world.stubborn = True
-    (told,) = results(Use("robot_mesh", {"action": "stop"}))
+    (told,) = results({"action": "stop"})
     assert told["status"] == "error"
     assert "DID NOT STOP: toys" in str(told["content"])
 
 
 def test_silence_is_an_error(world: ToyWorld) -> None:
-    asked = [Use("robot_mesh", {"action": action, "target": "nobody"}) for action in ("stop", "status")]
+    asked = [{"action": action, "target": "nobody"} for action in ("stop", "status")]
     for told in results(*asked):
         assert told["status"] == "error"
         assert "nobody" in str(told["content"])

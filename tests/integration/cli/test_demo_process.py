@@ -1,0 +1,92 @@
+"""The demo as a stranger runs it, and the demo with one thing spoiled."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots import settings
+
+WITHIN_S = 60.0
+
+
+def environment(state: Path, **more: str) -> dict[str, str]:
+    ours = {setting.name for setting in settings.declared()}
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    return {**kept, "STRANDS_STATE_DIR": str(state), **more}
+
+
+def start(folder: Path, *words: str, **more: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "strands_robots.cli", "demo", *words],
+        cwd=folder,
+        env=environment(folder / "state", **more),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def served_by(run: subprocess.Popen[str]) -> psutil.Process | None:
+    """The process in which the demo serves its robot."""
+    children = psutil.Process(run.pid).children()
+    return next((child for child in children if "serve" in child.cmdline()), None)
+
+
+def gone(process: psutil.Process) -> bool:
+    return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+
+
+def test_the_demo_happens_and_leaves_its_pictures(tmp_path: Path) -> None:
+    # A network of the user's own must not get in its way.
+    run = start(tmp_path, "--record", "demo.svg", "--json", NATS_URL="nats://192.0.2.1:4222", TENANT="elsewhere")
+    told, complaints = run.communicate(timeout=WITHIN_S)
+    assert run.returncode == 0, complaints
+    report = json.loads(told)
+    assert report["status"] == "success"
+    steps = {step["step"]: step for step in report["steps"]}
+    assert list(steps) == ["serve", "discover", "execute", "stop", "leave", "pictures"]
+    assert all(step["ok"] for step in steps.values())
+    assert {"execute", "stop", "getStatus", "getFeatures"} <= set(steps["discover"]["functions"])
+    assert steps["execute"]["steps"] > 0
+    assert steps["stop"]["drift_rad"] <= 0.005
+    assert (tmp_path / "demo-output" / "arm-path.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "demo-output" / "demo.gif").read_bytes().startswith(b"GIF89a")
+    assert all(Path(tmp_path / file).stat().st_size < 1_000_000 for file in report["files"])
+    assert "url(http" not in (tmp_path / "demo.svg").read_text(encoding="utf-8")
+
+
+def test_a_refused_motion_fails_the_demo(tmp_path: Path) -> None:
+    run = start(tmp_path, DEVICE_CONNECT_RPC_ALLOW="somebody-else")
+    told, complaints = run.communicate(timeout=WITHIN_S)
+    assert run.returncode == 1
+    assert "execute was refused" in complaints
+    assert "What the agent can call" in told
+    assert not (tmp_path / "demo-output").exists()
+
+
+def test_a_robot_that_dies_fails_the_demo(tmp_path: Path) -> None:
+    run = start(tmp_path, "--json")
+    served = eventually(lambda: served_by(run), within=20.0, what="the demo's robot process")
+    served.kill()
+    told, _ = run.communicate(timeout=WITHIN_S)
+    assert run.returncode == 1
+    assert json.loads(told)["status"] == "error"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_an_interrupted_demo_takes_its_robot_with_it(tmp_path: Path, number: signal.Signals) -> None:
+    run = start(tmp_path)
+    served = eventually(lambda: served_by(run), within=20.0, what="the demo's robot process")
+    run.send_signal(number)
+    run.communicate(timeout=WITHIN_S)
+    eventually(lambda: gone(served), within=10.0, what="the demo's robot process is gone")
+    assert run.returncode == (-9 if number == signal.SIGKILL else 130)
