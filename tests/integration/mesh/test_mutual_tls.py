@@ -1,0 +1,80 @@
+"""The mesh over mutual TLS: who gets in, and who may speak as whom."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fixtures.mesh_peer import MeshPeer
+from fixtures.waiting import eventually, free_port
+from tests.integration.mesh.conftest import Join
+
+from strands_robots.mesh import keys
+
+Fleet = dict[str, dict[str, str]]
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Fleet:
+    """Certificates of one authority and access rules by which only the console commands."""
+    folder = tmp_path / "keys"
+    keys.init(folder)
+    names = ("console", "sim-1", "sim-2")
+    rules = folder / "acl.json5"
+    rules.write_text(keys.acl(["sim-1", "sim-2"], ["console"]))
+    return {name: {**keys.issue(folder, name).settings(), "STRANDS_MESH_ACL_FILE": str(rules)} for name in names}
+
+
+def test_certified_peers_see_and_command_each_other_with_signed_messages(join: Join, fleet: Fleet) -> None:
+    console, sim = join("console", "none", **fleet["console"]), join("sim-1", **fleet["sim-1"])
+    console.sees("sim-1")
+    sim.sees("console")
+    assert console.ask("cert", "sim-1")[1] == "sim-1"
+    assert console.ask("ping", "sim-1")["status"] == "ok"
+    start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
+    assert console.ask("send", "sim-1", start, 5)["result"]["status"] == "success"
+    console.ask("estop")
+    eventually(lambda: sim.ask("epoch"), within=3)
+
+
+def test_the_access_rules_keep_a_robot_from_commanding_another(join: Join, fleet: Fleet) -> None:
+    hub = join("console", "none", **fleet["console"])
+    one, two = join("sim-1", **fleet["sim-1"]), join("sim-2", **fleet["sim-2"])
+    one.sees("sim-2")
+    hub.sees("sim-1", "sim-2")
+    assert one.ask("ping", "sim-2", 0.5)["status"] == "timeout"
+    assert hub.ask("ping", "sim-2")["status"] == "ok"
+    assert two.ask("reachable")
+
+
+def test_a_certificate_may_not_announce_another_peer(join: Join, fleet: Fleet, tmp_path: Path) -> None:
+    console = join("console", "none", **fleet["console"])
+    join("sim-2", "world", **fleet["sim-1"])
+    join("sim-1", "world", **fleet["sim-1"])
+    console.sees("sim-1")
+    assert console.ask("zid", "sim-2") is None
+    assert console.ask("cert", "sim-2") is None
+
+
+@pytest.mark.parametrize("outsider", ["another authority", "no certificate"])
+def test_who_is_not_of_the_fleet_gets_no_link(
+    join: Join, fleet: Fleet, tmp_path: Path, port: int, outsider: str
+) -> None:
+    console = join("console", "none", **fleet["console"])
+    other: dict[str, str] = {"ZENOH_CONNECT": f"tcp/127.0.0.1:{port}"}
+    if outsider == "another authority":
+        foreign = tmp_path / "foreign"
+        keys.init(foreign)
+        other = {**keys.issue(foreign, "sim-1").settings(), "ZENOH_CONNECT": f"tls/127.0.0.1:{port}"}
+    stranger = join("sim-1", "world", **other)
+    with pytest.raises(AssertionError):
+        console.sees("sim-1", within=1.5)
+    assert stranger.ask("reachable") == []
+
+
+def test_leaving_loopback_without_certificates_is_refused_by_name(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    state.mkdir(mode=0o700)
+    settings = {"ZENOH_LISTEN": f"tcp/0.0.0.0:{free_port()}", "STRANDS_STATE_DIR": str(state)}
+    with MeshPeer("sim-1", "world", settings) as peer:
+        assert peer.ready == {"ready": False}
