@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import random
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -156,3 +158,40 @@ def test_a_robots_file_does_not_change_the_worlds_time(empty: Simulation, tmp_pa
     assert empty.step(100)["sim_time"] == pytest.approx(0.2)
     assert empty.get_features()["timestep"] == 0.002
     assert empty.tip_position("ball")[2] < 1.9
+
+
+@pytest.mark.parametrize("timestep", [0.0005, 0.002, 0.01, 0.02])
+@pytest.mark.parametrize("model", OURS)
+def test_a_model_is_stable_at_every_timestep_whatever_it_is_told(model: str, timestep: float) -> None:
+    simulation = Simulation(timestep=timestep, realtime=False)
+    simulation.add_robot(model)
+    draw = random.Random(7)
+    for _ in range(15):
+        simulation.send_action({k: draw.uniform(low, high) for k, (low, high) in simulation.body().bounds.items()})
+        simulation.step(round(0.2 / timestep))
+    assert simulation.get_state()["diverged"] is False
+    simulation.cleanup()
+
+
+@pytest.fixture
+def descriptions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package with the shape of ``robot_descriptions``: names, and one module for each that knows its file."""
+    package = tmp_path / "robot_descriptions"
+    package.mkdir()
+    names = ["pole_mj_description", "far_description"]
+    (package / "__init__.py").write_text(f"DESCRIPTIONS = dict.fromkeys({names!r})\n")
+    (package / "pole_mj_description.py").write_text(f"MJCF_PATH = {str(MODELS / 'rover.xml')!r}\n")
+    (package / "far_description.py").write_text("raise ConnectionError('no network')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in [n for n in sys.modules if n.partition(".")[0] == "robot_descriptions"]:
+        monkeypatch.delitem(sys.modules, name)
+    return package
+
+
+@pytest.mark.usefixtures("descriptions")
+def test_a_robot_description_is_found_by_its_name(empty: Simulation) -> None:
+    assert empty.add_robot("robot", "pole_mj_description")["status"] == "success"
+    assert empty.add_robot("short", "pole")["actuators"] == ["linear_velocity", "angular_velocity"]
+    assert "pole_mj_description" in empty.add_robot("typo", "pole_mj_descriptoin")["reason"]
+    assert "cannot be fetched: no network" in empty.add_robot("far", "far_description")["reason"]
+    assert empty.list_robots() == ["robot", "short"]

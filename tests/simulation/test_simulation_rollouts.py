@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import pytest
@@ -55,6 +55,9 @@ class Stuck:
             self.inside.set()
             self.let_go.wait(10)
         return {"shoulder_pan": 1.5}
+
+    def interrupt(self) -> None:
+        """It does not listen."""
 
     def close(self) -> None:
         """Nothing to free."""
@@ -180,6 +183,20 @@ def test_a_stop_of_one_robot_voids_what_its_stuck_policy_says_later(
     assert world.get_observation("left")["shoulder_pan"] == pytest.approx(where, abs=0.2)
 
 
+def test_a_policy_that_raises_when_interrupted_is_stopped_all_the_same(
+    world: Simulation, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt() -> None:
+        stuck.let_go.set()
+        raise OSError("no")
+
+    monkeypatch.setattr(stuck, "interrupt", interrupt)
+    world.start_policy("left", "think")
+    assert stuck.inside.wait(5)
+    verdict = world.halt("test")
+    assert (verdict.stopped, verdict.halted) == (True, ("left",))
+
+
 def test_a_policy_that_fails_ends_in_error_and_on_hold(
     world: Simulation, events: list[RolloutEvent], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,3 +311,38 @@ def test_a_cleaned_up_world_follows_no_leader(world: Simulation) -> None:
     world.attach_teleop(Script(), "script")
     world.cleanup()
     assert "cleaned up" in world.teleoperate("script")["reason"]
+
+
+def test_everything_at_once_raises_nothing_and_ends(world: Simulation) -> None:
+    world.attach_teleop(Script(), "script", robot_name="right")
+    jobs: list[Callable[[], object]] = [
+        lambda: world.start_policy("left", "wave", duration=0.05),
+        lambda: world.start_policy("right", "nod", duration=5),
+        lambda: world.stop_policy("right"),
+        lambda: world.teleoperate("script", duration=0.05),
+        lambda: world.halt("test"),
+        world.reset,
+        lambda: world.add_robot("extra", "rover"),
+        lambda: world.remove_robot("extra"),
+        lambda: world.send_action({"gripper": 1.0}, "left"),
+        lambda: world.step(20),
+        lambda: [world.get_state(), world.get_observation("left"), world.get_features()],
+    ]
+    calm: list[bool] = []
+    until = time.monotonic() + 1.5
+
+    def repeat(job: Callable[[], object]) -> None:
+        while time.monotonic() < until:
+            job()
+            time.sleep(0.002)
+        calm.append(True)
+
+    threads = [threading.Thread(target=repeat, args=(job,)) for job in jobs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert not any(thread.is_alive() for thread in threads)
+    assert len(calm) == len(jobs)
+    assert world.cleanup()["status"] == "success"
+    assert not [t.name for t in threading.enumerate() if t.name.startswith(("rollout", "simulation"))]

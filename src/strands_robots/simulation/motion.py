@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from functools import partial
@@ -18,6 +19,8 @@ from strands_robots.simulation.pictures import Pictures
 from strands_robots.simulation.stage import Plan
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
+
+logger = logging.getLogger(__name__)
 
 DURATION_MAX_S = 86_400.0
 """Longest rollout: a day."""
@@ -77,7 +80,7 @@ class Rollouts(Pictures, TeleopMixin):
         """The same, but wait for the end; an error when the policy failed or did not end in its time."""
         rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
         if not rollout.join((rollout.duration or 0.0) + TEARDOWN_S):
-            rollout.request_stop()
+            _ask(rollout)
             return error(f"{rollout.robot} was still running {TEARDOWN_S:g} s after its time.", **self._row(rollout))
         if rollout.state == "error":
             return error(f"{rollout.robot} failed: {rollout.error}", **self._row(rollout))
@@ -152,7 +155,7 @@ class Rollouts(Pictures, TeleopMixin):
         return {**rollout.row(), "state": rollout.state, "error": rollout.error}
 
     def _stop(self, body: RobotBody, rollout: Rollout, patience_s: float) -> Envelope:
-        rollout.request_stop()
+        _ask(rollout)
         body.hold()
         stopped = rollout.join(patience_s)
         row = {**self._row(rollout), "stopped": stopped, "was_running": True}
@@ -165,7 +168,7 @@ class Rollouts(Pictures, TeleopMixin):
         """Ask every rollout to end at once; how to wait for each, until ``deadline`` on the monotonic clock."""
         running = self._running()
         for rollout in running.values():
-            rollout.request_stop()
+            _ask(rollout)
         waits = {name: partial(self._ended, name, rollout, deadline) for name, rollout in running.items()}
         return {**waits, **self.teleop_stops(deadline)}
 
@@ -173,3 +176,11 @@ class Rollouts(Pictures, TeleopMixin):
         if rollout.join(max(0.0, deadline - time.monotonic())):
             return success(f"{name} stopped.", stopped=True)
         return error(f"frozen, but its policy {rollout.policy_name} has not returned yet", stopped=False)
+
+
+def _ask(rollout: Rollout) -> None:
+    """Ask it to end. Its leave is void before its policy is told, so one that raises there has lost it all the same."""
+    try:
+        rollout.request_stop()
+    except Exception:
+        logger.exception("The policy %s of %s raised when it was interrupted.", rollout.policy_name, rollout.robot)
