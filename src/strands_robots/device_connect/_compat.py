@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import Future
 from typing import Any
 
@@ -19,6 +19,7 @@ from device_connect_edge.messaging.exceptions import MessagingError, NotConnecte
 
 from .. import settings
 from .backends import LinkConfig, register
+from .backends.jsonrpc import valid_json
 
 FRAMEWORK_VERSION = "0.2.5"
 
@@ -55,6 +56,8 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         link: how to reach the others.
         allow_insecure: required for a link on which nobody proves who he is.
         discovery: ``d2d`` announces presence; ``registry`` registers with the framework's registry service.
+        before_live: awaited with the connected client before the driver is connected and the device can be found or
+            called; what it raises ends the start.
         stock: further arguments of ``DeviceRuntime``, such as ``identity``, ``status``, ``ttl``.
 
     ``status`` is a live dict: presence sends what it holds at that moment.
@@ -68,6 +71,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         link: LinkConfig,
         allow_insecure: bool = False,
         discovery: str = "d2d",
+        before_live: Callable[[Any], Awaitable[None]] | None = None,
         **stock: Any,
     ) -> None:
         super().__init__(
@@ -84,6 +88,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._messaging_backend = link.transport
         self._d2d_mode = discovery != "registry"
         self.link = link
+        self._before_live = before_live
         self._started = asyncio.Event()
         self._ready = asyncio.Event()
         self._linked = asyncio.Event()
@@ -149,6 +154,8 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
             await super()._connect_messaging()
         finally:
             self._messaging_backend = stock
+        if self._before_live is not None and not self._ready.is_set():
+            await self._before_live(self.messaging)
 
     async def _notify_conn_state(self, state: bool) -> None:
         if state:
@@ -179,6 +186,9 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
 
     async def _send_event(self, subject: str, data: bytes) -> None:
         assert self.messaging is not None
+        if not valid_json(data):
+            _log.error("dropped an event on %s: it holds NaN or Infinity, which JSON cannot carry", subject)
+            return
         try:
             if self.messaging.is_connected:
                 self._lost_at = None

@@ -1,0 +1,144 @@
+"""The framework's runtime on our backend: ready when it says so, honest when it fails, gone when it is told to go."""
+
+import asyncio
+import json
+import threading
+
+import pytest
+from device_connect_edge import DeviceRuntime
+from fixtures.bare_caller import Caller
+from fixtures.echo_device import EchoDriver
+from fixtures.waiting import free_port, until
+
+from strands_robots.device_connect._compat import Runtime
+from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client, register, sessions
+
+
+@pytest.fixture
+def link():
+    return loopback_config(free_port())
+
+
+@pytest.fixture
+async def runtime(link):
+    made = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
+    task = asyncio.create_task(made.run())
+    await made.wait_ready(10)
+    yield made
+    await made.shutdown()
+    assert task.done()
+    assert not sessions.open_links()
+
+
+async def test_a_ready_device_is_callable_and_discoverable_at_once(runtime, link):
+    async with Caller(client=await open_client(link)) as caller:
+        assert (await caller.call("arm-1", "getStatus", {"value": "x"}))["result"]["value"] == "x"
+        await caller.sees("arm-1", within=2)
+
+
+async def test_the_status_that_presence_tells_is_the_live_one(runtime, link):
+    async with Caller(client=await open_client(link)) as caller:
+        heard = []
+
+        async def on_presence(data, _reply):
+            heard.append(json.loads(data)["status"].get("availability"))
+
+        await caller.client.subscribe("device-connect.default.arm-1.presence", on_presence, subscribe_only=True)
+        runtime.status["availability"] = "busy"
+        await until(lambda: "busy" in heard)
+
+
+async def test_a_foreign_thread_may_emit(runtime, link):
+    async with Caller(client=await open_client(link)) as caller:
+        heard = await caller.hears("arm-1", "tick")
+        thread = threading.Thread(target=lambda: [runtime.emit_from_thread("tick", {"n": n}) for n in range(100)])
+        thread.start()
+        await until(lambda: len(heard) == 100)
+        thread.join()
+        assert [each["n"] for each in heard] == list(range(100))
+
+
+async def test_an_event_that_json_cannot_carry_is_dropped_and_the_next_one_flows(runtime, link, caplog):
+    async with Caller(client=await open_client(link)) as caller:
+        heard = await caller.hears("arm-1", "tick")
+        await runtime.enqueue_event("tick", {"n": float("nan")})
+        await runtime.enqueue_event("tick", {"n": 2})
+        await until(lambda: heard)
+        assert heard == [{"n": 2}]
+        assert "NaN" in caplog.text
+
+
+async def test_a_driver_that_cannot_connect_is_reported_and_leaves_nothing_open(link):
+    class Broken(EchoDriver):
+        async def connect(self):
+            raise OSError("no motor answers")
+
+    runtime = Runtime(driver=Broken(), device_id="arm-1", link=link, allow_insecure=True)
+    task = asyncio.create_task(runtime.run())
+    with pytest.raises(OSError, match="no motor answers"):
+        await runtime.wait_ready(10)
+    await asyncio.gather(task, return_exceptions=True)
+    assert not sessions.open_links()
+
+
+async def test_a_start_that_waits_for_a_router_can_be_ended():
+    absent = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=0.3)
+    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=absent, allow_insecure=True)
+    task = asyncio.create_task(runtime.run())
+    with pytest.raises(TimeoutError):
+        await runtime.wait_ready(0.2)
+    await runtime.shutdown()
+    assert task.done()
+    await until(lambda: not sessions.open_links(), 2)
+
+
+async def test_a_link_on_which_nobody_proves_who_he_is_needs_the_opt_in(link):
+    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link)
+    task = asyncio.create_task(runtime.run())
+    with pytest.raises(ValueError, match="allow_insecure"):
+        await runtime.wait_ready(5)
+    await asyncio.gather(task, return_exceptions=True)
+    assert not sessions.open_links()
+
+
+async def test_certificates_in_the_environment_do_not_change_an_explicit_link(link, monkeypatch):
+    monkeypatch.setenv("MESSAGING_TLS_CA_FILE", "/nowhere/ca.pem")
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:1")
+    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
+    task = asyncio.create_task(runtime.run())
+    await runtime.wait_ready(5)
+    assert runtime.messaging.link == link
+    await runtime.shutdown()
+    assert task.done()
+
+
+async def test_a_stock_runtime_may_use_the_backend_by_name(link):
+    runtime = DeviceRuntime(
+        driver=EchoDriver(), device_id="arm-1", messaging_backend=register(link), allow_insecure=True
+    )
+    task = asyncio.create_task(runtime.run())
+    try:
+        async with Caller(client=await open_client(link)) as caller:
+            await caller.sees("arm-1")
+            assert (await caller.call("arm-1", "getStatus"))["result"]
+    finally:
+        await runtime.stop()
+        await asyncio.gather(task, return_exceptions=True)
+    assert not sessions.open_links()
+
+
+async def test_the_departure_is_told(link):
+    first = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
+    task = asyncio.create_task(first.run())
+    await first.wait_ready(5)
+    async with Caller(client=await open_client(link)) as caller:
+        farewells = []
+
+        async def on_presence(data, _reply):
+            if json.loads(data).get("departing"):
+                farewells.append(True)
+
+        await caller.client.subscribe("device-connect.default.arm-1.presence", on_presence, subscribe_only=True)
+        await first.shutdown()
+        await until(lambda: farewells)
+    assert task.done()
