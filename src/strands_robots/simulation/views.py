@@ -93,7 +93,7 @@ def _fit(stage: Stage, data: Any) -> tuple[Floats, float]:
     spread = float(np.linalg.norm(high - low))
     tallest = float(min(max(spots[:, 2].max(), 0.1), 1.0))
     centre = (low + high) / 2 + np.array([0.11, 0.0, 0.0])
-    return np.array([centre[0], centre[1], 0.13 if tallest > 0.15 else 0.06]), 0.72 + 0.85 * spread
+    return np.array([centre[0], centre[1], 0.13 if tallest > 0.15 else 0.06]), 0.95 + 0.85 * spread
 
 
 def pose(stage: Stage, data: Any, qpos: Floats) -> None:
