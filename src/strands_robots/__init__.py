@@ -1,1 +1,44 @@
-"""Robots on a network where agents find them, drive them and can always stop them."""
+"""Robots on a network where agents find them, drive them and can always stop them.
+
+Every name is loaded when it is first used, so that the package imports with no extra installed.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from strands_robots.hardware import HardwareRobot
+    from strands_robots.robot import Robot, run
+    from strands_robots.simulation import Simulation
+
+    __version__: str
+
+__all__ = ["HardwareRobot", "Robot", "Simulation", "__version__", "run"]
+
+_HOMES = {
+    "HardwareRobot": "strands_robots.hardware",
+    "Robot": "strands_robots.robot",
+    "Simulation": "strands_robots.simulation",
+    "run": "strands_robots.robot",
+}
+_SIM_PACKAGES = ("mujoco", "numpy", "PIL")
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version("strands-robots")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        return getattr(import_module(_HOMES[name]), name)
+    except ModuleNotFoundError as exc:
+        if (exc.name or "").partition(".")[0] not in _SIM_PACKAGES:
+            raise
+        utils = import_module("strands_robots.utils")
+        raise utils.missing_extra(name, "sim") from exc
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -191,9 +191,13 @@ class Rollout:
         return not self.running
 
     def request_stop(self) -> None:
-        """Void the permit and wake the loop; returns at once."""
+        """Void the permit, wake the loop and tell the policy; returns at once."""
         self._permit.withdraw()
         self._ending.set()
+        try:
+            self._policy.interrupt()
+        except Exception:
+            logger.exception("The policy %s of %s raised when interrupted.", self.policy_name, self.robot)
 
     def stop(self, timeout: float = STOP_JOIN_S) -> bool:
         """Stop, and tell the truth: False when the loop has not ended within ``timeout`` seconds.
@@ -218,8 +222,10 @@ class Rollout:
                 except PermitVoidError:
                     state = "stopped"
                 except Exception as exc:
-                    state, self.error = "error", f"{type(exc).__name__}: {exc}"
-                    logger.exception("The rollout of %s on %s failed; it holds.", self.policy_name, self.robot)
+                    # What was told to stop may give up in any way it likes.
+                    if self._permit.valid:
+                        state, self.error = "error", f"{type(exc).__name__}: {exc}"
+                        logger.exception("The rollout of %s on %s failed; it holds.", self.policy_name, self.robot)
                 state = self._hold(state)
         except Exception as exc:
             state, self.error = "error", f"{type(exc).__name__}: {exc}"

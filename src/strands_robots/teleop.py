@@ -143,6 +143,9 @@ class LeaderPolicy:
         self._publish(frame)
         return {key: self._last[key] for key in target}
 
+    def interrupt(self) -> None:
+        """A leader cannot be told to give up; a read that hangs ends by itself or never."""
+
     def close(self) -> None:
         """The leader stays connected: it is its owner's."""
 

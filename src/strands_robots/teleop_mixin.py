@@ -89,8 +89,10 @@ class TeleopMixin:
             return error(str(exc))
         with self.starting:
             if name in self.teleoperating():
-                return error(f"{name} teleoperates {self._sessions[name][0].robot} now; stop_teleoperate it first.")
-            self._attached[name] = attachment
+                return error(
+                    f"{name} teleoperates {self._teleop_sessions[name][0].robot} now; stop_teleoperate it first."
+                )
+            self._teleop_leaders[name] = attachment
         return success(f"{name} will lead {attachment.robot}.", name=name, robot=attachment.robot)
 
     def teleoperate(
@@ -111,9 +113,9 @@ class TeleopMixin:
         try:
             seconds = None if duration is None else number("duration", duration, above=0, high=3600)
             rate = number("hz", hz, low=1, high=1000)
-            sink = self._sink(flag("publish", publish))
+            sink = self._teleop_sink(flag("publish", publish))
             with self.starting:
-                session = self._begin(identifier("name", name), seconds, rate, sink)
+                session = self._lead(identifier("name", name), seconds, rate, sink)
         except MotionRefused as refused:
             return refused.envelope
         except ValidationError as exc:
@@ -130,7 +132,7 @@ class TeleopMixin:
         for session in asked.values():
             session.request_stop()
         late = [key for key, each in asked.items() if not each.join(max(0.0, deadline - time.monotonic()))]
-        fields = {"stopped": not late, "was_running": True, "leaders": self._rows(asked)}
+        fields = {"stopped": not late, "was_running": True, "leaders": self._teleop_rows(asked)}
         if late:
             return error(
                 f"{', '.join(late)}: the loop still waits for its leader; it sends no action any more.", **fields
@@ -139,12 +141,12 @@ class TeleopMixin:
 
     def teleop_status(self) -> Envelope:
         """One row for each leader that leads or has led: robot, frames, errors, state, steps and rate."""
-        rows = self._rows({name: rollout for name, (rollout, _) in self._sessions.items()})
+        rows = self._teleop_rows({name: rollout for name, (rollout, _) in self._teleop_sessions.items()})
         return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
 
     def teleoperating(self) -> dict[str, Rollout]:
         """The running sessions by leader."""
-        return {name: rollout for name, (rollout, _) in list(self._sessions.items()) if rollout.running}
+        return {name: rollout for name, (rollout, _) in list(self._teleop_sessions.items()) if rollout.running}
 
     def teleoperated_by(self, robot: str) -> str:
         """The leader that drives the body of that name now; empty when none does."""
@@ -158,22 +160,22 @@ class TeleopMixin:
         return {f"teleoperation {name}": partial(_ended, session, deadline) for name, session in running.items()}
 
     @cached_property
-    def _attached(self) -> dict[str, Attachment]:
+    def _teleop_leaders(self) -> dict[str, Attachment]:
         return {}
 
     @cached_property
-    def _sessions(self) -> dict[str, tuple[Rollout, LeaderPolicy]]:
+    def _teleop_sessions(self) -> dict[str, tuple[Rollout, LeaderPolicy]]:
         return {}
 
-    def _sink(self, publish: bool) -> InputSink | None:
+    def _teleop_sink(self, publish: bool) -> InputSink | None:
         if publish and self.input_sink is None:
             raise ValidationError("publish must be false: no network that carries input streams is attached.")
         return self.input_sink if publish else None
 
-    def _begin(self, name: str, seconds: float | None, rate: float, sink: InputSink | None) -> Rollout:
-        attachment = self._attached.get(name)
+    def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None) -> Rollout:
+        attachment = self._teleop_leaders.get(name)
         if attachment is None:
-            known = ", ".join(self._attached) or "none yet"
+            known = ", ".join(self._teleop_leaders) or "none yet"
             raise ValidationError(f"name must be an attached leader ({known}), not {name!r}; attach_teleop it first.")
         body = self.body(attachment.robot)
         busy = self.occupied(body.name) or self.teleoperated_by(body.name)
@@ -197,14 +199,14 @@ class TeleopMixin:
             duration=seconds,
             hz=rate,
         )
-        self._sessions[name] = (session, policy)
+        self._teleop_sessions[name] = (session, policy)
         session.start()
         return session
 
-    def _rows(self, sessions: Mapping[str, Rollout]) -> dict[str, dict[str, Any]]:
+    def _teleop_rows(self, sessions: Mapping[str, Rollout]) -> dict[str, dict[str, Any]]:
         rows = {}
         for name, rollout in sessions.items():
-            policy = self._sessions[name][1]
+            policy = self._teleop_sessions[name][1]
             rows[name] = {
                 **rollout.row(),
                 "state": rollout.state,

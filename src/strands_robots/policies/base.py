@@ -31,5 +31,8 @@ class Policy(Protocol):
         are accepted; the rollout ends with an error and a hold on anything else.
         """
 
+    def interrupt(self) -> None:
+        """The rollout is to end: a ``reset`` or ``act`` that waits shall give up. From another thread; never waits."""
+
     def close(self) -> None:
         """Free what the policy holds. Called once, whatever happened, also after a failed reset."""

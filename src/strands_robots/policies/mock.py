@@ -72,6 +72,9 @@ class MockPolicy:
         self._step += 1
         return {key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges}
 
+    def interrupt(self) -> None:
+        """It never waits."""
+
     def close(self) -> None:
         """Nothing to free."""
 

@@ -62,7 +62,9 @@ def create_policy(provider: str, **options: Any) -> Policy:
     except TypeError as exc:
         raise ValidationError(f"policy_provider {name} cannot be made with {shown(sorted(options))}: {exc}.") from exc
     if not isinstance(policy, Policy):
-        raise ValidationError(f"policy_provider {name} gave {shown(policy)}, which lacks reset, act or close.")
+        raise ValidationError(
+            f"policy_provider {name} gave {shown(policy)}, which lacks uses_cameras, reset, act, interrupt or close."
+        )
     return policy
 
 

@@ -1,0 +1,8 @@
+"""Real robots: the robot contract over any device with LeRobot's robot interface."""
+
+from __future__ import annotations
+
+from strands_robots.hardware.body import DeviceBody
+from strands_robots.hardware.robot import HardwareRobot
+
+__all__ = ["DeviceBody", "HardwareRobot"]

@@ -1,0 +1,129 @@
+"""A device as the body of a control loop: every exchange under its bus lock, every write under a valid permit."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Literal
+
+from strands_robots.bus_access import action_ranges, bus_lock, read_joints
+from strands_robots.policies.base import Action
+from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.utils import ValidationError, number, shown
+
+StopLevel = Literal["hold", "release"]
+STOP_LEVELS = ("hold", "release")
+
+_INTERFACE = ("get_observation", "send_action", "connect", "disconnect")
+
+
+class DeviceBody:
+    """One device with LeRobot's robot interface.
+
+    Args:
+        name: what it is called in events and refusals.
+        device: the device.
+        joint_ranges: lowest and highest target by action key; what is not named is asked of the device.
+        stop_level: hold (freeze with torque on) or release (torque off: an arm falls).
+
+    Raises:
+        ValidationError: the device lacks a part of the interface, a range is none, or it cannot release torque.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        device: Any,
+        joint_ranges: Mapping[str, tuple[float, float]] | None = None,
+        stop_level: StopLevel = "hold",
+    ) -> None:
+        self.name = name
+        self.device = device
+        missing = [verb for verb in _INTERFACE if not callable(getattr(device, verb, None))]
+        missing += [name for name in ("observation_features", "action_features") if not hasattr(device, name)]
+        if missing:
+            raise ValidationError(f"device must have LeRobot's robot interface; {shown(device)} lacks {missing}.")
+        if stop_level == "release" and not callable(getattr(getattr(device, "bus", None), "disable_torque", None)):
+            raise ValidationError(f"stop_level must be hold: {shown(device)} has no bus.disable_torque().")
+        self.stop_level = stop_level
+        self.lock = bus_lock(device)
+        self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
+        self._latest: tuple[float, dict[str, float]] | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        """What the device says; a device that says nothing counts as connected."""
+        return bool(getattr(self.device, "is_connected", True))
+
+    @property
+    def latest_joints(self) -> tuple[float, dict[str, float]] | None:
+        """Seconds since the last joint read, and its joints; None before the first."""
+        latest = self._latest
+        return None if latest is None else (time.monotonic() - latest[0], dict(latest[1]))
+
+    def get_observation(self) -> dict[str, Any]:
+        with self.lock:
+            return dict(self.device.get_observation())
+
+    def get_joints(self) -> dict[str, float]:
+        with self.lock:
+            joints = read_joints(self.device)
+            self._latest = (time.monotonic(), joints)
+            return dict(joints)
+
+    def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
+        with self.lock:
+            if not permit.valid:
+                raise PermitVoidError(f"{self.name} was stopped")
+            sent = self.device.send_action(dict(action))
+            return sent if isinstance(sent, Mapping) else dict(action)
+
+    def hold(self, permit: Permit | None = None) -> None:
+        with self.lock:
+            if permit is None or not permit.revoked:
+                self._hold()
+
+    def stop(self) -> None:
+        """Freeze, or let go, as the stop level says."""
+        with self.lock:
+            if self.stop_level == "release":
+                self.device.bus.disable_torque()
+            else:
+                self._hold()
+
+    def running(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def _hold(self) -> None:
+        """The device's own ``hold()``, else the present position as the target and every velocity zero."""
+        own = getattr(self.device, "hold", None)
+        if callable(own):
+            own()
+            return
+        still = {key: 0.0 for key in self.bounds if _is_velocity(key)}
+        if len(still) < len(self.bounds):
+            present = self.get_joints()
+            still |= {key: present[key] for key in self.bounds if key in present and key not in still}
+        if still:
+            self.device.send_action(still)
+
+
+def _is_velocity(key: str) -> bool:
+    return key.endswith((".vel", "_vel", ".velocity"))
+
+
+def _checked(ranges: Mapping[str, tuple[float, float]], device: Any) -> dict[str, tuple[float, float]]:
+    checked = {}
+    for key, pair in ranges.items():
+        if key not in device.action_features:
+            raise ValidationError(f"joint_ranges has {shown(key)}, which is no action of the device.")
+        try:
+            low, high = pair
+        except (TypeError, ValueError):
+            raise ValidationError(f"joint_ranges[{key!r}] must be a pair of numbers, not {shown(pair)}.") from None
+        bottom = -math.inf if low == -math.inf else number(f"joint_ranges[{key!r}] low", low)
+        top = math.inf if high == math.inf else number(f"joint_ranges[{key!r}] high", high, above=bottom)
+        checked[key] = (bottom, top)
+    return checked

@@ -1,0 +1,175 @@
+"""A real robot behind the contract: tasks, teleoperation and single actions, and one verb that halts them all."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, cast
+
+from strands_robots import settings
+from strands_robots.bus_access import joint_read_source
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.hardware.body import STOP_LEVELS, DeviceBody, StopLevel
+from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks, ended
+from strands_robots.policies.actions import checked_action
+from strands_robots.safety.gate import MotionRefused, Permit, PermitVoidError
+from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.utils import ValidationError, choice, number, text
+
+logger = logging.getLogger(__name__)
+
+
+class HardwareRobot(Tasks):
+    """Any device with LeRobot's robot interface, driven by tasks, leaders and single actions.
+
+    Args:
+        device: has ``observation_features``, ``action_features``, ``get_observation``, ``send_action``, ``connect``,
+            ``disconnect``, and may have ``is_connected``, ``joint_ranges``, ``get_joints`` and ``hold``.
+        tool_name: what the robot is called on a network, 1 to 128 characters.
+        control_hz: control rate, 1 to 2000; ``STRANDS_CONTROL_HZ`` by default.
+        joint_ranges: lowest and highest target by action key, in the device's unit; what is not named is asked of
+            the device, and unbounded where it does not know.
+        stop_level: what a halt leaves: ``hold`` (frozen, torque on) or ``release`` (torque off: an arm falls).
+
+    Raises:
+        ValidationError: an argument outside its domain, or a device that lacks a part of the interface.
+    """
+
+    def __init__(
+        self,
+        device: Any,
+        tool_name: str = "robot",
+        control_hz: float | None = None,
+        *,
+        joint_ranges: Mapping[str, tuple[float, float]] | None = None,
+        stop_level: StopLevel = "hold",
+    ) -> None:
+        name = text("tool_name", tool_name, longest=128)
+        rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
+        level = cast(StopLevel, choice("stop_level", stop_level, STOP_LEVELS))
+        super().__init__(DeviceBody(name, device, joint_ranges, level), number("control_hz", rate, low=1, high=2000))
+        self.device = device
+        self._sends: set[Permit] = set()
+
+    def connect(self) -> None:
+        """Connect the device; a LeRobot device without asking for calibration. Raises what the device raises."""
+        if self._body.is_connected and hasattr(self.device, "is_connected"):
+            return
+        with self._body.lock:
+            if "calibrate" in inspect.signature(self.device.connect).parameters:
+                self.device.connect(calibrate=False)
+            else:
+                self.device.connect()
+
+    def get_features(self) -> Envelope:
+        """``observation_features`` and ``action_features`` as data (``float``, or an image's shape), with ranges."""
+        return success(
+            f"{len(self._body.bounds)} action keys.",
+            observation_features={key: _kind(kind) for key, kind in self.device.observation_features.items()},
+            action_features={key: _kind(kind) for key, kind in self.device.action_features.items()},
+            ranges={key: [low, high] for key, (low, high) in self._body.bounds.items() if high - low < float("inf")},
+        )
+
+    def get_state(self) -> Envelope:
+        """``joints`` by name in the device's unit, ``joints_age_s``, and ``task``.
+
+        The read waits its turn on the bus for at most a control period; then the joints are those of the last
+        read, and ``joints_error`` says why. A camera that fails does not touch them.
+        """
+        problem = self._refresh(1 / self.control_hz)
+        age, joints = self._body.latest_joints or (None, {})
+        fields: dict[str, Any] = {"joints": joints, "task": self._task_fields()}
+        fields["joints_age_s"] = None if age is None else round(age, 4)
+        if problem:
+            fields["joints_error"] = problem
+        return success(problem or f"{len(joints)} joints.", **fields)
+
+    def get_observation(self) -> dict[str, Any]:
+        """Everything the device sees, images included, in its turn on the bus. Raises what the device raises."""
+        return self._body.get_observation()
+
+    def send_action(self, action: Mapping[str, float]) -> Envelope:
+        """Set targets once; ``sent`` is what the device really took. Refused while a task or a leader drives it."""
+        try:
+            with self.starting:
+                permit = self.gate.permit("send_action")
+                self._free()
+                targets = checked_action(dict(action) if isinstance(action, Mapping) else action, self._body.bounds)
+            self._sends.add(permit)
+            try:
+                sent = self._body.send_action(targets, permit)
+            finally:
+                self._sends.discard(permit)
+        except MotionRefused as refused:
+            return refused.envelope
+        except PermitVoidError as void:
+            return error(f"send_action was overtaken by a stop: {void}.")
+        except Exception as exc:
+            if not isinstance(exc, ValidationError):
+                logger.exception("%s did not take an action.", self.tool_name_str)
+            return error(str(exc) if isinstance(exc, ValidationError) else f"{type(exc).__name__}: {exc}")
+        return success(f"Sent {len(targets)} targets.", sent=dict(sent))
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop tasks, leaders and single actions, and freeze the robot; answers within ``STRANDS_HALT_DEADLINE_S``.
+
+        Every permit is void first. A verdict of stopped means: no write is in flight, none will follow until
+        somebody starts anew, and the robot was frozen. A bus that does not answer is ``not_stopped``.
+        """
+        began = time.monotonic()
+        deadline = began + ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+        sending = bool(self._sends)
+        self.gate.revoke()
+        sources: dict[str, Callable[[], object]] = {}
+        task = self._task
+        if task is not None and task.running:
+            task.request_stop()
+            sources["task"] = partial(ended, task, deadline)
+        sources.update(self.teleop_stops(deadline))
+        if sending:
+            sources["send_action"] = lambda: success("Sent.", stopped=True)
+        problem = self._freeze(deadline)
+        verdict = halt_each(sources) if problem is None else _unfrozen(problem, tuple(sources))
+        logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
+        return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
+
+    def cleanup(self) -> Envelope:
+        """Halt and disconnect. A robot that did not stop stays connected, so that it can still be stopped."""
+        verdict = self.halt("cleanup")
+        if not verdict.stopped:
+            return verdict.envelope()
+        if self._body.is_connected:
+            try:
+                with self._body.lock:
+                    self.device.disconnect()
+            except Exception as exc:
+                logger.exception("%s did not disconnect.", self.tool_name_str)
+                return error(f"Halted, but the device did not disconnect: {type(exc).__name__}: {exc}")
+        return success("Halted and disconnected.", stopped=True)
+
+    def _refresh(self, within_s: float) -> str:
+        if joint_read_source(self) is None or not self._body.is_connected:
+            return "The device is not connected."
+        if not self._body.lock.acquire(timeout=within_s):
+            return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
+        try:
+            self._body.get_joints()
+        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
+            logger.warning("The joints of %s could not be read: %s", self.tool_name_str, exc)
+            return f"The joints could not be read: {type(exc).__name__}: {exc}"
+        finally:
+            self._body.lock.release()
+        return ""
+
+
+def _unfrozen(problem: str, moving: tuple[str, ...]) -> StopVerdict:
+    """What moved may move on; of a robot that stood still nobody knows."""
+    return StopVerdict(not_stopped=dict.fromkeys(moving, problem), unknown={} if moving else {"bus": problem})
+
+
+def _kind(kind: Any) -> Any:
+    return getattr(kind, "__name__", None) or (list(kind) if isinstance(kind, tuple | list) else str(kind))

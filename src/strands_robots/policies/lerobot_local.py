@@ -1,0 +1,88 @@
+"""A LeRobot checkpoint as a policy, computed in this process.
+
+Written against LeRobot 0.4 (``lerobot.policies.factory`` and ``lerobot.policies.utils``). LeRobot with its torch is
+not installed where this project is tested, so this module is **not verified** beyond its refusals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+from strands_robots.policies.base import Action, Ranges
+from strands_robots.utils import ValidationError, missing_extra, text
+
+
+class LeRobotPolicy:
+    """Loads a checkpoint and asks it for every action.
+
+    Args:
+        pretrained_name_or_path: a model on the Hugging Face hub, ``org/name``, or a local directory.
+        device: a torch device; by default the checkpoint's own.
+
+    Raises:
+        ValidationError: no checkpoint named.
+        MissingExtraError: the [lerobot] extra is not installed.
+    """
+
+    uses_cameras = True
+
+    def __init__(self, pretrained_name_or_path: str = "", device: str = "") -> None:
+        try:
+            import_module("lerobot")
+        except ModuleNotFoundError as exc:
+            raise missing_extra("The policy lerobot_local", "lerobot") from exc
+        if not pretrained_name_or_path:
+            raise ValidationError("pretrained_name_or_path must name a checkpoint, such as 'org/name', not ''.")
+        self._checkpoint = text("pretrained_name_or_path", pretrained_name_or_path, longest=4096)
+        self._device = text("device", device, longest=64, empty=True)
+        self._instruction = ""
+        self._keys: tuple[str, ...] = ()
+        self._features: dict[str, Any] = {}
+        self._model: Any = None
+        self._before: Any = None
+        self._after: Any = None
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        """Load the checkpoint; the first time it may be fetched from the hub, which takes minutes."""
+        factory = import_module("lerobot.policies.factory")
+        config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(self._checkpoint)
+        if self._device:
+            config.device = self._device
+        self._model = factory.get_policy_class(config.type).from_pretrained(self._checkpoint, config=config)
+        self._before, self._after = factory.make_pre_post_processors(config, pretrained_path=self._checkpoint)
+        self._model.reset()
+        self._instruction = instruction
+        self._keys = tuple(ranges)
+        self._features = {}
+
+    def act(self, observation: Mapping[str, Any]) -> Action:
+        utils = import_module("lerobot.policies.utils")
+        if not self._features:
+            self._features = self._described(observation)
+        frame = utils.build_inference_frame(
+            observation=dict(observation),
+            ds_features=self._features,
+            device=self._model.config.device,
+            task=self._instruction,
+        )
+        with import_module("torch").inference_mode():
+            tensor = self._after(self._model.select_action(self._before(frame)))
+        action: Action = utils.make_robot_action(tensor, self._features)
+        return action
+
+    def interrupt(self) -> None:
+        """A forward pass cannot be broken off; it is short."""
+
+    def close(self) -> None:
+        self._model = self._before = self._after = None
+
+    def _described(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        described = import_module("lerobot.datasets.utils").hw_to_dataset_features
+        seen = {key: tuple(value.shape) if getattr(value, "ndim", 0) else float for key, value in observation.items()}
+        features: dict[str, Any] = {
+            **described(dict.fromkeys(self._keys, float), "action"),
+            **described(seen, "observation"),
+        }
+        return features

@@ -1,0 +1,204 @@
+"""``Robot(name)``: a running robot by its name, simulated or real, and ``run``, which serves it until a signal."""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from strands_robots._mesh_switch import mesh_env_request
+from strands_robots.contract import adapt
+from strands_robots.envelope import is_error, text_of
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import ValidationError, choice, device_id, identifier, missing_extra, shown
+
+logger = logging.getLogger(__name__)
+
+_SIM_PACKAGES = ("mujoco", "numpy", "PIL")
+
+
+class Networked:
+    """What :func:`Robot` adds to a robot: its place on the networks."""
+
+    peer_id: str | None = None
+    mesh: Any = None
+    """The robot's native mesh peer, or None."""
+
+    def run(self, **options: Any) -> StopVerdict:
+        """Serve this robot on Device Connect until SIGINT or SIGTERM; see :func:`run`."""
+        return run(self, **{"peer_id": self.peer_id, **options})
+
+    def cleanup(self) -> Any:
+        """Leave the mesh, then halt and let go of everything."""
+        peer, self.mesh = self.mesh, None
+        if peer is not None:
+            peer.stop()
+        return super().cleanup()  # type: ignore[misc]  # the robot class stands behind this one
+
+
+def Robot(  # the factory reads as the class it stands for
+    name: str = "so100",
+    mode: str = "sim",
+    *,
+    tool_name: str | None = None,
+    peer_id: str | None = None,
+    mesh: bool | None = None,
+    **options: Any,
+) -> Any:
+    """A running robot.
+
+    Args:
+        name: in simulation a model: ``so100``, ``so101``, ``rover``, the path of an MJCF or URDF file, or a
+            ``robot_descriptions`` name. Real: a LeRobot robot type, such as ``so100_follower`` or ``so100``.
+        mode: ``sim`` (MuJoCo, moving in real time) or ``real`` (a LeRobot device, connected without calibration).
+        tool_name: what it is called on a network; the robot's name by default.
+        peer_id: its id on the networks.
+        mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
+        options: ``sim``: what ``Simulation`` takes (``timestep``, ``gravity``, ``realtime``). ``real``:
+            ``control_hz``, ``joint_ranges``, ``stop_level``, and every other one goes to the LeRobot
+            configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``.
+
+    Raises:
+        ValidationError: an unknown name (the sentence lists the near ones) or an option outside its domain.
+        MissingExtraError: the [sim] or [lerobot] extra, or that of the mesh, is not installed.
+    """
+    kind = choice("mode", mode, ("sim", "real"))
+    if mesh is not None and not isinstance(mesh, bool):
+        raise ValidationError(f"mesh must be true, false or None, not {shown(mesh)}.")
+    if peer_id is not None:
+        identifier("peer_id", peer_id)
+    robot = _simulated(name, tool_name, options) if kind == "sim" else _real(name, tool_name, options)
+    robot.peer_id = peer_id
+    if mesh or (mesh is None and mesh_env_request()):
+        try:
+            robot.mesh = _join_mesh(robot, peer_id, "sim" if kind == "sim" else "robot")
+        except BaseException:
+            robot.cleanup()
+            raise
+    return robot
+
+
+def run(
+    robot: Any,
+    *,
+    peer_id: str | None = None,
+    until: threading.Event | None = None,
+    **network: Any,
+) -> StopVerdict:
+    """Serve ``robot`` on Device Connect until SIGINT, SIGTERM or ``until``; then halt it first, and say so.
+
+    Without a network in the arguments or the environment it is served on this machine alone. Called outside the
+    main thread there are no signals, and ``until`` is needed.
+
+    Args:
+        robot: any robot that ``init_device_connect`` takes.
+        peer_id: its id, without dots; made from its name by default.
+        until: ends the serving as a signal does.
+        network: what else ``init_device_connect`` takes, such as ``messaging_url`` and ``allow_insecure``.
+
+    Returns:
+        What the halt did.
+    """
+    from strands_robots import device_connect  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.device_connect.links import usual_link  # noqa: PLC0415
+
+    if peer_id is not None:
+        device_id("peer_id", peer_id)
+    if not {"messaging_url", "messaging_backend", "link"} & network.keys():
+        network["link"] = usual_link(network.get("tenant"))
+    body = robot if callable(getattr(robot, "halt", None)) else adapt(robot)
+    verdict = StopVerdict()
+    with _signals(until) as asked:
+        runtime = device_connect.init_device_connect_sync(robot, peer_id=peer_id, **network)
+        logger.info("Serving %s; Ctrl-C stops the robot first.", runtime.device_id)
+        try:
+            asked.wait()
+        finally:
+            verdict = body.halt("run ended")
+            still = verdict.stopped is True
+            logger.log(logging.INFO if still else logging.CRITICAL, "%s", text_of(verdict.envelope()))
+            device_connect.stop_device_connect(runtime)
+    return verdict
+
+
+class _Until:
+    """An event of the caller's in the place of the signals."""
+
+    def __init__(self, event: threading.Event) -> None:
+        self._event = event
+
+    def __enter__(self) -> threading.Event:
+        return self._event
+
+    def __exit__(self, *exc: object) -> None:
+        """Nothing to put back."""
+
+
+def _signals(until: threading.Event | None) -> Any:
+    if until is not None:
+        return _Until(until)
+    from strands_robots.device_connect import StopSignal  # noqa: PLC0415 - as above
+
+    return StopSignal()
+
+
+def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
+    try:
+        made = _simulation_class()
+    except ModuleNotFoundError as exc:
+        if (exc.name or "").partition(".")[0] in _SIM_PACKAGES:
+            raise missing_extra("A simulated robot", "sim") from exc
+        raise
+    label = _label(name)
+    simulation = _made(made, tool_name=tool_name or label, **options)
+    answer = simulation.add_robot(label, model=name)
+    if is_error(answer):
+        simulation.cleanup()
+        raise ValidationError(str(answer["reason"]))
+    return simulation
+
+
+def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
+    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - real hardware only
+
+    ours = {key: options.pop(key) for key in ("control_hz", "joint_ranges", "stop_level") if key in options}
+    robot = _made(_hardware_class(), make_device(name, options), tool_name=tool_name or _label(name), **ours)
+    robot.connect()
+    return robot
+
+
+@cache
+def _simulation_class() -> type[Any]:
+    from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
+
+    return type("Robot", (Networked, Simulation), {"__doc__": Simulation.__doc__})
+
+
+@cache
+def _hardware_class() -> type[Any]:
+    from strands_robots.hardware import HardwareRobot  # noqa: PLC0415 - real hardware only
+
+    return type("Robot", (Networked, HardwareRobot), {"__doc__": HardwareRobot.__doc__})
+
+
+def _made(factory: type[Any], *args: Any, **options: Any) -> Any:
+    try:
+        return factory(*args, **options)
+    except TypeError as exc:
+        raise ValidationError(f"Robot cannot be made with {', '.join(options)}: {exc}.") from exc
+
+
+def _label(name: object) -> str:
+    if not isinstance(name, str | Path) or not str(name).strip():
+        raise ValidationError(f"name must be a robot's name or the path of its model, not {shown(name)}.")
+    stem = Path(name).stem if "/" in str(name) or Path(name).suffix in (".xml", ".mjcf", ".urdf") else str(name)
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", stem)[:100].strip("-_") or "robot"
+
+
+def _join_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Any:
+    from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the mesh is loaded when it is used
+
+    return init_mesh(robot, peer_id=peer_id, peer_type=peer_type)

@@ -1,0 +1,242 @@
+"""The control loop: its rate, its ends, its events, and that nothing is written after a stop."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import pytest
+from fixtures.bodies import RecordingBody, ScriptedPolicy, StepClock
+from fixtures.waiting import eventually
+
+from strands_robots.contract import RolloutEvent
+from strands_robots.rollout import Clock, Observers, Rollout
+from strands_robots.safety.gate import MotionGate
+
+
+def rollout(body: RecordingBody, policy: Any, gate: MotionGate | None = None, **more: Any) -> Rollout:
+    more.setdefault("hz", 200.0)
+    return Rollout(body, policy, permit=(gate or MotionGate()).permit("test"), instruction="wave", **more)
+
+
+def run(policy: Any, **more: Any) -> tuple[Rollout, RecordingBody]:
+    body = RecordingBody()
+    one = rollout(body, policy, clock=more.pop("clock", StepClock()), **more)
+    one.run()
+    return one, body
+
+
+def test_a_policy_that_is_done_completes_the_rollout_and_leaves_a_hold() -> None:
+    policy = ScriptedPolicy([{"a": 0.1}, {"a": 0.2}])
+    one, body = run(policy)
+    assert (one.state, one.step_count, one.error) == ("completed", 2, "")
+    assert [action for _, action in body.writes] == [{"a": 0.1}, {"a": 0.2}]
+    assert (body.holds, policy.closed, policy.told) == (1, 1, ["wave"])
+
+
+def test_a_rollout_ends_when_its_duration_is_over() -> None:
+    one, body = run(ScriptedPolicy([], always={"a": 0.5}), duration=1.0, hz=10.0)
+    assert (one.state, one.step_count) == ("completed", 10)
+    assert one.elapsed_s == pytest.approx(1.0)
+    assert body.holds == 1
+
+
+def test_ticks_are_at_absolute_times_and_missed_ones_are_dropped() -> None:
+    clock = StepClock()
+    clock.late = {3: 0.25}
+    one, _ = run(ScriptedPolicy([], always={"a": 0.5}), duration=1.0, hz=10.0, clock=clock)
+    assert clock.waits == pytest.approx([100.1, 100.2, 100.3, 100.6, 100.7, 100.8, 100.9, 101.0])
+    assert (one.step_count, one.missed_ticks) == (8, 2)
+
+
+def test_a_chunk_is_played_one_action_a_step_and_an_empty_one_lets_the_step_pass() -> None:
+    policy = ScriptedPolicy([[{"a": 0.1}, {"a": 0.2}], [], {"a": 0.3}])
+    clock = StepClock()
+    one, body = run(policy, clock=clock)
+    assert [action["a"] for _, action in body.writes] == [0.1, 0.2, 0.3]
+    assert one.step_count == 3
+    assert len(policy.observations) == 4
+    assert len(clock.waits) == 4
+
+
+@pytest.mark.parametrize(
+    "decision",
+    [
+        RuntimeError("no idea"),
+        {"a": float("nan")},
+        {"a": float("inf")},
+        {"a": True},
+        {"a": "0.5"},
+        {"b": 0.5},
+        {7: 0.5},
+        [{"a": 0.1}, "nonsense"],
+        5,
+    ],
+    ids=repr,
+)
+def test_a_policy_that_fails_or_asks_for_the_impossible_ends_in_error_and_a_hold(decision: Any) -> None:
+    policy = ScriptedPolicy([{"a": 0.1}, decision])
+    one, body = run(policy)
+    assert one.state == "error"
+    assert one.error
+    assert body.holds == 1
+    assert policy.closed == 1
+    assert body.writes[0][1] == {"a": 0.1}
+    assert len(body.writes) <= 2
+
+
+def test_a_target_beyond_the_range_is_clamped_to_it() -> None:
+    _, body = run(ScriptedPolicy([{"a": 7.0}]))
+    assert body.writes[0][1] == {"a": 1.0}
+
+
+def test_a_reset_that_fails_is_an_error_and_the_policy_is_closed() -> None:
+    class NoCheckpoint(ScriptedPolicy):
+        def reset(self, instruction: str, ranges: Any) -> None:
+            raise FileNotFoundError("no such checkpoint")
+
+    policy = NoCheckpoint([])
+    one, body = run(policy)
+    assert one.state == "error"
+    assert "no such checkpoint" in one.error
+    assert (policy.closed, body.writes) == (1, [])
+
+
+def test_a_body_that_fails_ends_in_error_and_a_hold() -> None:
+    body = RecordingBody()
+
+    def broken() -> None:
+        raise ConnectionError("Failed to sync write")
+
+    body.before_write = broken
+    one = rollout(body, ScriptedPolicy([{"a": 0.1}]), clock=StepClock())
+    one.run()
+    assert one.state == "error"
+    assert "Failed to sync write" in one.error
+    assert body.holds == 1
+
+
+def test_a_hold_that_fails_is_an_error_that_says_so() -> None:
+    class Wedged(RecordingBody):
+        def hold(self, permit: Any = None) -> None:
+            raise ConnectionError("dead servo 3")
+
+    one = rollout(Wedged(), ScriptedPolicy([]), clock=StepClock())
+    one.run()
+    assert one.state == "error"
+    assert "hold failed" in one.error
+
+
+def test_observers_are_told_started_each_step_and_finished() -> None:
+    seen: list[RolloutEvent] = []
+    observers = Observers()
+    observers.subscribe(seen.append)
+    run(ScriptedPolicy([{"a": 0.1}, {"a": 0.2}]), observers=observers, policy_name="scripted")
+    assert [event.kind for event in seen] == ["started", "step", "step", "finished"]
+    assert [event.step for event in seen] == [0, 1, 2, 2]
+    assert seen[1].observation == {"a": 0.25}
+    assert seen[1].action == {"a": 0.1}
+    assert (seen[-1].state, seen[-1].policy, seen[-1].robot) == ("completed", "scripted", "body")
+
+
+def test_an_observer_that_raises_harms_neither_the_loop_nor_the_others(caplog: pytest.LogCaptureFixture) -> None:
+    def broken(event: RolloutEvent) -> None:
+        raise RuntimeError("observer broke")
+
+    seen: list[RolloutEvent] = []
+    observers = Observers()
+    observers.subscribe(broken)
+    observers.subscribe(seen.append)
+    one, _ = run(ScriptedPolicy([{"a": 0.1}] * 5), observers=observers)
+    assert one.state == "completed"
+    assert len(seen) == 7
+    assert len(caplog.records) == 1
+
+
+def test_an_observer_that_unsubscribed_is_told_no_more() -> None:
+    seen: list[RolloutEvent] = []
+    observers = Observers()
+    first, second = observers.subscribe(seen.append), observers.subscribe(seen.append)
+    first()
+    first()
+    observers.tell(RolloutEvent("started", "r", "i", "p"))
+    assert len(seen) == 1
+    second()
+    observers.tell(RolloutEvent("started", "r", "i", "p"))
+    assert len(seen) == 1
+
+
+def test_a_stop_ends_the_loop_at_once_and_it_says_stopped() -> None:
+    body, policy = RecordingBody(), ScriptedPolicy([], always={"a": 0.5})
+    one = rollout(body, policy, hz=2.0)
+    one.start()
+    eventually(lambda: body.writes)
+    assert one.stop() is True
+    assert (one.state, one.running, body.holds) == ("stopped", False, 1)
+    assert policy.interrupted.is_set()
+
+
+def test_a_loop_that_outlives_its_stop_is_not_called_stopped_and_writes_nothing_more() -> None:
+    thinks, go_on = threading.Event(), threading.Event()
+    body = RecordingBody()
+
+    def thinking() -> dict[str, float]:
+        thinks.set()
+        go_on.wait(10)
+        return {"a": 0.9}
+
+    one = rollout(body, ScriptedPolicy([{"a": 0.1}, thinking], always={"a": 0.9}))
+    one.start()
+    assert thinks.wait(5)
+    assert one.stop(timeout=0.05) is False
+    assert one.running
+    written = len(body.writes)
+    go_on.set()
+    assert one.join(5)
+    assert len(body.writes) == written
+    assert one.state == "stopped"
+
+
+def test_after_a_halt_has_passed_the_lock_nothing_is_written() -> None:
+    for _ in range(30):
+        gate, body = MotionGate(), RecordingBody()
+        one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), gate, hz=2000.0)
+        one.start()
+        eventually(lambda body=body: len(body.writes) > 3)
+        gate.revoke()
+        with body.lock:
+            verdict = time.monotonic()
+        assert one.join(5)
+        assert not [moment for moment, _ in body.writes if moment > verdict]
+        assert one.state == "stopped"
+        assert body.holds == 0, "a halt freezes the body itself"
+
+
+def test_a_rollout_keeps_its_rate_on_the_real_clock() -> None:
+    body = RecordingBody()
+    one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), hz=100.0, duration=0.5, clock=Clock())
+    one.start()
+    assert one.join(10)
+    assert one.step_count + one.missed_ticks in range(49, 52)
+
+
+def test_the_thread_carries_the_robots_name() -> None:
+    hold = threading.Event()
+    one = rollout(RecordingBody(), ScriptedPolicy([lambda: hold.wait(5) and None]))
+    one.start()
+    assert "rollout-body" in [thread.name for thread in threading.enumerate()]
+    hold.set()
+    assert one.join(5)
+
+
+def test_an_observer_that_stops_its_own_rollout_does_not_deadlock() -> None:
+    observers = Observers()
+    body = RecordingBody()
+    one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), observers=observers)
+    said: list[bool] = []
+    observers.subscribe(lambda event: said.append(one.stop()) if event.kind == "step" else None)
+    one.start()
+    assert one.join(5)
+    assert said == [False]
+    assert len(body.writes) == 1
