@@ -96,7 +96,7 @@ async def test_closing_the_desk_cancels_what_runs(desk):
 async def test_events_are_handled_in_the_order_of_their_arrival_even_when_one_fails():
     seen = []
 
-    async def handler(number):
+    async def handler(_data, number):
         await asyncio.sleep(0)
         seen.append(number)
         if number == 3:
@@ -104,7 +104,7 @@ async def test_events_are_handled_in_the_order_of_their_arrival_even_when_one_fa
 
     feed = dispatch.OrderedFeed("s", handler)
     for number in range(1_000):
-        feed.accept(number)
+        feed.accept(b"", number)
     await until(lambda: len(seen) == 1_000)
     await feed.close()
     assert seen == list(range(1_000))
@@ -114,16 +114,16 @@ async def test_a_feed_whose_handler_hangs_keeps_the_newest(monkeypatch):
     monkeypatch.setattr(dispatch, "MAX_EVENTS", 10)
     gate, seen = asyncio.Event(), []
 
-    async def handler(number):
+    async def handler(_data, number):
         await gate.wait()
         seen.append(number)
 
     feed = dispatch.OrderedFeed("s", handler)
-    feed.accept(0)
+    feed.accept(b"", 0)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     for number in range(1, 31):
-        feed.accept(number)
+        feed.accept(b"", number)
     gate.set()
     await until(lambda: len(seen) == 11)
     await feed.close()
@@ -153,3 +153,44 @@ def test_a_closed_loop_swallows_what_comes_late():
     inbox = dispatch.Inbox(loop)
     loop.close()
     inbox.put(print, "nobody hears this")
+
+
+async def test_a_feed_keeps_no_more_bytes_than_it_may(monkeypatch):
+    monkeypatch.setattr(dispatch, "MAX_WAITING_BYTES", 1_000)
+    seen = []
+
+    async def handler(data):
+        seen.append(len(data))
+
+    feed = dispatch.OrderedFeed("s", handler)
+    for _ in range(5):
+        feed.accept(b"x" * 400)
+    feed.accept(b"x" * 5_000)
+    await until(lambda: seen)
+    await feed.close()
+    assert seen == [5_000]
+
+
+async def test_a_feed_takes_messages_from_threads_in_their_order():
+    loop, seen = asyncio.get_running_loop(), []
+
+    async def handler(_data, number):
+        seen.append(number)
+
+    feed = dispatch.OrderedFeed("s", handler, loop.call_soon_threadsafe)
+    thread = threading.Thread(target=lambda: [feed.accept(b"x", number) for number in range(5_000)])
+    thread.start()
+    await until(lambda: len(seen) == 5_000)
+    thread.join()
+    await feed.close()
+    assert seen == list(range(5_000))
+
+
+def test_room_runs_out_by_count_and_by_size_and_comes_back():
+    room = dispatch.Room(messages=2, size=100)
+    assert room.take(50)
+    assert not room.take(60)
+    assert room.take(50)
+    assert not room.take(0)
+    room.give_back(50)
+    assert room.take(10)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import threading
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
@@ -25,6 +26,12 @@ RESERVED_COMMANDS = 64
 
 MAX_EVENTS = 65_536
 """Messages of one subscription that wait for its handler; the oldest is dropped for the next."""
+
+MAX_WAITING_BYTES = 64 * 2**20
+"""The same in bytes, for commands, too, that arrive while the loop is held up."""
+
+MAX_ARRIVED = 4_096
+"""Commands that arrive while the loop is held up; the next is answered 'busy' by the thread that received it."""
 
 # One turn of the loop serves this many messages, then timers and sockets have their turn.
 DRAIN_AT_ONCE = 256
@@ -155,24 +162,71 @@ class CommandDesk:
             self._answer(reply, jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, reason))
 
 
-class OrderedFeed:
-    """Serves one subscription's messages one after another, in the order of their arrival."""
+class Room:
+    """How many messages, and how many bytes, may be on their way from a transport's thread to the loop."""
 
-    def __init__(self, subject: str, handler: Callable[..., Awaitable[None]]) -> None:
+    def __init__(self, messages: int = MAX_ARRIVED, size: int = MAX_WAITING_BYTES) -> None:
+        self._messages, self._size = messages, size
+        self._lock = threading.Lock()
+
+    def take(self, size: int) -> bool:
+        """Room for a message of ``size`` bytes, if there is any; from any thread."""
+        with self._lock:
+            if self._messages < 1 or self._size < size:
+                return False
+            self._messages, self._size = self._messages - 1, self._size - size
+            return True
+
+    def give_back(self, size: int) -> None:
+        """The message has arrived."""
+        with self._lock:
+            self._messages, self._size = self._messages + 1, self._size + size
+
+
+class OrderedFeed:
+    """Serves one subscription's messages one after another, in the order of their arrival.
+
+    Args:
+        subject: for the log.
+        handler: called with what ``accept`` was given.
+        hand_over: calls a function on the feed's loop; ``accept`` may then be called from any thread.
+    """
+
+    def __init__(
+        self,
+        subject: str,
+        handler: Callable[..., Awaitable[None]],
+        hand_over: Callable[[Callable[[], None]], None] | None = None,
+    ) -> None:
         self._subject = subject
         self._handler = handler
+        self._hand_over = hand_over
         self._waiting: deque[tuple[Any, ...]] = deque()
+        self._bytes = 0
+        self._lock = threading.Lock()
+        self._told = False
         self._arrived = asyncio.Event()
         self._log = Throttled(logger)
         self._task = asyncio.ensure_future(self._work())
 
     def accept(self, *message: Any) -> None:
-        """Take a message for the handler. On the loop's thread."""
-        if len(self._waiting) >= MAX_EVENTS:
-            self._waiting.popleft()
-            self._log.warning("the handler of %s is %d messages behind; dropped the oldest", self._subject, MAX_EVENTS)
-        self._waiting.append(message)
-        self._arrived.set()
+        """Take a message, whose bytes come first, for the handler."""
+        with self._lock:
+            self._waiting.append(message)
+            self._bytes += len(message[0])
+            late = 0
+            while len(self._waiting) > MAX_EVENTS or (self._bytes > MAX_WAITING_BYTES and len(self._waiting) > 1):
+                self._bytes -= len(self._waiting.popleft()[0])
+                late += 1
+            told, self._told = self._told, True
+        if late:
+            self._log.warning("the handler of %s does not keep up; dropped the oldest messages", self._subject)
+        if told:
+            return
+        if self._hand_over is None:
+            self._arrived.set()
+        else:
+            self._hand_over(self._arrived.set)
 
     async def close(self) -> None:
         """Stop serving; what still waits is dropped."""
@@ -180,14 +234,23 @@ class OrderedFeed:
         if self._task is not asyncio.current_task():
             await asyncio.gather(self._task, return_exceptions=True)
 
+    def _next(self) -> tuple[Any, ...] | None:
+        with self._lock:
+            if not self._waiting:
+                self._told = False
+                return None
+            message = self._waiting.popleft()
+            self._bytes -= len(message[0])
+            return message
+
     async def _work(self) -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()
             served = 0
-            while self._waiting:
+            while (message := self._next()) is not None:
                 try:
-                    await self._handler(*self._waiting.popleft())
+                    await self._handler(*message)
                 except Exception:
                     logger.exception("the handler of %s failed", self._subject)
                 served += 1

@@ -7,7 +7,6 @@ device's ``cmd`` key whose payload is the JSON-RPC request, its reply carries th
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
 import logging
 import math
@@ -32,7 +31,7 @@ from .dispatch import CommandDesk, Inbox, OrderedFeed
 from .errors import NoResponderError
 from .threads import on_a_thread
 from .zenoh_ask import LARGE_BYTES, ask
-from .zenoh_intake import Handle, Intake
+from .zenoh_intake import Handle, Intake, answer_query
 
 logger = logging.getLogger(__name__)
 
@@ -136,7 +135,7 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
         """
         if key_of(subject).endswith("/cmd") and not subscribe_only:
             return self._declare(subject, queue, desk=CommandDesk(subject, callback, self._answer, self._unanswered))
-        return self._declare(subject, queue, OrderedFeed(subject, callback), answers=not subscribe_only)
+        return self._declare(subject, queue, OrderedFeed(subject, callback, self.hand_over), answers=not subscribe_only)
 
     async def subscribe_with_subject(
         self,
@@ -146,7 +145,7 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
         subscribe_only: bool = False,
     ) -> Subscription:
         """``subscribe`` whose callback also gets the key that matched: ``callback(data, key, reply_subject)``."""
-        feed = OrderedFeed(subject, callback)
+        feed = OrderedFeed(subject, callback, self.hand_over)
         return self._declare(subject, queue, feed, answers=not subscribe_only, with_subject=True)
 
     async def request(self, subject: str, data: bytes, timeout: float = 5.0) -> bytes:  # noqa: ASYNC109 - the framework's signature
@@ -288,10 +287,3 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             task = asyncio.ensure_future(callback())
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
-
-
-def answer_query(query: Any, data: bytes) -> None:
-    """Reply with the caller's own priority and let go of the query, which tells the caller that no more comes."""
-    with contextlib.suppress(zenoh.ZError):  # the caller's link is gone; nobody is left to tell
-        query.reply(query.key_expr, data)
-    query.drop()

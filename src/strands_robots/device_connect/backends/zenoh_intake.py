@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import zenoh
 from device_connect_edge.messaging.base import Subscription
 
 from . import jsonrpc
-from .dispatch import CommandDesk, OrderedFeed
+from .dispatch import CommandDesk, OrderedFeed, Room
 
 
 class Client(Protocol):
@@ -24,33 +26,45 @@ class Client(Protocol):
 class Intake:
     """What runs on Zenoh's threads for one subscription: bounds the size, copies, hands over."""
 
-    __slots__ = ("_client", "_desk", "_feed", "_with_subject")
+    __slots__ = ("_client", "_desk", "_feed", "_room", "_with_subject")
 
     def __init__(self, client: Client, desk: CommandDesk | None, feed: OrderedFeed | None, with_subject: bool) -> None:
         self._client = client
         self._desk = desk
         self._feed = feed
         self._with_subject = with_subject
+        self._room = Room()
 
     def on_sample(self, sample: Any) -> None:
         """A put on the key."""
-        payload = sample.payload
         if self._desk is not None:
-            self._client.hand_over(self._command, _bounded(payload), None)
+            self._hand_over_command(sample.payload, None)
         elif self._feed is not None:
             key = (str(sample.key_expr),) if self._with_subject else ()
-            self._client.hand_over(self._feed.accept, payload.to_bytes(), *key, None)
+            self._feed.accept(sample.payload.to_bytes(), *key, None)
 
     def on_query(self, query: Any) -> None:
         """A query on the key."""
-        payload = query.payload
         if self._desk is not None:
-            self._client.hand_over(self._command, b"" if payload is None else _bounded(payload), query)
+            self._hand_over_command(query.payload, query)
+            return
+        data = b"" if query.payload is None else query.payload.to_bytes()
+        if self._room.take(len(data)):
+            self._client.hand_over(self._question, data, query)
         else:
-            self._client.hand_over(self._question, b"" if payload is None else payload.to_bytes(), query)
+            query.drop()
 
-    def _command(self, data: bytes | int, query: Any) -> None:
+    def _hand_over_command(self, payload: Any, query: Any) -> None:
+        data = b"" if payload is None else _bounded(payload)
+        size = 0 if isinstance(data, int) else len(data)
+        if self._room.take(size):
+            self._client.hand_over(self._command, data, size, query)
+        elif query is not None:
+            answer_query(query, jsonrpc.error(None, jsonrpc.BUSY, "busy: the device's loop is held up"))
+
+    def _command(self, data: bytes | int, size: int, query: Any) -> None:
         assert self._desk is not None
+        self._room.give_back(size)
         reply = None if query is None else self._client.keep(query, until_answered=True)
         if isinstance(data, int):
             self._desk.refuse(jsonrpc.too_large(data), reply)
@@ -59,6 +73,7 @@ class Intake:
 
     def _question(self, data: bytes, query: Any) -> None:
         assert self._feed is not None
+        self._room.give_back(len(data))
         key = (str(query.key_expr),) if self._with_subject else ()
         self._feed.accept(data, *key, self._client.keep(query, until_answered=False))
 
@@ -85,6 +100,13 @@ class Handle(Subscription):  # type: ignore[misc]  # the framework has no type i
         if served_by is not None:
             await served_by.close()
         self._forget(self)
+
+
+def answer_query(query: Any, data: bytes) -> None:
+    """Reply with the caller's own priority and let go of the query, which tells the caller that no more comes."""
+    with contextlib.suppress(zenoh.ZError):  # the caller's link is gone; nobody is left to tell
+        query.reply(query.key_expr, data)
+    query.drop()
 
 
 def _bounded(payload: Any) -> bytes | int:
