@@ -49,12 +49,12 @@ def test_the_types_are_those_of_the_arguments() -> None:
     [
         (
             DRIVERS[0],
-            {"execute", "stop", "getStatus", "getFeatures", "getState"},
+            {"execute", "stop", "resume", "getStatus", "getFeatures", "getState"},
             {"taskStarted", "taskComplete", "streamStep", "stateUpdate", "emergencyStop"},
         ),
         (
             DRIVERS[1],
-            {"execute", "stop", "getStatus", "getFeatures", "step", "reset"},
+            {"execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset"},
             {"policyStarted", "policyComplete", "observationUpdate", "streamStep", "stateUpdate", "emergencyStop"},
         ),
     ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from strands_robots.safety.intake import TRAY_MAX, TRAYS, Heard, Intake
+from strands_robots.safety.intake import TRAY_MAX, Heard, Intake
 
 
 def drained(intake: Intake) -> list[Heard]:

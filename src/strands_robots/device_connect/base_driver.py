@@ -22,6 +22,8 @@ from device_connect_edge.types import DeviceStatus
 
 from strands_robots import settings
 from strands_robots.contract import RolloutEvent, TaskRobot, Unsubscribe, WorldRobot
+from strands_robots.device_connect.declare import rpc
+from strands_robots.device_connect.safety_seat import SafetySeat
 from strands_robots.device_connect.telemetry import RolloutPump, paced
 from strands_robots.device_connect.wire import jsonable
 from strands_robots.device_connect.workers import Lane, LaneFullError
@@ -77,6 +79,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         self.authorization = authorization or Authorization(hardware=hardware, robot=name)
         self.approval = approval or Approval()
         self.runtime: Any = None
+        self.seat: SafetySeat | None = None
         self.moves = Lane("motion", MOVES_AT_ONCE)
         self.reads = Lane("read", READS_AT_ONCE)
         self.stops = Lane("stop", STOPS_AT_ONCE)
@@ -89,7 +92,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     # The state, told in one way everywhere.
 
-    def look(self) -> Activity:
+    def glance(self) -> Activity:
         """Ask the robot what it is doing. May block: runs on a thread."""
         raise NotImplementedError
 
@@ -183,7 +186,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     async def _looked(self) -> Activity:
         try:
-            return await self.reads.run(self.look, READ_DEADLINE_S)
+            return await self.reads.run(self.glance, READ_DEADLINE_S)
         except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
             fault = f"{type(exc).__name__}: {exc}"
             if fault != self.activity.fault:
@@ -192,7 +195,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     def _look_now(self) -> Activity:
         try:
-            return self.reads.start(self.look).result(1.0)
+            return self.reads.start(self.glance).result(1.0)
         except Exception as exc:  # noqa: BLE001 - a robot that cannot answer is shown with its fault
             return Activity(fault=f"{type(exc).__name__}: {exc}")
 
@@ -279,6 +282,29 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     # The stop.
 
+    @rpc(labels={"direction": "write", "safety": "critical"})
+    async def resume(self, assertion: dict[str, Any]) -> dict[str, Any]:
+        """Free the robot of one emergency stop, at the word of the operator's key; nothing starts to move by it.
+
+        Args:
+            assertion: What the operator's resume key signed: v, epoch, targets, t, nonce and sig
+        """
+        seat = self.seat
+        if seat is None:
+            return error("resume rejected")
+        return await self._guarded("resume", lambda: self.alarms.run(lambda: seat.resume(assertion), READ_DEADLINE_S))
+
+    def with_safety(self, call: Call) -> Call:
+        """``call`` whose answer also says what holds the robot and how the dead-man check-in stands."""
+
+        def read() -> object:
+            answer = call()
+            if self.seat is None or not isinstance(answer, dict):
+                return answer
+            return {**answer, **self.seat.facts()}
+
+        return read
+
     def halt(self, reason: str) -> StopVerdict:
         """Halt every motion source and wait for the verdict, at most the halt deadline. Callable from any thread."""
         within = settings.number("STRANDS_HALT_DEADLINE_S")
@@ -329,8 +355,11 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         return verdict
 
     async def on_estop(self, device_id: object, payload: object) -> None:
-        """:meth:`handle_estop` off the loop, on threads that nothing else takes."""
+        """The second road of an emergency stop: into the safety plane, or, off the network, off the loop at least."""
         if device_id == self.peer_id:
+            return
+        if self.seat is not None:
+            self.seat.second_road(device_id, payload)
             return
         try:
             self.alarms.start(lambda: self.handle_estop(device_id, payload))

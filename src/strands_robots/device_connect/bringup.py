@@ -22,7 +22,7 @@ from device_connect_edge.messaging import MessagingError
 from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.device_connect._compat import Runtime
-from strands_robots.device_connect.backends import LinkConfig, open_client
+from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.errors import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
 from strands_robots.device_connect.limits import (
@@ -34,7 +34,9 @@ from strands_robots.device_connect.limits import (
 )
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.safety_seat import SafetySeat, take_seat
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.drivers.reachy.driver import ReachyDriver
 from strands_robots.utils import ValidationError, choice, device_id
 
 logger = logging.getLogger(__name__)
@@ -88,8 +90,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     Raises:
         ValidationError: an argument out of its domain, or an unauthenticated transport without an opt-in.
         DuplicateDeviceError: a live device has this id.
-        ConnectionError: the broker or router was not reached.
-        TimeoutError: not callable in time; nothing is left running.
+        TimeoutError: not callable in time, or the broker not reached; nothing is left running.
     """
     choice("peer_type", peer_type, ("robot", "sim"))
     name = default_id(robot) if peer_id is None else device_id("peer_id", peer_id)
@@ -97,24 +98,35 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
     driver = driver_for(robot, peer_type)
     announceable(driver)
-    _keep_logging_to_the_application(name)
-    async with asyncio.timeout(bringup_timeout):
-        await refuse_duplicate(name, reach)
-        runtime = Runtime(
-            driver=driver,
-            device_id=name,
-            link=reach,
-            allow_insecure=insecure,
-            discovery=settings.raw("DEVICE_CONNECT_DISCOVERY_MODE").lower(),
-        )
-        if isinstance(driver, RobotDriver):
-            runtime.set_heartbeat_provider(driver.heartbeat)
-        task = asyncio.create_task(runtime.run(), name=f"device {name}")
-        try:
-            await runtime.wait_ready(bringup_timeout)
-        except BaseException:
-            await asyncio.shield(_put_down(runtime, task))
-            raise
+    said = _listen_to_the_framework(name)
+    seats: list[SafetySeat | None] = []
+
+    async def before_live(messaging: Any) -> None:
+        await refuse_duplicate(name, reach, messaging)
+        # Before it can be called, it can be stopped.
+        seats.append(await asyncio.to_thread(take_seat, name, driver, reach, named=peer_id is not None))
+
+    runtime = Runtime(
+        driver=driver,
+        device_id=name,
+        link=reach,
+        allow_insecure=insecure,
+        discovery=settings.raw("DEVICE_CONNECT_DISCOVERY_MODE").lower(),
+        before_live=before_live,
+    )
+    if isinstance(driver, RobotDriver):
+        runtime.set_heartbeat_provider(driver.heartbeat)
+    task = asyncio.create_task(_live(runtime, seats), name=f"device {name}")
+    try:
+        await runtime.wait_ready(bringup_timeout)
+    except BaseException as exc:
+        await asyncio.shield(_put_down(runtime, task))
+        if isinstance(exc, TimeoutError):
+            where = ", ".join(reach.connect) or "the network"
+            raise TimeoutError(
+                f"{name} was not up on {where} within {bringup_timeout:g} s. {said.last}".strip()
+            ) from exc
+        raise
     _hosts[runtime] = Host(asyncio.get_running_loop(), task)
     # Again with each device, because what is registered last runs first: the link must still be open then.
     atexit.unregister(_leave_no_ghost)
@@ -229,6 +241,10 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
     """The driver of ``robot``: its own where it is one, else what the object is, else what ``peer_type`` says."""
     if isinstance(robot, DeviceDriver):
         return robot
+    if isinstance(robot, ReachyDriver):
+        from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver  # noqa: PLC0415 - for it alone
+
+        return ReachyMiniDriver(robot=robot)
     simulation = getattr(sys.modules.get("strands_robots.simulation"), "Simulation", None)
     if isinstance(simulation, type) and isinstance(robot, simulation):
         return SimulationDeviceDriver(robot)
@@ -264,18 +280,14 @@ def announceable(driver: DeviceDriver) -> None:
         )
 
 
-async def refuse_duplicate(name: str, link: LinkConfig) -> None:
+async def refuse_duplicate(name: str, link: LinkConfig, messaging: Any) -> None:
     """Raise :class:`DuplicateDeviceError` when a device with this id answers within a second. A ghost does not."""
     request = {"jsonrpc": "2.0", "id": "probe", "method": "requestRegistration", "params": {}}
-    try:
-        client = await open_client(link)
-    except MessagingError as exc:
-        raise ConnectionError(f"{', '.join(link.connect) or 'The network'} was not reached: {exc}") from exc
     if link.is_peer:
-        # A peer's links come up one after another; a client's server knows at once who is there.
-        client.configure_d2d_retry(retries=PROBES, delay=PROBE_EVERY_S)
+        # At a meeting point peers learn of one another one by one; elsewhere an open link knows who is there.
+        messaging.configure_d2d_retry(retries=PROBES if link.meet_port else 1, delay=PROBE_EVERY_S)
     try:
-        await client.request(
+        await messaging.request(
             f"device-connect.{link.tenant}.{name}.cmd", json.dumps(request).encode(), timeout=PROBE_TIMEOUT_S
         )
     except NoResponderError:
@@ -283,8 +295,6 @@ async def refuse_duplicate(name: str, link: LinkConfig) -> None:
     except MessagingError as exc:
         logger.warning("A device %r is known on this network and does not answer (%s); taking its place.", name, exc)
         return
-    finally:
-        await client.close()
     raise DuplicateDeviceError(
         f"A device {name!r} is live in tenant {link.tenant!r} and answered; give this one another peer_id."
     )
@@ -294,6 +304,16 @@ async def _put_down(runtime: Runtime, task: asyncio.Task[None]) -> None:
     await runtime.shutdown()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
+
+
+async def _live(runtime: Runtime, seats: list[SafetySeat | None]) -> None:
+    try:
+        await runtime.run()
+    finally:
+        for seat in seats:
+            if seat is not None:
+                # Closing a link blocks, so it is done on a thread, to its end.
+                await asyncio.shield(asyncio.to_thread(seat.leave))
 
 
 def _ended(runtime: Runtime, task: asyncio.Task[None]) -> None:
@@ -311,11 +331,26 @@ def _cancel_everything(loop: asyncio.AbstractEventLoop) -> None:
         loop.call_soon_threadsafe(cancel)
 
 
-def _keep_logging_to_the_application(name: str) -> None:
-    """The framework writes to stderr by itself where its logger has no handler; the application decides instead."""
+class _LastWord(logging.Handler):
+    """Keeps the framework's last warning; what is shown is the application's to decide."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.last = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.last = record.getMessage().strip()
+
+
+def _listen_to_the_framework(name: str) -> _LastWord:
+    """A handler on the runtime's logger; without any the framework writes to stderr by itself."""
     framework = logging.getLogger(f"device_connect_edge.device.{name}")
-    if not framework.handlers:
-        framework.addHandler(logging.NullHandler())
+    for handler in framework.handlers:
+        if isinstance(handler, _LastWord):
+            return handler
+    word = _LastWord()
+    framework.addHandler(word)
+    return word
 
 
 def _leave_no_ghost() -> None:

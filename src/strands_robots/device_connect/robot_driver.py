@@ -96,7 +96,7 @@ class RobotDeviceDriver(RobotDriver):
     @rpc(labels={"direction": "read"})
     async def getStatus(self) -> dict[str, Any]:
         """What the robot is doing: task state, instruction and steps so far."""
-        return await self.read("getStatus", self.task_robot.get_task_status)
+        return await self.read("getStatus", self.with_safety(self.task_robot.get_task_status))
 
     @rpc(labels={"direction": "read"})
     async def getFeatures(self) -> dict[str, Any]:
@@ -164,7 +164,7 @@ class RobotDeviceDriver(RobotDriver):
         """Halt on the emergency stop of an allowed source."""
         await self.on_estop(device_id, payload)
 
-    def look(self) -> Activity:
+    def glance(self) -> Activity:
         """The task's state."""
         facts = record(self.task_robot.get_task_status())
         state = str(facts.get("task_status", "")).lower()

@@ -92,7 +92,7 @@ class SimulationDeviceDriver(RobotDriver):
     @rpc(labels={"direction": "read"})
     async def getStatus(self) -> dict[str, Any]:
         """Simulated time, physics steps, joints of every robot and the policies that run."""
-        return await self.read("getStatus", self.world.get_state)
+        return await self.read("getStatus", self.with_safety(self.world.get_state))
 
     @rpc(labels={"direction": "read"})
     async def getFeatures(self) -> dict[str, Any]:
@@ -200,7 +200,7 @@ class SimulationDeviceDriver(RobotDriver):
         """Halt every motion source on the emergency stop of an allowed source."""
         await self.on_estop(device_id, payload)
 
-    def look(self) -> Activity:
+    def glance(self) -> Activity:
         """Time, steps and running policies of the world; keeps the joints for :meth:`observationUpdate`."""
         facts = record(self.world.get_state())
         rows = self.world.list_policies_running()

@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any
 
 from strands_robots.audit import log_safety_event
 from strands_robots.safety.decision import Decision, Refused, params_of
@@ -30,8 +31,8 @@ CHECK_IN_AGE_S = 60.0
 class Seat:
     """One device's place on the lane. ``leave`` gives it up; the last one of a link closes the link."""
 
-    def __init__(self, lane: StopLane, device_id: str, key: Hashable, link: StopLink) -> None:
-        self.device_id = device_id
+    def __init__(self, lane: StopLane, robot_id: str, key: Hashable, link: StopLink) -> None:
+        self.robot_id = robot_id
         self.key = key
         self.link = link
         self._lane = lane
@@ -66,8 +67,8 @@ class StopLane:
         """Who is on the lane."""
         return self._seats
 
-    def join(self, device_id: str, key: Hashable, make: Callable[[], StopLink]) -> Seat:
-        """Serve a device's stops over the link that ``key`` names; made and opened if no device uses it yet."""
+    def join(self, robot_id: str, key: Hashable, make: Callable[[], StopLink]) -> Seat:
+        """Serve a robot of the plane over the link that ``key`` names, made and opened if nobody uses it yet."""
         with self._joining:
             if self._intake is None:
                 self._start()
@@ -75,7 +76,7 @@ class StopLane:
             if link is None:
                 link = make()
                 link.open((ESTOP, CHECK_IN), self._hear, lambda up: None)
-            seat = Seat(self, device_id, key, link)
+            seat = Seat(self, robot_id, key, link)
             self._seats = (*self._seats, seat)
             return seat
 
@@ -95,6 +96,14 @@ class StopLane:
             intake.close()
         if thread is not None and thread is not threading.current_thread():
             thread.join(2.0)
+
+    def hear_params(self, source: str, params: Mapping[str, Any], road: str) -> None:
+        """Act on an emergency stop that another road has parsed; returns at once, whichever road was first."""
+        order = self._decision.order(source, params, road)
+        if isinstance(order, Refused):
+            self._refusals.tell(order, ESTOP)
+        else:
+            self._plane.begin(order, self._answer)
 
     def _start(self) -> None:
         self._decision = self._decide()
@@ -157,8 +166,11 @@ class StopLane:
         while len(self._answered) > SOURCES_TOLD:
             del self._answered[next(iter(self._answered))]
         for seat in self._seats:
-            if seat.device_id == report.robot_id:
-                seat.link.publish(seat.device_id, VERDICT, notification(VERDICT, report.fields()))
+            if seat.robot_id == report.robot_id:
+                entry = self._plane.robots.get(report.robot_id)
+                device_id = entry.wire_id if entry else report.robot_id
+                told = {**report.fields(), "device_id": device_id}
+                seat.link.publish(device_id, VERDICT, notification(VERDICT, told))
 
 
 class Refusals:

@@ -6,7 +6,7 @@ import functools
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 from strands_robots import settings
@@ -42,14 +42,18 @@ class Stoppable(Haltable, Protocol):
 class Registered:
     """One robot in the plane. ``close`` takes it out; the lockout on disk stays."""
 
-    def __init__(self, plane: SafetyPlane, robot_id: str, robot: Stoppable, key: str | None, kept: Kept) -> None:
+    def __init__(
+        self, plane: SafetyPlane, robot_id: str, robot: Stoppable, *, key: str | None, kept: Kept, wire_id: str
+    ) -> None:
         self.robot_id = robot_id
+        self.wire_id = wire_id
         self.robot = robot
         self.key = key
         self.users = 1
-        self.latch = LockoutLatch(robot_id, kept.state, kept.seen)
+        self.gates: tuple[MotionGate, ...] = (robot.gate,)
+        self.latch = LockoutLatch(wire_id, kept.state, kept.seen)
         self.worker = HaltWorker(robot, robot_id)
-        self.verifier = ResumeVerifier([robot_id])
+        self.verifier = ResumeVerifier([wire_id])
         self.reports: dict[str, RobotReport] = {}
         self._plane = plane
 
@@ -106,11 +110,12 @@ class SafetyPlane:
         """The ids of the robots held now."""
         return frozenset(self._robots)
 
-    def register(self, robot_id: str, robot: Stoppable, *, key: str | None = None) -> Registered:
+    def register(self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "") -> Registered:
         """Hold ``robot``: its gate refuses motion while it is locked, and every emergency stop halts it.
 
         Args:
-            robot_id: the name it answers by; also what a resume targets.
+            robot_id: its name in this process.
+            wire_id: the name it answers by on its network and that a resume targets; ``robot_id`` by default.
             key: what its lockout is kept under over a restart, from :func:`~.persistence.hardware_key` or
                 :func:`~.persistence.simulation_key`. None: it is not kept.
 
@@ -124,11 +129,15 @@ class SafetyPlane:
         with self._registering:
             known = self._robots.get(robot_id)
             if known is not None:
-                if known.robot is not robot:
+                if _body(known.robot) is not _body(robot):
                     raise ValidationError(f"robot_id {shown(robot_id)} is taken by another robot of this process.")
                 known.users += 1
+                if robot.gate not in known.gates:
+                    robot.gate.attach(known.latch)
+                    known.gates = (*known.gates, robot.gate)
                 return known
-            entry = Registered(self, robot_id, robot, key, self.store.load(key) if key else Kept())
+            kept = self.store.load(key) if key else Kept()
+            entry = Registered(self, robot_id, robot, key=key, kept=kept, wire_id=wire_id or robot_id)
             robot.gate.attach(entry.latch)
             if not self._robots:
                 self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
@@ -158,11 +167,12 @@ class SafetyPlane:
         A robot that has seen this stop is not halted again; its report of then is given to ``on_report`` at once,
         where there is one. None when no robot had anything to do.
         """
-        robots = [each for name, each in self._robots.items() if not (order.heard and name == order.source)]
+        robots = [each for each in self._robots.values() if not (order.heard and each.wire_id == order.source)]
         fresh: list[Registered] = []
         for entry in robots:
             if entry.latch.engage(order.epoch, order.source, order.reason) is not None:
-                entry.robot.gate.revoke()
+                for gate in entry.gates:
+                    gate.revoke()
                 fresh.append(entry)
         reporter = self._reporter
         if not fresh or reporter is None:
@@ -305,6 +315,11 @@ class SafetyPlane:
             self._desk.look()
 
 
+def _body(robot: Stoppable) -> object:
+    """The robot itself, where ``contract.adapt`` wrapped it anew for each of its networks."""
+    return getattr(robot, "wrapped", robot)
+
+
 def _again(entry: Registered, known: RobotReport) -> RobotReport:
     return RobotReport(
         known.robot_id, known.epoch, known.verdict, entry.epochs, known.elapsed_ms, known.persisted, repeated=True
@@ -317,4 +332,3 @@ _PLANE = SafetyPlane()
 def plane() -> SafetyPlane:
     """The plane of this process."""
     return _PLANE
-

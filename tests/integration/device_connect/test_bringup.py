@@ -67,7 +67,11 @@ def open_things() -> tuple[int, int]:
 
 def settles(before: tuple[int, int], spare: int = 0) -> None:
     """Threads and descriptors come back to what they were; ``spare`` for Zenoh's own pool, made once."""
-    eventually(lambda: all(now <= then + spare for now, then in zip(open_things(), before, strict=True)), within=10)
+    eventually(
+        lambda: all(now <= then + spare for now, then in zip(open_things(), before, strict=True)),
+        within=10,
+        what=f"back to {before} from {open_things()}",
+    )
 
 
 def test_a_simulation_is_found_called_and_gone(link: LinkConfig, world: ToyWorld) -> None:
@@ -76,7 +80,7 @@ def test_a_simulation_is_found_called_and_gone(link: LinkConfig, world: ToyWorld
         (peer,) = fleet.peers()
         assert (peer.id, peer.type, peer.model) == ("arm-1", "strands_sim", "toy_sim")
         assert {f["name"] for f in peer.functions} == {
-            *("execute", "stop", "getStatus", "getFeatures", "step", "reset"),
+            *("execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset"),
         }
         assert fleet.call("arm-1", "getStatus")["status"] == "success"
         stop_device_connect(runtime)

@@ -1,0 +1,94 @@
+"""A device's place in the safety plane: its robot held, its stops heard on the lane, its second road joined to it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from device_connect_edge.drivers import DeviceDriver
+
+from strands_robots.contract import Haltable
+from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.stop_link import stop_link
+from strands_robots.envelope import Envelope
+from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.lane import Seat, lane
+from strands_robots.safety.persistence import hardware_key, simulation_key
+from strands_robots.safety.plane import Registered, plane
+
+logger = logging.getLogger(__name__)
+
+
+def take_seat(device_id: str, driver: DeviceDriver, link: LinkConfig, *, named: bool) -> SafetySeat | None:
+    """Put a driver's robot under the safety plane before it is on the network; None for a driver without a robot.
+
+    Args:
+        named: the operator gave ``device_id``; a simulation's lockout is kept only then.
+    """
+    robot = getattr(driver, "robot", driver)
+    gate = getattr(robot, "gate", None)
+    if not isinstance(robot, Haltable) or not isinstance(gate, MotionGate):
+        logger.warning("%s has no robot that the safety plane could halt; it hears no emergency stop.", device_id)
+        return None
+    seat = SafetySeat(device_id, robot, link, _key(device_id, driver, robot, named=named))
+    if hasattr(driver, "seat"):
+        driver.seat = seat
+    return seat
+
+
+def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
+    own = getattr(robot, "safety_key", None)
+    if isinstance(own, str) and own:
+        return own
+    if getattr(driver, "hardware", True):
+        return hardware_key(str(getattr(robot, "tool_name_str", "robot")), device_id if named else "unnamed")
+    return simulation_key(device_id) if named else None
+
+
+class SafetySeat:
+    """One robot's entry in the plane and its seat on the lane."""
+
+    def __init__(self, device_id: str, robot: Any, link: LinkConfig, key: str | None) -> None:
+        self.device_id = device_id
+        # Two tenants may each have a device of this id in one process.
+        name = device_id if link.tenant == "default" else f"{link.tenant}.{device_id}"
+        self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
+        self._held: Registered | None = self.entry
+        try:
+            self._seat: Seat = lane().join(name, ("device-connect", link), lambda: stop_link(link))
+        except BaseException:
+            self.entry.close()
+            raise
+
+    @property
+    def up(self) -> bool:
+        """True while the lane's link of this device reaches somebody."""
+        return self._seat.link.up
+
+    def second_road(self, source: object, params: object) -> None:
+        """An emergency stop that came by the runtime's own handler; returns at once, halts nothing twice."""
+        if isinstance(source, str):
+            lane().hear_params(source, params if isinstance(params, Mapping) else {}, "runtime")
+
+    def resume(self, assertion: object) -> Envelope:
+        """Check a signed resume; its signature is its authorization."""
+        return self.entry.resume(assertion, "device-connect")
+
+    def facts(self) -> dict[str, Any]:
+        """For ``getStatus``: what holds the robot, since when and by whom, and the dead-man check-in."""
+        holds = self.entry.latch.state.all
+        return {
+            "locked": bool(holds),
+            "lockout": [{"epoch": h.epoch, "source": h.source, "reason": h.reason, "since": h.at} for h in holds],
+            "check_in": plane().checkin.fields(time.monotonic()),
+            "stop_lane": self.up,
+        }
+
+    def leave(self) -> None:
+        """Leave lane and plane; the lockout on disk stays. Blocks while a link closes; safe to call twice."""
+        self._seat.leave()
+        entry, self._held = self._held, None
+        if entry is not None:
+            entry.close()
