@@ -14,6 +14,9 @@ from typing import Any
 
 from strands_robots.policies.actions import numbers
 
+NESTING_MAX = 4
+"""Wrappers around wrappers that are looked through."""
+
 _INNER = ("device", "robot")
 _READERS = ("get_joints", "get_observation")
 
@@ -28,13 +31,15 @@ def joint_read_source(robot: Any) -> Any | None:
     """The object that a robot's joints are read from, or None when it has none.
 
     A native driver that owns its bus is its own source; a wrapper's is the device inside it (``device``, or
-    ``robot`` as LeRobot's own wrappers call it).
+    ``robot`` as LeRobot's own wrappers call it), through at most :data:`NESTING_MAX` wrappers.
     """
-    for name in _INNER:
-        inner = getattr(robot, name, None)
-        if inner is not None and inner is not robot and _readable(inner):
-            return joint_read_source(inner)
-    return robot if _readable(robot) else None
+    source = robot
+    for _ in range(NESTING_MAX):
+        inner = next((each for each in (getattr(source, name, None) for name in _INNER) if _may_be_device(each)), None)
+        if inner is None or inner is source:
+            break
+        source = inner
+    return source if _readable(source) else None
 
 
 def bus_lock(device: Any) -> threading.RLock:
@@ -110,6 +115,10 @@ def _motors(device: Any) -> Mapping[str, Any] | None:
     features = getattr(device, "observation_features", {})
     scalars = {key for key, kind in features.items() if not isinstance(kind, tuple | list)}
     return motors if scalars == {f"{name}.pos" for name in motors} else None
+
+
+def _may_be_device(candidate: Any) -> bool:
+    return _readable(candidate) or any(_readable(getattr(candidate, name, None)) for name in _INNER)
 
 
 def _readable(candidate: Any) -> bool:

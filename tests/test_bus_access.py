@@ -1,0 +1,101 @@
+"""Which object is read, one lock for each device, joints without cameras."""
+
+from __future__ import annotations
+
+import gc
+import math
+import threading
+from enum import Enum
+from types import SimpleNamespace
+from typing import Any
+
+from fixtures.devices import RANGES, BlindDevice, RecordingDevice
+
+from strands_robots.bus_access import action_ranges, bus_lock, joint_read_source, read_joints
+
+
+class Wrapper:
+    def __init__(self, device: Any) -> None:
+        self.device = device
+
+
+class Slotted:
+    __slots__ = ()
+
+    def get_joints(self) -> dict[str, float]:
+        return {"a": 1.0}
+
+
+def test_a_wrapper_is_read_through_the_device_inside_it() -> None:
+    device = RecordingDevice()
+    assert joint_read_source(device) is device
+    assert joint_read_source(Wrapper(device)) is device
+    assert joint_read_source(Wrapper(Wrapper(device))) is device
+    assert joint_read_source(Wrapper(None)) is None
+    assert read_joints(Wrapper(None)) == {}
+
+
+def test_a_native_driver_that_owns_its_bus_is_its_own_source() -> None:
+    native = Slotted()
+    assert joint_read_source(native) is native
+    assert read_joints(native) == {"a": 1.0}
+    assert bus_lock(native) is bus_lock(native)
+
+
+def test_a_wrapper_and_its_device_share_one_reentrant_lock() -> None:
+    device = RecordingDevice()
+    lock = bus_lock(device)
+    assert bus_lock(Wrapper(device)) is lock
+    assert bus_lock(RecordingDevice()) is not lock
+    with lock, lock:
+        taken: list[bool] = []
+        other = threading.Thread(target=lambda: taken.append(lock.acquire(blocking=False)))
+        other.start()
+        other.join()
+    assert taken == [False]
+
+
+def test_a_lock_goes_with_its_device() -> None:
+    from strands_robots import bus_access  # noqa: PLC0415 - the table under test
+
+    before = len(bus_access._locks)
+    devices = [RecordingDevice() for _ in range(50)]
+    for device in devices:
+        bus_lock(device)
+    assert len(bus_access._locks) == before + 50
+    del devices, device
+    gc.collect()
+    assert len(bus_access._locks) == before
+
+
+def test_joints_are_read_from_the_motors_alone_where_there_is_one_bus() -> None:
+    assert read_joints(BlindDevice()) == {"pan.pos": 10.0, "lift.pos": 10.0, "grip.pos": 10.0}
+
+
+def test_the_numbers_of_an_observation_are_the_joints_of_any_other_device() -> None:
+    assert read_joints(RecordingDevice()) == {"pan.pos": 10.0, "lift.pos": 10.0, "grip.pos": 10.0}
+
+
+class Mode(Enum):
+    RANGE_M100_100 = 1
+    RANGE_0_100 = 2
+    DEGREES = 3
+
+
+def test_lerobots_motor_modes_are_ranges() -> None:
+    motors = {mode.name: SimpleNamespace(norm_mode=mode) for mode in Mode}
+    features = {f"{name}.pos": float for name in motors}
+    calibration = {"DEGREES": SimpleNamespace(range_min=1024, range_max=3071)}
+    bus = SimpleNamespace(motors=motors, calibration=calibration, sync_read=lambda register: {})
+    device = SimpleNamespace(bus=bus, action_features=features, observation_features=features)
+    ranges = action_ranges(device)
+    assert ranges["RANGE_M100_100.pos"] == (-100.0, 100.0)
+    assert ranges["RANGE_0_100.pos"] == (0.0, 100.0)
+    low, high = ranges["DEGREES.pos"]
+    assert high == -low
+    assert math.isclose(high, 2047 / 2 * 360 / 4095)
+
+
+def test_what_nobody_knows_is_infinite_and_what_the_device_declares_counts() -> None:
+    assert action_ranges(SimpleNamespace(action_features={"a": float})) == {"a": (-math.inf, math.inf)}
+    assert action_ranges(RecordingDevice()) == dict(RANGES)
