@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         stop_device_connect,
     )
     from strands_robots.device_connect.client import FleetClient
+    from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
     from strands_robots.device_connect.robot_driver import RobotDeviceDriver
     from strands_robots.device_connect.signals import StopSignal
     from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
@@ -40,6 +41,7 @@ __all__ = [
     "DuplicateDeviceError",
     "FleetClient",
     "LinkConfig",
+    "ReachyMiniDriver",
     "RobotDeviceDriver",
     "SimulationDeviceDriver",
     "StopSignal",
@@ -56,6 +58,7 @@ _HOMES = {
     "DuplicateDeviceError": f"{_HERE}.bringup",
     "FleetClient": f"{_HERE}.client",
     "LinkConfig": f"{_HERE}.backends",
+    "ReachyMiniDriver": f"{_HERE}.reachy_mini_driver",
     "RobotDeviceDriver": f"{_HERE}.robot_driver",
     "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
     "StopSignal": f"{_HERE}.signals",

@@ -75,6 +75,11 @@ class ReachyDriver:
         self.motors = Motors(self.connection, self.motions)
         self.library = Library(self.connection, self.motions)
 
+    @property
+    def safety_key(self) -> str:
+        """Under which a lockout of this robot is remembered, whatever device id it is given."""
+        return f"hardware:{self.tool_name_str}:{self.connection.host}:{self.connection.port}"
+
     # LeRobot's verbs.
 
     @property

@@ -114,9 +114,8 @@ def bounded(key: str, value: object, *, unit: str = "", scale: float = 1.0, name
     label = f"{name or key} ({unit})" if unit else name or key
     # A bound is not missed by the last digit of a conversion between degrees and radians.
     slack = _ROUNDING * max(1.0, scale)
-    asked = number(label, value)
-    if low - slack <= asked <= high + slack:
-        return min(high, max(low, asked)) / scale
+    if isinstance(value, int | float) and not isinstance(value, bool) and low - slack <= value <= high + slack:
+        return min(high, max(low, float(value))) / scale
     return number(label, value, low=round(low, 6), high=round(high, 6)) / scale
 
 

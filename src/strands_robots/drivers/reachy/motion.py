@@ -39,11 +39,12 @@ Reached = Callable[[], str]
 
 @dataclass(eq=False)
 class Motion:
-    """One motion that runs, or the last one that ran. ``uuid`` only for a move of the daemon."""
+    """One motion that runs, or the last one that ran. ``uuid`` only for a move of the daemon, ``brief`` for a frame."""
 
     name: str
     permit: Permit
     of_daemon: bool = False
+    brief: bool = True
     uuid: str = ""
     state: str = "running"
     detail: str = ""
@@ -154,6 +155,7 @@ class Motions:
                 motion.posted.set()
                 self._end(motion, "error", str(exc))
                 raise
+            motion.brief = False
             motion.posted.set()
             self._forget()
             try:
@@ -250,7 +252,7 @@ class Motions:
             return
         motion.state, motion.detail = state, detail or motion.detail
         motion.done.set()
-        if not motion.of_daemon and state == "completed" and motion.name == "send_action":
+        if motion.brief and state == "completed":
             return
         self._tell(
             RolloutEvent(
@@ -294,6 +296,7 @@ class Motions:
         self._pace()
         self._send(motion, next(frames))
         second = next(frames, None)
+        motion.brief = second is None
         if second is None:
             self._end(motion, "completed")
             return

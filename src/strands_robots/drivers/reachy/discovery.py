@@ -1,0 +1,83 @@
+"""Finding a Reachy Mini on the local network: its daemon announces ``_reachy-mini._tcp`` by mDNS."""
+
+from __future__ import annotations
+
+import ipaddress
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.drivers.reachy.driver import ReachyDriver
+from strands_robots.drivers.reachy.rest import DaemonUnreachable
+from strands_robots.utils import ValidationError, missing_extra, number
+
+SERVICE = "_reachy-mini._tcp.local."
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One announced daemon: its name, an address to dial and the port."""
+
+    name: str
+    host: str
+    port: int
+
+
+def discover(within_s: float = 3.0, *, interfaces: Any = None) -> list[Found]:
+    """Every Reachy Mini that answers in that time, by name.
+
+    Args:
+        within_s: seconds to listen, above 0 and at most 60.
+        interfaces: addresses to ask on, all of this machine by default.
+
+    Raises:
+        MissingExtraError: the [reachy] extra is not installed.
+    """
+    try:
+        from zeroconf import InterfaceChoice, ServiceBrowser, ServiceStateChange, Zeroconf  # noqa: PLC0415 - optional
+    except ImportError as exc:
+        raise missing_extra("Finding a Reachy Mini", "reachy") from exc
+    wait = number("within_s", within_s, above=0, high=60)
+    names: set[str] = set()
+
+    def heard(zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange) -> None:
+        del zeroconf, service_type
+        if state_change is ServiceStateChange.Added:
+            names.add(name)
+
+    with Zeroconf(interfaces=interfaces if interfaces is not None else InterfaceChoice.All) as network:
+        browser = ServiceBrowser(network, SERVICE, handlers=[heard])
+        threading.Event().wait(wait)
+        browser.cancel()
+        infos = [(name, network.get_service_info(SERVICE, name, timeout=500)) for name in sorted(names)]
+    return [_found(name, info) for name, info in infos if info is not None and info.parsed_addresses()]
+
+
+def _found(name: str, info: Any) -> Found:
+    """IPv4 before IPv6: a link-local IPv6 address needs a scope that a URL does not carry."""
+    addresses = sorted(info.parsed_addresses(), key=lambda text: ipaddress.ip_address(text).version)
+    return Found(name.removesuffix("." + SERVICE), addresses[0], int(info.port))
+
+
+def make_reachy(host: str = "", *, api_port: int = 8000, within_s: float = 3.0, **options: Any) -> ReachyDriver:
+    """A driver for ``host``, or for the one Reachy Mini that announces itself when no host is given.
+
+    Args:
+        host: bare hostname or IP literal; empty to look for it.
+        api_port: TCP port of the daemon, when ``host`` is given.
+        within_s: seconds to look.
+        options: further arguments of :class:`ReachyDriver`.
+
+    Raises:
+        DaemonUnreachable: none was found.
+        ValidationError: several were found, or an argument is out of its domain.
+    """
+    if host:
+        return ReachyDriver(host, api_port=api_port, **options)
+    found = discover(within_s)
+    if not found:
+        raise DaemonUnreachable(f"no Reachy Mini announced itself within {within_s:g} s; name its host.")
+    if len(found) > 1:
+        names = ", ".join(f"{each.name} at {each.host}:{each.port}" for each in found)
+        raise ValidationError(f"host must name one Reachy Mini; {len(found)} were found: {names}.")
+    return ReachyDriver(found[0].host, api_port=found[0].port, **options)

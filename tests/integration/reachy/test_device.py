@@ -1,0 +1,197 @@
+"""Reachy Mini on Device Connect: every function, its refusals, its stops and its truth."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from fixtures.reachy_daemon.process import Daemon
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.device_connect import (
+    FleetClient,
+    ReachyMiniDriver,
+    init_device_connect_sync,
+    loopback_config,
+    stop_device_connect,
+)
+from strands_robots.device_connect.client import Event
+from strands_robots.drivers.reachy import ReachyDriver
+
+Call = Callable[..., dict[str, Any]]
+MOTIONS = ("look", "antennas", "body", "nod", "shake", "happy", "wakeUp", "sleep", "enableMotors", "disableMotors")
+
+
+@pytest.fixture
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
+    monkeypatch.setenv("BYPASS_TOOL_CONSENT", "1")
+
+
+@pytest.fixture
+def fleet() -> Iterator[FleetClient]:
+    with FleetClient(loopback_config(free_port()), "tester") as client:
+        yield client
+
+
+@pytest.fixture
+def device(daemon: Daemon, fleet: FleetClient) -> Iterator[ReachyMiniDriver]:
+    # The stand-in's Zenoh twin has a port of its own, so that tests may run beside a real daemon.
+    reachy = ReachyDriver("127.0.0.1", api_port=daemon.port, zenoh_port=daemon.zenoh_port)
+    driver = ReachyMiniDriver(robot=reachy, release_on_estop=True)
+    runtime = init_device_connect_sync(driver, peer_id="head-1", link=fleet.link)
+    yield driver
+    stop_device_connect(runtime)
+
+
+@pytest.fixture
+def call(device: ReachyMiniDriver, fleet: FleetClient) -> Call:
+    eventually(lambda: device.reachy.is_connected, 8.0, "the daemon")
+    return lambda function, **params: fleet.call("head-1", function, params)
+
+
+@pytest.mark.usefixtures("allowed")
+def test_the_head_looks_where_it_is_told_in_degrees_and_millimetres(call: Call, device: ReachyMiniDriver) -> None:
+    assert call("look", pitch=0, yaw=0)["status"] == "success"
+    answer = call("look", pitch=10, roll=-5, yaw=15, x=5, z=-4)
+    assert answer["status"] == "success"
+    assert answer["target"]["head_pitch"] == pytest.approx(0.17453, abs=1e-4)
+    assert answer["target"]["head_x"] == pytest.approx(0.005)
+
+    def off() -> bool:
+        error = device.reachy.facts()["head_error_rad"]
+        return error is not None and error < 0.1
+
+    eventually(off, 5.0, "it looks there")
+    assert call("antennas", left=20, right=-20)["status"] == "success"
+    assert call("body", yaw=10)["status"] == "success"
+
+
+@pytest.mark.usefixtures("allowed")
+@pytest.mark.parametrize(
+    ("function", "params", "says"),
+    [
+        ("look", {"pitch": 41}, "pitch (degrees) must be a finite number from -40 to 40, not 41"),
+        ("look", {"roll": True}, "roll (degrees) must be a finite number from -40 to 40, not True"),
+        ("look", {"yaw": "left"}, "not 'left'"),
+        ("look", {"x": 26}, "x (mm) must be a finite number from -25 to 25, not 26"),
+        ("look", {"z": -31}, "z (mm) must be a finite number from -30 to 15, not -31"),
+        ("look", {"pitch": 40, "roll": 30}, "together be at most 60 degrees, not 70"),
+        ("antennas", {"left": 181}, "left (degrees) must be a finite number from -180 to 180"),
+        ("body", {"yaw": 161}, "yaw (degrees) must be a finite number from -160 to 160"),
+        ("enableMotors", {"motor_ids": ","}, "motor_ids must name motors"),
+        ("disableMotors", {"motor_ids": "17,tail"}, "motor_ids must name motors"),
+        ("playMove", {"move_name": "../yes1"}, "move_name must be"),
+        ("playMove", {"move_name": "yes1", "library": "songs"}, "library must be one of emotions, dances"),
+        ("listMoves", {"library": ""}, "library must be one of emotions, dances"),
+        ("nod", {"times": 3}, "nod takes no parameters"),
+    ],
+)
+def test_a_value_out_of_its_domain_is_refused_by_name(
+    call: Call, device: ReachyMiniDriver, function: str, params: dict[str, Any], says: str
+) -> None:
+    sent = device.reachy.motions.frames_sent
+    answer = call(function, **params)
+    assert answer["status"] == "error"
+    assert says in answer["reason"]
+    assert device.reachy.motions.frames_sent == sent
+
+
+@pytest.mark.usefixtures("allowed")
+def test_a_gesture_does_not_hold_the_line_and_stop_motion_ends_it(
+    call: Call, device: ReachyMiniDriver, fleet: FleetClient
+) -> None:
+    told: list[Event] = []
+    with fleet.subscription("head-1", told.append):
+        assert call("shake")["status"] == "success"
+        eventually(lambda: device.reachy.motions.frames_sent > 3, 3.0, "frames")
+        answer = call("stopMotion")
+        sent = device.reachy.motions.frames_sent
+        assert (answer["stopped"], answer["halted"]) == (True, ["shake"])
+        eventually(lambda: any(event.name == "motionComplete" for event in told), 5.0, "motionComplete")
+    assert device.reachy.motions.frames_sent == sent
+    ended = next(event for event in told if event.name == "motionComplete")
+    assert (ended.payload["name"], ended.payload["state"]) == ("shake", "stopped")
+
+
+@pytest.mark.usefixtures("allowed")
+def test_wake_up_and_a_recorded_move_and_sleep(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
+    if daemon.kind.simulation == "mujoco":
+        pytest.skip("its motors cannot be switched off")
+
+    def ended() -> dict[str, str]:
+        motion = device.reachy.motions.current
+        assert motion is not None
+        eventually(motion.done.is_set, 15.0, motion.name)
+        return motion.facts()
+
+    assert call("disableMotors")["motor_mode"] == "disabled"
+    assert "the motors are disabled" in call("nod")["reason"]
+    assert call("wakeUp")["motor_mode"] == "enabled"
+    assert ended()["state"] == "completed"
+    assert sorted(call("listMoves")["moves"]) == ["no1", "yes1"]
+    assert call("playMove", move_name="yes1")["move"] == "yes1"
+    assert ended()["state"] == "completed"
+    assert "unknown" in call("listMoves", library="dances")["reason"]
+    assert call("sleep")["status"] == "success"
+    assert ended() == {"name": "sleep", "state": "completed", "detail": ""}
+    assert call("getStatus")["motor_mode"] == "disabled"
+
+
+def test_without_permission_nothing_moves_and_everything_else_answers(
+    call: Call, device: ReachyMiniDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for function in MOTIONS:
+        assert call(function)["status"] == "error", function
+    assert "DEVICE_CONNECT_RPC_ALLOW" in call("playMove", move_name="yes1")["reason"]
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "*")
+    for function in ("stopMotion", "getStatus", "getDaemonStatus", "getJoints", "listMoves"):
+        assert call(function)["status"] == "success", function
+    assert device.reachy.motions.frames_sent == 0
+
+
+def test_the_status_tells_the_truth(call: Call, daemon: Daemon) -> None:
+    status = call("getStatus")
+    assert status["link"] == ("zenoh" if daemon.kind.zenoh else "websocket")
+    assert status["version"] == daemon.kind.version
+    assert (status["daemon_state"], status["motor_mode"], status["locked"]) == ("running", "enabled", False)
+    assert status["data_age_s"] < 1.5
+    daemon_status = call("getDaemonStatus")
+    assert (daemon_status["status"], daemon_status["version"]) == ("success", daemon.kind.version)
+    joints = call("getJoints")
+    assert len(joints["joints"]) == 9
+    assert joints["age_s"] < 1.5
+
+
+@pytest.mark.usefixtures("allowed")
+def test_an_emergency_stop_of_its_own_halts_it(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
+    call("shake")
+    asyncio.run(device.emergencyStop(reason="test"))
+    motion = device.reachy.motions.current
+    assert motion is not None
+    assert motion.facts()["state"] == "stopped"
+    if daemon.kind.simulation != "mujoco":
+        assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
+
+
+def test_a_daemon_that_is_away_does_not_kill_the_device(fleet: FleetClient) -> None:
+    driver = ReachyMiniDriver("127.0.0.1", api_port=free_port())
+    runtime = init_device_connect_sync(driver, peer_id="head-2", link=fleet.link)
+    try:
+        eventually(lambda: "Connection refused" in str(driver.status.error_state), 5.0, "the reason")
+        assert driver.status.availability == "unavailable"
+        status = fleet.call("head-2", "getStatus", {})
+        assert status["connected"] is False
+        assert "Connection refused" in status["unavailable"]
+        assert fleet.call("head-2", "getJoints", {})["status"] == "error"
+        assert "did not answer" in fleet.call("head-2", "getDaemonStatus", {})["reason"]
+        started = time.monotonic()
+        assert fleet.call("head-2", "stopMotion", {})["stopped"] is True
+        assert time.monotonic() - started < 1.0
+        peer = next(peer for peer in fleet.peers(1.0) if peer.id == "head-2")
+        assert peer.status["availability"] == "unavailable"
+    finally:
+        stop_device_connect(runtime)
