@@ -147,6 +147,7 @@ def test_a_broken_file_is_refused_and_the_world_stays_as_it_was(empty: Simulatio
     assert empty.list_robots() == ["so100"]
 
 
+@pytest.mark.filterwarnings("ignore:Attach conflict")
 def test_a_robots_file_does_not_change_the_worlds_time(empty: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "slow.xml"
     path.write_text(

@@ -150,3 +150,18 @@ def test_a_halt_stops_the_rover() -> None:
     simulation.step(500)
     assert simulation.get_observation()["base_x"] == pytest.approx(before, abs=0.002)
     simulation.cleanup()
+
+
+def test_a_world_that_was_held_up_catches_up_within_a_second_and_lets_the_rest_go(physics: Physics) -> None:
+    clock = Clock(physics)
+    now = time.monotonic()
+    clock.tick(now)
+    for _ in range(200):
+        clock.tick(now + 0.6)
+    assert physics.snapshot.time == pytest.approx(0.6, abs=0.003)
+    assert clock.real_time_factor == 1.0
+    for _ in range(400):
+        clock.tick(now + 5.6)
+    assert physics.snapshot.time == pytest.approx(1.6, abs=0.005)
+    assert clock.slipped_s == pytest.approx(4.0, abs=0.01)
+    assert clock.real_time_factor == pytest.approx(1.6 / 5.6, abs=0.01)

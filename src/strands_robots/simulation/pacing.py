@@ -25,8 +25,13 @@ TICK_S = 0.005
 SETTLE_S = 2.0
 """How long physics goes on after a single command."""
 
-MAX_BEHIND_S = 0.25
-"""A world that is further behind real time than this lets the rest go, so that it cannot starve the others."""
+MAX_BEHIND_S = 1.0
+"""A world that is further behind real time than this lets the rest go: it will not catch up."""
+
+VISIT_S = 0.01
+"""How long one visit may take while a world catches up, so that it does not starve the others."""
+
+_CHUNK = 16
 
 
 class Clock:
@@ -111,12 +116,17 @@ class Clock:
                 self.paced_s += behind - MAX_BEHIND_S
             self._due = now - MAX_BEHIND_S
             behind = MAX_BEHIND_S
-        steps = int(behind / timestep)
-        if steps:
+        left = int(behind / timestep)
+        leave = time.monotonic() + VISIT_S
+        while left:
+            steps = min(left, _CHUNK)
             self._physics.advance(steps)
+            left -= steps
             self._due += steps * timestep
             with self._lock:
                 self.paced_s += steps * timestep
+            if time.monotonic() > leave:
+                return
 
     def rest(self) -> None:
         """Nothing runs any more: forget when the next step was due."""

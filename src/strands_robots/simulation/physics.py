@@ -27,8 +27,8 @@ from strands_robots.simulation.parts import Actuator, RobotParts
 from strands_robots.simulation.stage import Floats, Stage
 from strands_robots.utils import ValidationError, shown
 
-CHUNK = 64
-"""Steps between two snapshots when stepping by hand: about a millisecond, 1 % of it for the snapshot."""
+CHUNK = 128
+"""Steps between two snapshots when stepping by hand: about a millisecond for an arm, 1 % of it for the snapshot."""
 
 
 # Numbers a joint has in qpos and in qvel, by mjtJoint: free, ball, slide, hinge.
