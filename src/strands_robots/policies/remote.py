@@ -83,6 +83,7 @@ class RemotePolicy:
         self._broken = (_module("websockets.exceptions").WebSocketException, OSError)
         self._msgpack = _module("msgpack") if self._packed else None
         self._connection: Any = None
+        self._held = contextlib.ExitStack()
         self._task: dict[str, Any] = {}
         self._ranges: Ranges = {}
         self._last_id = 0
@@ -118,14 +119,13 @@ class RemotePolicy:
         self._interrupted.set()
 
     def close(self) -> None:
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            with contextlib.suppress(*self._broken):  # a connection that is lost already is closed
-                connection.close()
+        self._connection = None
+        with contextlib.suppress(*self._broken):  # a connection that is lost already is closed
+            self._held.close()
 
     def _open(self, deadline: float) -> None:
         self.close()
-        self._connection = self._client.connect(
+        opening = self._client.connect(
             self.url,
             open_timeout=max(0.01, deadline - time.monotonic()),
             close_timeout=_CLOSE_S,
@@ -133,6 +133,7 @@ class RemotePolicy:
             proxy=None,
             max_size=8 * 2**20,
         )
+        self._connection = self._held.enter_context(opening)
         answer = self._ask(self._task, deadline)
         if answer.get("type") != "ready":
             self._nonsense(answer)
