@@ -113,7 +113,7 @@ class Simulation(Rollouts):
         snapshot = self._physics.snapshot
         robots = {name: {**snapshot.joints(p), **snapshot.base_pose(p)} for name, p in snapshot.stage.robots.items()}
         return success(
-            f"{len(robots)} robots at {snapshot.time:.3f} s of simulated time.",
+            f"{_count(robots)} at {snapshot.time:.3f} s of simulated time.",
             sim_time=snapshot.time,
             step_count=snapshot.steps,
             robots=robots,
@@ -174,3 +174,7 @@ class Simulation(Rollouts):
 
 def _range(low: float, high: float) -> list[float] | None:
     return [low, high] if low > float("-inf") or high < float("inf") else None
+
+
+def _count(robots: dict[str, Any]) -> str:
+    return "1 robot" if len(robots) == 1 else f"{len(robots)} robots"
