@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PRUNE_HZ = 1.0
+DESCRIBE_S = 0.2
 
 
 @dataclass(slots=True)
@@ -105,14 +106,15 @@ class Assembled:
         every, rates = self.scheduler.every, topics.BY_NAME
         self.sensors = self.mesh.add_robot_sensors() if self.mesh.robot is not None else []
         every("describe", rates["presence"].rate_hz, self.herald.refresh)
-        every("presence", rates["presence"].rate_hz, self.herald.announce, quick=True)
         every("state", rates["state"].rate_hz, self._publish_state)
         every("prune", PRUNE_HZ, self._prune, quick=True)
         frames = getattr(self.mesh.robot, "camera_frames", None)
         if callable(frames):
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), lambda: self._publish_frames(frames))
-        self.herald.refresh()
         self.scheduler.start()
+        # A robot whose bus is wedged is announced all the same, by its name alone.
+        self.herald.described.wait(DESCRIBE_S)
+        every("presence", rates["presence"].rate_hz, self.herald.announce, quick=True)
         if not _can_resume():
             logger.info("%s: no resume key is configured; an emergency stop is cleared at this machine only.", peer)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import socket
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -30,6 +31,7 @@ class Herald:
         self._describe = describe
         self._facts: dict[str, Any] = {}
         self._trouble = ""
+        self.described = threading.Event()
         self._held: list[Subscription] = []
         self._host = socket.gethostname()
 
@@ -59,6 +61,7 @@ class Herald:
         if trouble and trouble != self._trouble:
             logger.warning("%s cannot be described: %s", self._context.peer_id, trouble)
         self._trouble = trouble
+        self.described.set()
 
     def announce(self) -> None:
         """Publish one heartbeat."""

@@ -1,0 +1,211 @@
+"""Bytes from anybody on every topic: nothing raises, nothing is kept, the peer still answers."""
+
+from __future__ import annotations
+
+import gc
+import json
+import random
+import sys
+from typing import Any
+
+import pytest
+from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.mesh.peers import Fleet
+
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.security import ValidationError, validate_command, validate_input_frame
+
+LIMIT = 16 * 1024
+
+scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=40)
+values = st.recursive(
+    scalars,
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=12), inner, max_size=5),
+    max_leaves=12,
+)
+FIELDS = [
+    "robot_id", "robot_type", "hostname", "timestamp", "sender_id", "turn_id", "command", "type", "responder_id",
+    "result", "error", "peer_id", "t", "estop_id", "source_zid", "assertion", "action", "seq", "sig", "duration",
+    "policy_provider", "policy_host", "target_pose", "robot_name", "steps", "instruction",
+]  # fmt: skip
+bodies = st.dictionaries(st.sampled_from(FIELDS) | st.text(max_size=8), values, max_size=10)
+
+
+@given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode))
+@settings(max_examples=500)
+def test_any_bytes_are_an_object_or_a_wire_error(data: bytes) -> None:
+    try:
+        assert isinstance(wire.decode(data, LIMIT), dict)
+    except wire.WireError:
+        return
+
+
+@given(bodies)
+@settings(max_examples=500)
+def test_any_object_is_a_message_or_a_wire_error(body: dict[str, Any]) -> None:
+    for kind in (wire.Presence, wire.Request, wire.Reply, wire.EstopNotice, wire.ResumeRelay):
+        try:
+            kind.of(body)
+        except wire.WireError:
+            continue
+
+
+@given(values)
+@settings(max_examples=500)
+def test_any_command_is_clean_or_refused_by_name(command: Any) -> None:
+    for candidate in (
+        command,
+        {"action": command},
+        {"action": "start", "policy_provider": "mock", "duration": command},
+    ):
+        try:
+            clean = validate_command(candidate)
+        except ValidationError as exc:
+            assert str(exc)
+        else:
+            json.dumps(clean, allow_nan=False)
+
+
+@given(values)
+@settings(max_examples=500)
+def test_any_input_action_is_finite_or_refused(action: Any) -> None:
+    try:
+        checked = validate_input_frame(action)
+    except ValidationError:
+        return
+    assert all(abs(value) <= 720 for value in checked.values())
+    assert len(checked) <= 64
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"[" * 100_000,
+        b'{"a":' * 100_000,
+        b'{"t":NaN}',
+        b'{"t":1e999}',
+        b'{"t":' + b"9" * 10_000 + b"}",
+        b"\xff\xfe",
+        b"",
+    ],
+)
+def test_what_breaks_parsers_is_a_wire_error(data: bytes) -> None:
+    try:
+        body = wire.decode(data, 1 << 20)
+    except wire.WireError:
+        return
+    with pytest.raises(wire.WireError):
+        wire.EstopNotice.of({"peer_id": "x", **body})
+
+
+def test_a_message_too_large_is_an_error_to_its_sender() -> None:
+    with pytest.raises(wire.TooLargeError):
+        wire.encode({"data": "x" * LIMIT}, LIMIT)
+    with pytest.raises(wire.WireError):
+        wire.encode({"data": object()}, LIMIT)
+    assert json.loads(wire.encode({"a": float("nan"), "b": [float("inf"), 1]}, LIMIT)) == {"a": None, "b": [None, 1]}
+
+
+def seeds(peers: Fleet) -> dict[str, dict[str, Any]]:
+    """A lawful message of each topic, to mutate."""
+    now = peers.clock()
+    assertion = {"v": 1, "epoch": "0" * 32, "targets": ["arm-1"], "t": now, "nonce": "1" * 32, "sig": "x"}
+    return {
+        "strands/arm-9/presence": {"robot_id": "arm-9", "robot_type": "robot", "hostname": "h", "timestamp": now},
+        "strands/arm-1/cmd": {"sender_id": "x", "turn_id": "t", "command": {"action": "status"}, "timestamp": now},
+        "strands/broadcast": {"sender_id": "x", "turn_id": "t", "command": {"action": "ping"}, "timestamp": now},
+        "strands/arm-1/response/x/t": {"type": "response", "responder_id": "x", "turn_id": "t", "result": {}},
+        "strands/safety/estop": {"peer_id": 5, "t": now, "estop_id": "a" * 32, "source_zid": "ff"},
+        "strands/safety/resume": {"peer_id": "x", "t": now, "assertion": assertion, "source_zid": "ff"},
+        "strands/lead/input/leader": {"peer_id": "lead", "t": now, "seq": 1, "action": {"j": 1.0}},
+    }
+
+
+def mutated(chance: random.Random, seed: dict[str, Any]) -> bytes:
+    data = bytearray(json.dumps(seed).encode())
+    for _ in range(chance.randrange(1, 6)):
+        at = chance.randrange(len(data))
+        match chance.randrange(4):
+            case 0:
+                data[at] = chance.randrange(256)
+            case 1:
+                del data[at : at + chance.randrange(1, 8)]
+            case 2:
+                data[at:at] = bytes(chance.choices(b'{}[]",:0e-\\u', k=3))
+            case _:
+                data[at:at] = data[: chance.randrange(1, 20)]
+        if not data:
+            data = bytearray(b"0")
+    return bytes(data)
+
+
+def test_a_hundred_thousand_mutated_messages_leave_nothing_behind(peers: Fleet) -> None:
+    peers.join(World("left"), "arm-1", "sim")
+    console = peers.join(None, "console")
+    stranger, chance = peers.stranger(), random.Random(5)
+    messages = list(seeds(peers).items())
+    stream = peers.meshes[0].subscribe("strands/*/input/*", lambda key, data: None)
+    assert stream
+
+    def pour(count: int) -> None:
+        for number in range(count):
+            key, seed = messages[number % len(messages)]
+            stranger.put(key, mutated(chance, seed))
+        eventually(lambda: console.ping("arm-1", timeout=2)["status"] == "ok", within=10)
+
+    pour(10_000)
+    peers.audit.clear()
+    gc.collect()
+    before = sys.getallocatedblocks()
+    pour(90_000)
+    peers.audit.clear()
+    gc.collect()
+    assert sys.getallocatedblocks() - before < 60_000
+    assert console.send("arm-1", {"action": "status"}, timeout=5)["type"] == "response"
+
+
+def test_a_flood_of_refusals_is_told_as_a_count(peers: Fleet) -> None:
+    peers.join(Arm(), "arm-1")
+    stranger = peers.stranger()
+    for _ in range(1000):
+        stranger.put("strands/arm-1/cmd", {"sender_id": "*", "turn_id": "t", "command": {"action": "stop"}})
+    assert len(peers.events("command_rejected")) <= 5
+    peers.clock.pass_(2)
+    peers.meshes[0].stop()
+    told = peers.events("command_rejected")
+    assert sum(event.get("left_out", 0) for event in told) >= 990
+
+
+def test_invented_peers_do_not_fill_the_registry_beyond_its_bound(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    console = peers.join(None, "console")
+    stranger = peers.stranger()
+    for number in range(1500):
+        stranger.put(f"strands/p{number}/presence", {"robot_id": f"p{number}", "timestamp": peers.clock()})
+    assert len(console.peers) <= 1024
+    assert console.get_peer("p1499") is not None
+    assert console.get_peer("p0") is None
+
+
+@pytest.mark.parametrize(
+    ("pattern", "key", "fits"),
+    [
+        ("strands/*/presence", "strands/a/presence", True),
+        ("strands/*/presence", "strands/a/b/presence", False),
+        ("strands/**", "strands/a/b", True),
+        ("strands/*/response/**", "strands/a/response", True),
+        ("**", "x", True),
+        ("**/a/**/b", "x/a/y/z/b", True),
+        ("**/a/**/b", "x/a/y/z", False),
+    ],
+)
+def test_key_expressions_match_as_zenoh_has_them(pattern: str, key: str, fits: bool) -> None:
+    assert topics.matches(pattern, key) is fits
+
+
+def test_a_hostile_pattern_costs_no_exponential_time() -> None:
+    assert not topics.matches("/".join(["**", "a"] * 40 + ["b"]), "/".join(["a"] * 200))

@@ -1,0 +1,231 @@
+"""Leader to follower: what is published, and every guard that a frame passes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fixtures.mesh_robots import Arm
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet
+
+from strands_robots.mesh.core import Mesh
+from strands_robots.mesh.input import InputPublisher, InputReceiver
+from strands_robots.mesh.security import ValidationError
+
+
+class Leader:
+    """A teleoperator that counts upwards."""
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def get_action(self) -> dict[str, float]:
+        self.reads += 1
+        return {"shoulder.pos": self.reads / 10}
+
+
+class Stream:
+    """A follower, its receiver and the leader's own session to send frames by hand."""
+
+    def __init__(self, peers: Fleet) -> None:
+        self.peers, self.arm = peers, Arm()
+        self.follower: Mesh = peers.join(self.arm, "follower")
+        self.leader = peers.stranger()
+        self.leader.put("strands/lead/presence", {"robot_id": "lead", "timestamp": peers.clock()})
+        self.receiver = InputReceiver(self.follower, self.arm, "lead")
+        self.sequence = 0
+
+    def frame(self, **fields: Any) -> dict[str, Any]:
+        self.sequence += 1
+        body = {"peer_id": "lead", "device": "leader", "method": "arm", "t": self.peers.clock(), "seq": self.sequence}
+        return {**body, "action": {"shoulder.pos": 1.0}, "events": None, **fields}
+
+    def send(self, **fields: Any) -> None:
+        time.sleep(0.011)  # the cap is 100 a second
+        self.leader.put("strands/lead/input/leader", self.frame(**fields))
+
+    def stat(self, name: str) -> Callable[[], int]:
+        return lambda: int(self.receiver.stats[name])
+
+
+@pytest.fixture
+def stream(peers: Fleet) -> Stream:
+    made = Stream(peers)
+    made.receiver.start()
+    assert made.receiver.start_refusal is None
+    return made
+
+
+def test_a_leaders_actions_reach_the_follower_in_order(peers: Fleet) -> None:
+    arm = Arm()
+    follower, lead = peers.join(arm, "follower"), peers.join(None, "lead")
+    receiver = InputReceiver(follower, arm, "lead")
+    publisher = InputPublisher(lead, Leader(), hz=50)
+    receiver.start()
+    publisher.start()
+    eventually(lambda: len(arm.actions) >= 10, within=5)
+    sent, got = publisher.stop(), receiver.stop()
+    values = [action["shoulder.pos"] for action in arm.actions]
+    assert values == sorted(values)
+    assert sent["running"] is sent["thread_alive"] is False
+    assert got["frames_received"] == len(arm.actions)
+    assert got["rejected"] == got["errors"] == 0
+    assert peers.events("input_stream_opened")
+
+
+def test_a_stream_needs_a_leader_that_was_seen(peers: Fleet) -> None:
+    arm = Arm()
+    receiver = InputReceiver(peers.join(arm, "follower"), arm, "nobody")
+    receiver.start()
+    assert receiver.start_refusal is not None
+    assert peers.events("input_stream_refused")
+
+
+def test_a_locked_follower_opens_no_stream_and_an_open_one_ends(stream: Stream) -> None:
+    stream.send()
+    eventually(lambda: stream.arm.actions, within=2)
+    stream.follower.emergency_stop()
+    stream.send()
+    eventually(lambda: stream.stat("rejected_lockout")() == 1, within=2)
+    assert len(stream.arm.actions) == 1
+    assert stream.receiver.stats["running"] is False
+    stream.receiver.start()
+    assert stream.receiver.start_refusal is not None
+
+
+def test_a_halt_ends_a_stream_without_locking(stream: Stream) -> None:
+    stream.arm.halt("by hand")
+    stream.send()
+    eventually(lambda: stream.receiver.stats["running"] is False, within=2)
+    assert stream.arm.actions == []
+
+
+def test_another_session_on_the_leaders_topic_moves_nothing(stream: Stream) -> None:
+    stream.peers.stranger().put("strands/lead/input/leader", stream.frame())
+    eventually(lambda: stream.stat("rejected_source")() == 1, within=2)
+    assert stream.arm.actions == []
+
+
+@pytest.mark.parametrize("stamp", [-61.0, 6.0, None, "now", True])
+def test_a_frame_that_is_not_fresh_is_refused(stream: Stream, stamp: object) -> None:
+    stream.send(t=stream.peers.clock() + stamp if isinstance(stamp, float) else stamp)
+    eventually(lambda: stream.stat("rejected_freshness")() == 1, within=2)
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        {"j": float("1e5")},
+        {"j": 721},
+        {"j": True},
+        {"j": "1"},
+        {"j": [1]},
+        {"x" * 65: 1},
+        {f"j{number}": 1 for number in range(65)},
+        [1, 2],
+    ],
+)
+def test_an_action_out_of_bounds_is_refused(stream: Stream, action: object) -> None:
+    stream.send(action=action)
+    eventually(lambda: stream.stat("rejected_invalid")() == 1, within=2)
+    assert stream.receiver.stats["rejected"] == 1
+    assert stream.arm.actions == []
+
+
+def test_a_null_action_an_old_frame_and_a_burst_move_nothing(stream: Stream) -> None:
+    stream.send(action=None)
+    stream.send(seq=10)
+    stream.send(seq=10)
+    eventually(lambda: stream.stat("out_of_order")() == 1, within=2)
+    for number in range(11, 16):
+        stream.leader.put("strands/lead/input/leader", stream.frame(seq=number))
+    eventually(lambda: stream.stat("rate_dropped")() >= 3, within=2)
+    assert len(stream.arm.actions) <= 3
+
+
+def test_a_joint_commanded_too_fast_is_refused(stream: Stream) -> None:
+    stream.send(action={"shoulder.pos": 0.0})
+    stream.send(action={"shoulder.pos": 300.0})
+    eventually(lambda: stream.stat("slew_rejected")() == 1, within=2)
+    stream.send(action={"shoulder.pos": 5.0})
+    eventually(lambda: stream.stat("frames_received")() == 2, within=2)
+
+
+def test_a_stream_ends_with_its_lifetime(stream: Stream, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_INPUT_STREAM_TTL_S", "1")
+    stream.receiver._opened -= 2
+    stream.send()
+    eventually(lambda: stream.peers.events("input_stream_expired"), within=2)
+    assert stream.receiver.stats["rejected_expired"] == 1
+    assert stream.receiver.stats["running"] is False
+
+
+def test_a_robot_that_refuses_every_frame_reads_as_errors(stream: Stream) -> None:
+    for _ in range(3):
+        stream.send(action={"broken": 1.0})
+    eventually(lambda: stream.stat("errors")() == 3, within=2)
+    assert stream.receiver.stats["frames_received"] == 3
+
+
+def test_streams_are_opened_told_and_closed_by_command(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "teleop_receive")
+    arm = Arm()
+    peers.join(arm, "follower")
+    lead = peers.join(None, "lead")
+    receive = {"action": "teleop_receive", "source_peer_id": "lead"}
+    assert lead.send("follower", receive, timeout=5)["result"]["status"] == "success"
+    publisher = InputPublisher(lead, Leader(), hz=50)
+    publisher.start()
+    eventually(lambda: arm.actions, within=3)
+    told = lead.send("follower", {"action": "teleop_status"}, timeout=5)["result"]
+    assert told["streams"][0]["running"] is True
+    closed = lead.send("follower", {"action": "teleop_stop"}, timeout=5)["result"]
+    assert closed["streams"][0]["running"] is False
+    publisher.stop()
+
+
+def test_a_plain_stop_closes_the_streams_too(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "teleop_receive")
+    peers.join(Arm(), "follower")
+    lead = peers.join(None, "lead")
+    lead.send("follower", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=5)
+    assert lead.send("follower", {"action": "stop"}, timeout=5)["result"]["ok"] is True
+    assert lead.send("follower", {"action": "teleop_status"}, timeout=5)["result"]["streams"] == []
+
+
+@pytest.mark.parametrize("hz", [0, -1, float("nan"), float("inf"), True, "50"])
+def test_a_rate_that_no_loop_can_keep_is_refused(peers: Fleet, hz: object) -> None:
+    with pytest.raises(ValueError, match="hz"):
+        InputPublisher(peers.join(None, "lead"), Leader(), hz=hz)  # type: ignore[arg-type]
+
+
+def test_a_device_without_actions_and_a_wildcard_name_are_refused(peers: Fleet) -> None:
+    mesh = peers.join(None, "lead")
+    with pytest.raises(ValueError, match="get_action"):
+        InputPublisher(mesh, object())
+    with pytest.raises(ValidationError):
+        InputPublisher(mesh, Leader(), device_name="*")
+    with pytest.raises(ValidationError):
+        InputReceiver(mesh, Arm(), "**")
+
+
+def test_a_device_that_fails_is_counted_and_goes_on(peers: Fleet) -> None:
+    class Flaky(Leader):
+        def get_action(self) -> dict[str, float]:
+            if self.reads == 0:
+                self.reads = 1
+                raise OSError("bus")
+            return super().get_action()
+
+        def get_teleop_events(self) -> dict[str, bool]:
+            raise OSError("no events")
+
+    publisher = InputPublisher(peers.join(None, "lead"), Flaky(), hz=200)
+    publisher.start()
+    eventually(lambda: publisher.stats["frames"] >= 3, within=3)
+    stats = publisher.stop()
+    assert stats["errors"] == 1
+    assert stats["event_read_errors"] >= 3

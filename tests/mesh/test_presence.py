@@ -1,0 +1,145 @@
+"""Who is there, and which session speaks for whom."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from fixtures.mesh_robots import Arm, World
+from tests.mesh.peers import Clock, Fleet
+
+from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
+from strands_robots.mesh.registry import PeerRegistry
+
+
+def heartbeat(peers: Fleet, peer: str, **fields: Any) -> dict[str, Any]:
+    return {"robot_id": peer, "robot_type": "robot", "hostname": "host", "timestamp": peers.clock(), **fields}
+
+
+def test_peers_see_each_other_and_what_they_are(peers: Fleet) -> None:
+    arm = peers.join(Arm("so100"), "arm-1")
+    sim = peers.join(World("left", "right"), "sim-1", "sim")
+    row = arm.get_peer("sim-1")
+    assert row is not None
+    assert (row["type"], row["world"], row["sim_robots"], row["reachable"]) == ("sim", True, ["left", "right"], True)
+    assert sim.peers_by_id["arm-1"]["tool_name"] == "so100"
+    assert sim.peers_by_id["arm-1"]["action_keys"] == ["shoulder.pos"]
+    assert [peer["peer_id"] for peer in arm.peers] == ["sim-1"]
+    assert arm.get_peer("arm-1") is None
+
+
+def test_a_live_peers_name_cannot_be_taken_by_another_session(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    peers.join(Arm(), "arm-1")
+    held = console.peer_wire_zid("arm-1")
+    thief = peers.stranger()
+    thief.put("strands/arm-1/presence", heartbeat(peers, "arm-1"))
+    assert console.peer_wire_zid("arm-1") == held
+    assert peers.events("presence_identity_conflict")
+    peers.clock.pass_(10.5)
+    thief.put("strands/arm-1/presence", heartbeat(peers, "arm-1"))
+    assert console.peer_wire_zid("arm-1") == thief.session_id
+
+
+def test_a_peer_whose_session_ended_is_out_of_reach_at_once_and_may_restart(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    arm = peers.join(Arm(), "arm-1")
+    assert console.peers_by_id["arm-1"]["reachable"]
+    arm.stop()
+    assert not console.peers_by_id["arm-1"]["reachable"]
+    again = peers.stranger()
+    again.put("strands/arm-1/presence", heartbeat(peers, "arm-1"))
+    assert console.peer_wire_zid("arm-1") == again.session_id
+    assert console.peers_by_id["arm-1"]["reachable"]
+
+
+@pytest.mark.parametrize("stamp", [-61.0, 6.0, None, "now", True])
+def test_a_heartbeat_that_is_not_fresh_is_dropped(peers: Fleet, stamp: object) -> None:
+    console = peers.join(None, "console")
+    shifted = peers.clock() + stamp if isinstance(stamp, float) else stamp
+    peers.stranger().put("strands/x/presence", {"robot_id": "x", "timestamp": shifted})
+    assert console.peers == []
+
+
+def test_local_facts_are_written_over_what_a_heartbeat_claims(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    body = heartbeat(peers, "x", age=-5, reachable=False, peer_id="console", type="console")
+    peers.stranger().put("strands/x/presence", body)
+    row = console.peers_by_id["x"]
+    assert row["age"] == 0
+    assert row["reachable"] is True
+    assert row["type"] == "robot"
+
+
+def test_a_silent_peer_is_pruned_or_kept_as_out_of_reach() -> None:
+    clock, kept = Clock(), [0.0]
+    registry = PeerRegistry(clock=clock, most=lambda: 2, retention=lambda: kept[0])
+    assert registry.update("a", "robot", "h", {}) is True
+    assert registry.update("a", "robot", "h", {}) is False
+    clock.pass_(11)
+    kept[0] = 60
+    assert registry.prune() == []
+    assert registry.all()[0]["reachable"] is False
+    assert registry.get("a", max_age_s=5) is None
+    kept[0] = 0
+    assert registry.prune() == ["a"]
+    for name in "bcd":
+        registry.update(name, "robot", "h", {})
+    assert {row["peer_id"] for row in registry.all()} == {"c", "d"}
+
+
+@pytest.mark.parametrize("peer", ["", "broadcast", "safety", "-a", "a/b", "a*", "a b", "x" * 129, None, 5])
+def test_a_bad_peer_id_is_refused(peer: object) -> None:
+    with pytest.raises(ValueError, match="peer_id"):
+        Mesh(None, peer)  # type: ignore[arg-type]
+
+
+def test_the_kill_switch_overrides_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH", "no")
+    assert init_mesh(Arm(), "arm-1") is None
+    monkeypatch.delenv("STRANDS_MESH")
+    assert init_mesh(Arm(), "arm-1", mesh=False) is None
+
+
+def test_init_mesh_names_joins_and_lists_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
+    mesh = init_mesh(Arm("my arm"), mesh=True)
+    assert mesh is not None
+    try:
+        assert mesh.alive
+        assert mesh.peer_id.startswith("my-arm-")
+        assert get_local_robots() == {mesh.peer_id: mesh}
+    finally:
+        mesh.close()
+    assert get_local_robots() == {}
+    assert not mesh.alive
+
+
+def test_a_peer_that_cannot_join_is_not_alive(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_BACKEND", "pigeon")
+    mesh = init_mesh(None, "console")
+    assert mesh is not None
+    assert not mesh.alive
+    with pytest.raises(RuntimeError, match="not on the mesh"):
+        mesh.emergency_stop()
+    assert mesh.subscribe("strands/**") is None
+    mesh.close()
+
+
+def test_subscriptions_deliver_objects_and_end_with_the_stay(peers: Fleet) -> None:
+    one, two = peers.join(None, "one"), peers.join(None, "two")
+    heard: list[tuple[str, dict[str, Any], str | None]] = []
+    name = one.subscribe("strands/**", on_sample=lambda key, data, zid: heard.append((key, data, zid)), name="all")
+    assert name == "all"
+    assert one.subscribe("strands/two/note") == "strands/two/note"
+    two.publish("strands/two/note", {"x": 1})
+    peers.meshes[0].ping("two")
+    assert ("strands/two/note", {"x": 1}, peers.transports["two"].session_id) in heard
+    assert one.inbox["strands/two/note"][0]["x"] == 1
+    one.unsubscribe("all")
+    with pytest.raises(ValueError, match="not both"):
+        one.subscribe("x", lambda key, data: None, on_sample=lambda key, data, zid: None)
+    one.stop()
+    assert one.inbox == {}
+    one.start()
+    assert one.alive

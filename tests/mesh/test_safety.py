@@ -1,0 +1,223 @@
+"""The fleet's emergency stop and its signed resume, on the in-memory transport."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet
+
+from strands_robots.mesh.resume_authority import keygen, load_signing_key, main
+from strands_robots.mesh.transport.base import Sample
+from strands_robots.safety.resume import sign
+
+PASSPHRASE = "Correct-Horse-7-Battery"
+
+
+@pytest.fixture
+def key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    public = keygen(tmp_path / "operator.pem", PASSPHRASE)
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", public)
+    return load_signing_key(tmp_path / "operator.pem", PASSPHRASE)
+
+
+def test_an_emergency_stop_halts_and_locks_everybody_under_one_epoch(peers: Fleet) -> None:
+    arms = [Arm(f"arm-{number}") for number in range(3)]
+    meshes = [peers.join(arm, arm.tool_name_str) for arm in arms]
+    answers = meshes[0].emergency_stop()
+    assert answers[0]["responder_id"] == "arm-0"
+    assert {answer["responder_id"] for answer in answers} == {"arm-0", "arm-1", "arm-2"}
+    epochs = {mesh.lockout_epoch for mesh in meshes}
+    assert len(epochs) == 1 and None not in epochs
+    assert all(arm.halts for arm in arms)
+    recorded = peers.events("emergency_stop")[0]
+    assert (recorded["responses_received"], recorded["peers_not_stopped"], recorded["peers_silent"]) == (3, 0, 0)
+
+
+def test_who_did_not_stop_and_who_was_silent_is_named(peers: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+    console = peers.join(None, "console")
+    peers.join(Arm("stuck", stops=False), "stuck")
+    ghost = peers.stranger()
+    ghost.put("strands/ghost/presence", {"robot_id": "ghost", "timestamp": peers.clock()})
+    console.emergency_stop()
+    recorded = peers.events("emergency_stop")[0]
+    assert recorded["not_stopped"] == ["stuck"]
+    assert recorded["silent"] == ["ghost"]
+    critical = [record.message for record in caplog.records if record.levelname == "CRITICAL"]
+    assert any("stuck" in message for message in critical)
+    assert any("ghost" in message for message in critical)
+
+
+def test_the_envelope_goes_out_at_once_and_again_with_the_counts(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    peers.join(Arm(), "arm-1")
+    seen: list[dict[str, Any]] = []
+    peers.stranger().declare_subscriber("strands/safety/estop", lambda sample: seen.append(json.loads(sample.payload)))
+    console.emergency_stop()
+    assert [body["responses_received"] for body in seen] == [0, 2]
+    assert len({body["estop_id"] for body in seen}) == 1
+    assert seen[0]["source_zid"] == peers.transports["console"].session_id
+    assert set(seen[1]) == {
+        "peer_id", "t", "estop_id", "responses_received", "peers_not_stopped", "peers_silent", "lockout_engaged",
+        "source_zid",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("shift", [0.0, -3600.0, 3600.0, 30.0])
+def test_a_stop_counts_whatever_its_time_says(peers: Fleet, shift: float) -> None:
+    arm = Arm()
+    mesh = peers.join(arm, "arm-1")
+    stranger = peers.stranger()
+    body = {"peer_id": "far", "t": peers.clock() + shift, "estop_id": "a" * 32, "source_zid": stranger.session_id}
+    stranger.put("strands/safety/estop", body)
+    eventually(lambda: mesh.lockout_epoch == "a" * 32, within=2)
+    assert arm.halts
+    assert bool(peers.events("estop_clock_skew")) is (shift > 5)
+    stranger.put("strands/safety/estop", body)
+    assert peers.events("remote_estop_redundant")
+    assert len(arm.halts) == 1
+
+
+def test_an_envelope_without_an_id_has_the_epoch_of_its_issuer_and_time(peers: Fleet) -> None:
+    mesh = peers.join(Arm(), "arm-1")
+    stranger = peers.stranger()
+    stranger.put("strands/safety/estop", {"peer_id": "far", "t": 1700000000.25, "source_zid": stranger.session_id})
+    expected = hashlib.sha256(b"far\x001700000000.25").hexdigest()[:32]
+    eventually(lambda: mesh.lockout_epoch == expected, within=2)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"source_zid": "ff"},
+        {"source_zid": None},
+        {"t": "now"},
+        {"t": True},
+        {"t": None},
+        {"peer_id": ""},
+        {"peer_id": 5},
+    ],
+)
+def test_an_envelope_that_contradicts_itself_stops_nobody(peers: Fleet, change: dict[str, Any]) -> None:
+    arm = Arm()
+    mesh = peers.join(arm, "arm-1")
+    stranger = peers.stranger()
+    body = {"peer_id": "far", "t": peers.clock(), "estop_id": "a" * 32, "source_zid": stranger.session_id, **change}
+    stranger.put("strands/safety/estop", body)
+    eventually(lambda: peers.events("estop_rejected"), within=2)
+    assert mesh.lockout_epoch is None
+
+
+def test_a_locked_peer_refuses_motion_and_answers_reads_and_stops(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    world = World("left")
+    peers.join(world, "sim-1", "sim")
+    console.emergency_stop()
+    assert console.send("sim-1", {"action": "step"}, timeout=5)["error"] == "command rejected"
+    start = {"action": "start", "policy_provider": "mock"}
+    assert console.send("sim-1", start, timeout=5)["error"] == "command rejected"
+    for action in ("status", "ping", "stop", "state", "features", "teleop_status", "teleop_stop"):
+        assert console.send("sim-1", {"action": action}, timeout=5)["type"] == "response", action
+
+
+def test_the_operators_resume_frees_the_fleet_and_nobody_elses_does(peers: Fleet, key: Any, tmp_path: Path) -> None:
+    console, robot = peers.join(None, "console"), peers.join(Arm(), "arm-1")
+    console.emergency_stop()
+    keygen(tmp_path / "thief.pem", PASSPHRASE)
+    thief = load_signing_key(tmp_path / "thief.pem", PASSPHRASE)
+    assert console.resume(thief) == {"status": "error", "error": "resume rejected"}
+    assert console.resume("no key") == {"status": "error", "error": "resume rejected"}
+    assert robot.lockout_epoch is not None
+    assert console.resume(key) == {"status": "ok"}
+    assert console.lockout_epoch is None
+    eventually(lambda: robot.lockout_epoch is None, within=2)
+    eventually(lambda: peers.events("remote_resume_applied"), within=2)
+    assert console.resume(key) == {"status": "error", "error": "resume rejected"}
+
+
+def test_a_resume_frees_only_its_targets(peers: Fleet, key: Any) -> None:
+    console = peers.join(None, "console")
+    first, second = peers.join(Arm(), "arm-1"), peers.join(Arm(), "arm-2")
+    console.emergency_stop()
+    assert console.resume(key, targets=["arm-1"]) == {"status": "ok"}
+    eventually(lambda: first.lockout_epoch is None, within=2)
+    assert second.lockout_epoch is not None
+    assert console.lockout_epoch is None
+
+
+def test_a_resume_by_command_is_admitted_and_relayed(peers: Fleet, key: Any) -> None:
+    first, second = peers.join(Arm(), "arm-1"), peers.join(Arm(), "arm-2")
+    console = peers.join(None, "console")
+    epoch = None
+    console.emergency_stop()
+    epoch = first.lockout_epoch
+    assert epoch is not None
+    [assertion] = sign(key, epoch, ["arm-1", "arm-2"])
+    answer = console.send("arm-1", {"action": "resume", "assertion": assertion}, timeout=5)
+    assert answer["result"] == {"status": "ok"}
+    eventually(lambda: second.lockout_epoch is None, within=2)
+    assert first.lockout_epoch is None
+    again = console.send("arm-1", {"action": "resume", "assertion": assertion}, timeout=5)
+    assert again["result"] == {"status": "error", "error": "resume rejected"}
+
+
+def test_two_stops_need_two_resumes(peers: Fleet, key: Any) -> None:
+    one, two = peers.join(Arm(), "arm-1"), peers.join(Arm(), "arm-2")
+    one.emergency_stop()
+    first = one.lockout_epoch
+    two.emergency_stop()
+    assert first is not None
+    [assertion] = sign(key, first, ["arm-1"])
+    console = peers.join(None, "console")
+    console.send("arm-1", {"action": "resume", "assertion": assertion}, timeout=5)
+    assert one.lockout_epoch not in (None, first)
+
+
+def test_relays_that_are_not_for_us_are_not_held_against_anybody(peers: Fleet, key: Any) -> None:
+    robot = peers.join(Arm(), "arm-1")
+    console = peers.join(None, "console")
+    console.emergency_stop()
+    stranger = peers.stranger()
+    for number in range(10):
+        assertion = {"epoch": "f" * 32, "targets": ["other"], "nonce": str(number)}
+        body = {"peer_id": "x", "t": peers.clock(), "assertion": assertion, "source_zid": stranger.session_id}
+        stranger.put("strands/safety/resume", body)
+    assert console.resume(key) == {"status": "ok"}
+    eventually(lambda: robot.lockout_epoch is None, within=2)
+
+
+def test_without_sessions_a_stop_that_the_broker_kept_locks_a_late_joiner(peers: Fleet) -> None:
+    mesh = peers.join(Arm(), "arm-1", sessionless=True)
+    body = {"peer_id": "far", "t": peers.clock() - 86_400, "estop_id": "b" * 32}
+    sample = Sample("strands/safety/estop", json.dumps(body).encode(), None, sessionless=True, retained=True)
+    peers.bus.deliver(peers.transports["arm-1"], sample)
+    eventually(lambda: mesh.lockout_epoch == "b" * 32, within=2)
+
+
+def test_a_kept_stop_that_a_signed_resume_followed_does_not_lock(peers: Fleet, key: Any) -> None:
+    mesh = peers.join(Arm(), "arm-1", sessionless=True)
+    [assertion] = sign(key, "b" * 32, ["arm-1"], clock=lambda: peers.clock() - 3600)
+    relay = {"peer_id": "far", "t": peers.clock() - 3600, "assertion": assertion}
+    estop = {"peer_id": "far", "t": peers.clock() - 7200, "estop_id": "b" * 32}
+    for key_, body in (("resume", relay), ("estop", estop)):
+        sample = Sample(f"strands/safety/{key_}", json.dumps(body).encode(), None, sessionless=True, retained=True)
+        peers.bus.deliver(peers.transports["arm-1"], sample)
+    eventually(lambda: peers.events("remote_estop_redundant"), within=2)
+    assert mesh.lockout_epoch is None
+
+
+def test_keygen_asks_twice_and_prints_the_public_half(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "operator.pem"
+    assert main(["keygen", str(path)], ask=lambda prompt: prompt) == 1
+    assert main(["keygen", str(path)], ask=lambda prompt: "short") == 1
+    assert main(["sign"], ask=lambda prompt: PASSPHRASE) == 2
+    assert main(["keygen", str(path)], ask=lambda prompt: PASSPHRASE) == 0
+    assert len(capsys.readouterr().out.strip()) >= 43
+    assert path.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(ValueError, match="passphrase"):
+        load_signing_key(path, "Wrong-Horse-7-Battery")

@@ -1,0 +1,164 @@
+"""Signed messages: what a signature must be, and for whom it speaks."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
+from fixtures.mesh_robots import Arm, World
+from tests.mesh.peers import Clock, Fleet
+
+from strands_robots.mesh import keys
+from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
+
+BODY = {"robot_id": "arm-1", "timestamp": 1.5, "nested": {"b": [1, "é"], "a": None}}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("keys")
+    keys.init(made)
+    for name in ("arm-1", "arm-2"):
+        keys.issue(made, name)
+    return made
+
+
+def signer(folder: Path, name: str, clock: Clock) -> Signer:
+    return Signer(folder / f"{name}.pem", folder / f"{name}.key", clock)
+
+
+def verifier(folder: Path, clock: Clock) -> Verifier:
+    return Verifier((folder / "ca.pem").read_bytes(), clock, clock)
+
+
+def test_a_signed_message_is_verified_once(folder: Path) -> None:
+    clock = Clock()
+    signed, check = signer(folder, "arm-1", clock).sign(BODY), verifier(folder, clock)
+    arrived = json.loads(json.dumps(signed))
+    found = check.verify(arrived)
+    assert found.common_name == "arm-1"
+    with pytest.raises(IdentityError, match="nonce"):
+        check.verify(arrived)
+
+
+@pytest.mark.parametrize(
+    ("peer", "speaks"),
+    [("arm-1", True), ("arm-1__left", True), ("arm-10", False), ("arm-1_x", False), ("arm-2", False)],
+)
+def test_a_name_speaks_for_itself_and_its_children(folder: Path, peer: str, speaks: bool) -> None:
+    clock = Clock()
+    identity = Identity(None, verifier(folder, clock), required=True)
+    why = identity.refusal(signer(folder, "arm-1", clock).sign(BODY), peer)
+    assert (why is None) is speaks
+
+
+CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "another body": lambda message: message.update(timestamp=2.5),
+    "a field more": lambda message: message.update(extra=1),
+    "a signature field more": lambda message: message["sig"].update(extra=1),
+    "a signature field less": lambda message: message["sig"].pop("nonce"),
+    "another version": lambda message: message["sig"].update(v=2),
+    "a boolean version": lambda message: message["sig"].update(v=True),
+    "another algorithm": lambda message: message["sig"].update(alg="ed25519"),
+    "an unknown algorithm": lambda message: message["sig"].update(alg="none"),
+    "another time": lambda message: message["sig"].update(t=message["sig"]["t"] + 1),
+    "a time that is none": lambda message: message["sig"].update(t="now"),
+    "another nonce": lambda message: message["sig"].update(nonce="00"),
+    "no base64": lambda message: message["sig"].update(cert="%%%"),
+    "no certificate": lambda message: message["sig"].update(cert=base64.b64encode(b"0" * 300).decode()),
+    "a long certificate": lambda message: message["sig"].update(cert="A" * 9000),
+    "a cut signature": lambda message: message["sig"].update(sig=message["sig"]["sig"][:-8]),
+    "no signature": lambda message: message.pop("sig"),
+    "a list": lambda message: message.update(sig=[1]),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_a_signature_that_was_changed_does_not_count(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    clock = Clock()
+    message = json.loads(json.dumps(signer(folder, "arm-1", clock).sign(BODY)))
+    change(message)
+    with pytest.raises(IdentityError):
+        verifier(folder, clock).verify(message)
+
+
+@pytest.mark.parametrize("shift", [61, -6, 400 * 86_400])
+def test_a_signature_counts_only_near_its_time_and_its_certificates(folder: Path, shift: float) -> None:
+    clock = Clock()
+    message = signer(folder, "arm-1", clock).sign(BODY)
+    clock.pass_(shift)
+    with pytest.raises(IdentityError):
+        verifier(folder, clock).verify(message)
+
+
+def test_a_certificate_of_another_authority_does_not_count(folder: Path, tmp_path: Path) -> None:
+    clock = Clock()
+    keys.init(tmp_path)
+    keys.issue(tmp_path, "arm-1")
+    message = signer(tmp_path, "arm-1", clock).sign(BODY)
+    with pytest.raises(IdentityError, match="issued"):
+        verifier(folder, clock).verify(message)
+
+
+@pytest.mark.parametrize("kind", ["rsa", "ed25519", "ecdsa"])
+def test_every_algorithm_of_the_wire_signs_and_verifies(tmp_path: Path, kind: str) -> None:
+    clock = Clock()
+    keys.init(tmp_path)
+    keys.issue(tmp_path, "arm-1")
+    if kind != "ecdsa":
+        reissue(tmp_path, "arm-1", rsa.generate_private_key(65537, 2048) if kind == "rsa" else None)
+    message = json.loads(json.dumps(signer(tmp_path, "arm-1", clock).sign(BODY)))
+    assert message["sig"]["alg"].startswith(kind)
+    assert verifier(tmp_path, clock).verify(message).common_name == "arm-1"
+
+
+def reissue(folder: Path, name: str, key: Any) -> None:
+    """The same certificate for a key of another kind."""
+    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - used here alone
+
+    key = key or ed25519.Ed25519PrivateKey.generate()
+    old = x509.load_pem_x509_certificate((folder / f"{name}.pem").read_bytes())
+    signing = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), None)
+    assert isinstance(signing, ec.EllipticCurvePrivateKey)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(old.subject)
+        .issuer_name(old.issuer)
+        .public_key(key.public_key())
+        .serial_number(old.serial_number + 1)
+        .not_valid_before(old.not_valid_before_utc)
+        .not_valid_after(old.not_valid_after_utc)
+        .sign(signing, hashes.SHA256())
+    )
+    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    (folder / f"{name}.key").write_bytes(pem)
+    (folder / f"{name}.pem").write_bytes(made.public_bytes(serialization.Encoding.PEM))
+
+
+def test_in_signed_mode_an_unsigned_peer_is_listed_but_bound_to_nothing(peers: Fleet, folder: Path) -> None:
+    roots = (folder / "ca.pem").read_bytes()
+    clock = peers.clock
+
+    def identity(name: str) -> Identity:
+        return Identity(signer(folder, name, clock), Verifier(roots, clock, clock), required=True)
+
+    console = peers.join(None, "arm-1", identity=identity("arm-1"))
+    peers.join(World("left"), "arm-2", "sim", identity=identity("arm-2"))
+    peers.join(Arm(), "plain")
+    certificate = console.peer_cert("arm-2")
+    assert certificate is not None
+    assert certificate[1] == "arm-2"
+    assert console.peer_cert("plain") is None
+    assert console.peer_wire_zid("plain") is None
+    assert console.get_peer("plain") is not None
+    assert console.ping("arm-2")["status"] == "ok"
+    assert console.ping("plain", timeout=0.2)["status"] == "timeout"
+    assert peers.events("presence_unverified")
+    assert peers.events("response_hijack_rejected")
