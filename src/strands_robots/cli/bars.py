@@ -37,12 +37,14 @@ def ranges(features: Mapping[str, Any], robot: str = "") -> dict[str, Range]:
     chosen: Any = features
     if isinstance(robots, Mapping) and robots:
         chosen = robots.get(robot) or next(iter(robots.values()))
-    joints = chosen.get("joints") if isinstance(chosen, Mapping) else None
     found: dict[str, Range] = {}
-    for name, limits in joints.items() if isinstance(joints, Mapping) else ():
-        pair = [number for number in limits if _finite(number)] if isinstance(limits, list | tuple) else []
-        if len(pair) == 2 and pair[0] < pair[1]:
-            found[str(name)] = (float(pair[0]), float(pair[1]))
+    for key in ("joints", "ranges"):
+        joints = chosen.get(key) if isinstance(chosen, Mapping) else None
+        for name, limits in joints.items() if isinstance(joints, Mapping) else ():
+            pair = [number for number in limits if _finite(number)] if isinstance(limits, list | tuple) else []
+            if len(pair) == 2 and pair[0] < pair[1]:
+                # A real robot names the range of an action, such as pan.pos, and the position of the joint, pan.
+                found[str(name)] = found[str(name).removesuffix(".pos")] = (float(pair[0]), float(pair[1]))
     return found
 
 

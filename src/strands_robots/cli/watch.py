@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from strands_robots.cli.bars import Range
+    from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.client import Event
 
 SILENCE_S = 5.0
@@ -48,7 +49,7 @@ def watch(
                 for event in events:
                     screen.data({"device": event.device, "event": event.name, "payload": dict(event.payload)})
             elif screen.out.is_terminal:
-                _live(screen, device, events, limits)
+                _live(screen, _first_view(fleet, device, limits), events)
             else:
                 in_lines(screen, events)
 
@@ -61,6 +62,15 @@ class View:
         self._limits = limits
         self._joints: dict[str, Mapping[str, Any]] = {}
         self.task = "idle"
+
+    def look(self, state: Mapping[str, Any]) -> None:
+        """Learn from an answer to getState or getStatus."""
+        robots = state.get("robots")
+        if isinstance(state.get("joints"), Mapping):
+            self._joints[""] = state["joints"]
+        for name, joints in robots.items() if isinstance(robots, Mapping) else ():
+            if isinstance(joints, Mapping):
+                self._joints[str(name)] = joints
 
     def take(self, event: Event) -> None:
         """Learn from one event."""
@@ -124,10 +134,18 @@ def until(events: Iterator[Event], longest: float | None, device: str) -> Iterat
         raise Failure(f"{device} told nothing for {SILENCE_S:g} s.", Exit.SILENT)
 
 
-def _live(screen: Screen, device: str, events: Iterator[Event], limits: Mapping[str, Range]) -> None:
+def _first_view(fleet: FleetClient, device: str, limits: Mapping[str, Range]) -> View:
+    """The device as it is now: an idle robot may tell no joints by itself."""
+    view = View(device, limits)
+    for question in ("getState", "getStatus"):
+        with contextlib.suppress(Failure):  # a device answers one of the two
+            view.look(asked(fleet, device, question, {}, 3.0))
+    return view
+
+
+def _live(screen: Screen, view: View, events: Iterator[Event]) -> None:
     from rich.live import Live  # noqa: PLC0415 - Rich is loaded when something is shown
 
-    view = View(device, limits)
     with Live(view.draw(), console=screen.out, refresh_per_second=15) as live:
         for event in events:
             view.take(event)

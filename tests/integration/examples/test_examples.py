@@ -1,0 +1,85 @@
+"""The examples as processes, offline."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from fixtures.waiting import eventually, free_port
+
+from strands_robots import settings
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
+WITHIN_S = 30.0
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    ours = {setting.name for setting in settings.declared()}
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    return {**kept, "STRANDS_DC_PORT": str(free_port()), "STRANDS_STATE_DIR": str(tmp_path)}
+
+
+@contextmanager
+def example(name: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
+    """A running example; it has to end in order on Ctrl-C."""
+    process = subprocess.Popen([sys.executable, EXAMPLES / name], env=environment, text=True)
+    try:
+        yield process
+        process.send_signal(signal.SIGINT)
+        assert process.wait(WITHIN_S) == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+def command(environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "strands_robots.cli", *words]
+    return subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
+
+
+def live(environment: dict[str, str], peer: str) -> bool:
+    return command(environment, "peers", peer, "--timeout", "1").returncode == 0
+
+
+def test_the_served_arm_is_driven_by_an_agents_tools(environment: dict[str, str]) -> None:
+    with example("serve_arm.py", environment):
+        eventually(lambda: live(environment, "so100-lab-1"), within=WITHIN_S, what="the arm is live")
+        line = [sys.executable, EXAMPLES / "drive_from_agent.py"]
+        driven = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
+        assert driven.returncode == 0, driven.stderr
+        assert "Driving so100-lab-1." in driven.stdout
+
+
+def test_without_a_robot_the_agent_says_so(environment: dict[str, str]) -> None:
+    line = [sys.executable, EXAMPLES / "drive_from_agent.py"]
+    driven = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
+    assert driven.returncode != 0
+
+
+def test_a_robot_of_ones_own_moves_for_the_allowed_and_stops_for_everybody(environment: dict[str, str]) -> None:
+    allowed = {"DEVICE_CONNECT_RPC_ALLOW": "strands-robots", "STRANDS_ROBOT_COMMAND_ALLOW": "execute"}
+    with example("own_driver.py", environment | allowed):
+        eventually(lambda: live(environment, "pan-tilt"), within=WITHIN_S, what="the robot is live")
+        wave = ("call", "pan-tilt", "execute", "instruction=look around", "duration=20")
+        assert command(environment, *wave, "--as", "stranger").returncode == 1
+        assert command(environment, *wave).returncode == 0
+        before = json.loads(command(environment, "call", "pan-tilt", "getState", "--json").stdout)
+        assert before["joints"]
+        stopped = command(environment, "stop", "pan-tilt")
+        assert stopped.returncode == 0, stopped.stderr
+
+
+def test_a_robot_of_ones_own_moves_for_nobody_unless_told(environment: dict[str, str]) -> None:
+    with example("own_driver.py", environment):
+        eventually(lambda: live(environment, "pan-tilt"), within=WITHIN_S, what="the robot is live")
+        refused = command(environment, "call", "pan-tilt", "execute", "instruction=look around")
+        assert refused.returncode == 1
+        assert "DEVICE_CONNECT_RPC_ALLOW" in refused.stderr
