@@ -20,6 +20,8 @@ EXTRA_MEANINGS = {
     "sim": "the MuJoCo simulation and its pictures",
     "remote": "policies served over a WebSocket",
     "agent": "the Strands agent tool and the MCP bridge",
+    "mesh": "the native Zenoh mesh, for robots without Device Connect",
+    "iot": "the mesh over AWS IoT Core (MQTT 5)",
     "reachy": "Reachy Mini",
     "lerobot": "real arms through LeRobot, and its checkpoints (brings torch; not in `all`)",
     "all": "everything but `lerobot`",
