@@ -139,8 +139,10 @@ def _json_blocks(answer: Mapping[str, object]) -> list[Mapping[str, object]]:
 
 
 def _denies(fact: Mapping[str, object]) -> bool:
+    # An error whose own verdict is that nobody knows stays unknown when it has travelled as an envelope.
+    undecided = "stopped" in fact and fact["stopped"] is None
     return (
-        fact.get("status") == "error"
+        (fact.get("status") == "error" and not undecided)
         or fact.get("ok") is False
         or fact.get("stopped") is False
         or fact.get("running") is True

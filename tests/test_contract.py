@@ -1,0 +1,117 @@
+"""A foreign robot is made to fit in one place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from strands_robots.contract import AdaptedRobot, TaskRobot, adapt
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import ValidationError
+
+
+class Foreign:
+    """No more than the four verbs."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.stop_answer: Any = success("Stopped.", stopped=True)
+
+    def start_task(self, instruction: str, **options: Any) -> Envelope:
+        self.calls.append(f"start {instruction} {options}")
+        return success("Started.")
+
+    def stop_task(self) -> Any:
+        self.calls.append("stop")
+        if isinstance(self.stop_answer, BaseException):
+            raise self.stop_answer
+        return self.stop_answer
+
+    def get_task_status(self) -> Envelope:
+        return success("Idle.", task_status="idle")
+
+    def get_features(self) -> Envelope:
+        return success("None.")
+
+
+class Locked:
+    def refusal(self, verb: str) -> Envelope:
+        return error(f"{verb} is refused: locked.")
+
+
+def test_a_robot_of_four_verbs_is_made_to_fit() -> None:
+    robot = adapt(Foreign())
+    assert isinstance(robot, TaskRobot)
+    assert robot.tool_name_str == "robot"
+    assert robot.start_task("wave")["status"] == "success"
+    assert robot.get_state()["task"]["task_status"] == "idle"
+    assert robot.get_features()["status"] == "success"
+    robot.subscribe(lambda event: None)()
+
+
+def test_a_robot_that_fits_is_given_back_as_it_is() -> None:
+    robot = adapt(Foreign())
+    assert adapt(robot) is robot
+
+
+@pytest.mark.parametrize("thing", [None, 5, "arm", object(), []])
+def test_what_is_no_robot_is_refused_by_what_it_lacks(thing: object) -> None:
+    with pytest.raises(ValidationError, match="lacks start_task"):
+        adapt(thing)
+
+
+def test_a_locked_foreign_robot_is_never_asked_to_move() -> None:
+    foreign = Foreign()
+    robot = adapt(foreign)
+    robot.gate.attach(Locked())
+    assert "locked" in robot.start_task("wave")["reason"]
+    assert foreign.calls == []
+    assert robot.stop_task()["status"] == "success"
+
+
+def test_a_halt_voids_permits_and_asks_the_task_and_the_teleoperation() -> None:
+    class Led(Foreign):
+        def stop_teleoperate(self) -> Envelope:
+            self.calls.append("stop teleoperation")
+            return success("Stopped.")
+
+    foreign = Led()
+    foreign.stop_answer = RuntimeError("bus")
+    robot = adapt(foreign)
+    permit = robot.gate.permit("x")
+    verdict = robot.halt("test")
+    assert not permit.valid
+    assert foreign.calls == ["stop", "stop teleoperation"]
+    assert verdict.stopped is False
+    assert verdict.halted == ("teleoperation",)
+
+
+def test_a_halt_of_its_own_is_asked_instead_and_graded() -> None:
+    class Own(Foreign):
+        tool_name_str = "own"
+
+        def halt(self, reason: str = "") -> Any:
+            return StopVerdict(unknown={"base": reason})
+
+    robot = adapt(Own())
+    verdict = robot.halt("test")
+    assert verdict.stopped is None
+    assert "own" in verdict.unknown
+
+
+@pytest.mark.parametrize("answer", [success("Stopped.", stopped=False), error("no"), {"running": True}])
+def test_a_stop_that_denies_itself_is_not_stopped(answer: Any) -> None:
+    foreign = Foreign()
+    foreign.stop_answer = answer
+    assert adapt(foreign).halt().stopped is False
+
+
+def test_a_gate_of_its_own_is_used() -> None:
+    foreign = Foreign()
+    foreign.gate = MotionGate()  # type: ignore[attr-defined]
+    assert adapt(foreign).gate is foreign.gate  # type: ignore[attr-defined]
+    foreign.gate = "no gate"  # type: ignore[attr-defined]
+    assert isinstance(AdaptedRobot(foreign).gate, MotionGate)

@@ -1,0 +1,183 @@
+"""Value domains: what is a number, a name, a host; every refusal names the argument, the value and the domain."""
+
+from __future__ import annotations
+
+import math
+import string
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from strands_robots import utils
+from strands_robots.utils import ValidationError
+
+ANYTHING = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(),
+    st.binary(),
+    st.lists(st.integers()),
+    st.dictionaries(st.text(), st.integers()),
+    st.just(10**400),
+    st.just(float("nan")),
+    st.builds(object),
+)
+CHECKS: list[Callable[[str, Any], Any]] = [
+    utils.number,
+    utils.whole,
+    utils.flag,
+    utils.text,
+    utils.mapping,
+    utils.identifier,
+    utils.device_id,
+    utils.port,
+    lambda name, value: utils.choice(name, value, ("a", "b")),
+    lambda name, value: utils.number(name, value, low=-1, high=1),
+    lambda name, value: utils.number(name, value, above=0),
+]
+
+
+@pytest.mark.parametrize("check", CHECKS)
+@given(value=ANYTHING)
+def test_a_check_gives_the_value_back_or_refuses_it_by_name_and_briefly(
+    check: Callable[[str, Any], Any], value: Any
+) -> None:
+    try:
+        result = check("speed", value)
+    except ValidationError as refused:
+        assert str(refused).startswith("speed must be ")
+        assert str(refused).endswith(".")
+        assert len(str(refused)) < 400
+        assert refused.code == "INVALID"
+    else:
+        assert result == (float(value) if isinstance(result, float) else value)
+
+
+@given(st.floats(allow_nan=True, allow_infinity=True), st.floats(-10, 0), st.floats(0, 10))
+def test_a_number_is_finite_and_between_its_bounds(value: float, low: float, high: float) -> None:
+    if math.isfinite(value) and low <= value <= high:
+        assert utils.number("x", value, low=low, high=high) == value
+    else:
+        with pytest.raises(ValidationError):
+            utils.number("x", value, low=low, high=high)
+
+
+def test_above_leaves_its_bound_out_and_the_others_include_theirs() -> None:
+    assert utils.number("x", 1, low=1, high=1) == 1.0
+    with pytest.raises(ValidationError, match="above 0"):
+        utils.number("x", 0, above=0)
+
+
+@given(st.integers(), st.integers(-5, 0), st.integers(1, 5))
+def test_an_integer_is_between_its_bounds(value: int, low: int, high: int) -> None:
+    if low <= value <= high:
+        assert utils.whole("n", value, low=low, high=high) == value
+    else:
+        with pytest.raises(ValidationError):
+            utils.whole("n", value, low=low, high=high)
+
+
+@pytest.mark.parametrize("value", [True, False, 2.0, "2", None, float("nan")])
+def test_what_only_looks_like_an_integer_is_none(value: object) -> None:
+    with pytest.raises(ValidationError):
+        utils.whole("n", value)
+
+
+@pytest.mark.parametrize("value", [0, 1, "true", None])
+def test_only_a_boolean_is_a_flag(value: object) -> None:
+    with pytest.raises(ValidationError, match="true or false"):
+        utils.flag("on", value)
+
+
+@given(st.text())
+def test_text_that_passes_has_no_control_characters_and_is_not_blank(value: str) -> None:
+    try:
+        utils.text("instruction", value, longest=50)
+    except ValidationError:
+        return
+    assert 0 < len(value) <= 50
+    assert value.strip()
+    assert not any(ord(c) < 32 or 127 <= ord(c) < 160 for c in value)
+
+
+@pytest.mark.parametrize("value", ["a\x00", "a\nb", "\x7f", "\x85", "\ud800", " ", ""])
+def test_text_with_control_characters_or_nothing_in_it_is_refused(value: str) -> None:
+    with pytest.raises(ValidationError):
+        utils.text("instruction", value)
+
+
+def test_empty_text_passes_only_where_it_may() -> None:
+    assert utils.text("note", "", empty=True) == ""
+
+
+@given(st.text(string.ascii_letters + string.digits + "._-", min_size=1, max_size=140))
+def test_an_identifier_begins_with_a_letter_or_digit_and_is_at_most_128_long(value: str) -> None:
+    good = value[0].isalnum() and len(value) <= 128
+    try:
+        assert utils.identifier("id", value) == value
+        assert good
+    except ValidationError:
+        assert not good
+
+
+@pytest.mark.parametrize("value", ["a/b", "a*", "a b", "a\n", "é", ".a", "-a", "", "a$", "**", "a" * 129])
+def test_what_would_widen_a_key_expression_is_no_identifier(value: str) -> None:
+    for check in (utils.identifier, utils.device_id):
+        with pytest.raises(ValidationError):
+            check("peer_id", value)
+
+
+def test_a_device_id_has_no_dots() -> None:
+    assert utils.identifier("id", "arm.left") == "arm.left"
+    with pytest.raises(ValidationError, match="without dots"):
+        utils.device_id("id", "arm.left")
+
+
+@pytest.mark.parametrize("value", ["localhost", "10.0.0.1", "::1", "[::1]", "robot-7.lab.example", "a_b"])
+def test_a_hostname_or_an_address_can_be_dialled(value: str) -> None:
+    assert utils.dial_host_error(value) is None
+
+
+@pytest.mark.parametrize(
+    "value", ["", "http://x", "a/b", "a:80", "user@host", "a b", "-a", "a..b", "a" * 254, None, 5, b"x", "x\n", "?"]
+)
+def test_what_is_more_than_a_host_cannot_be_dialled(value: object) -> None:
+    assert str(utils.dial_host_error(value)).startswith("host must be")
+
+
+class _Hostile:
+    def __repr__(self) -> str:
+        raise RuntimeError("no")
+
+
+@given(ANYTHING)
+def test_what_is_shown_of_a_value_is_short(value: object) -> None:
+    assert len(utils.shown(value)) < 200
+
+
+def test_what_is_shown_of_a_hostile_value_is_short_too() -> None:
+    assert "RuntimeError" in utils.shown(_Hostile())
+    assert utils.shown("x" * 10**6).endswith("(1000000 long)")
+    assert utils.shown([1] * 100) == "a list of 100"
+    assert utils.shown(10**5000).startswith("an integer of")
+    assert len(utils.shown([["x" * 1000] * 3])) < 200
+
+
+def test_a_missing_extra_is_one_sentence_that_names_it() -> None:
+    error = utils.missing_extra("A simulated robot", "sim")
+    assert str(error) == "A simulated robot needs the [sim] extra: pip install 'strands-robots[sim]'."
+    assert isinstance(error, ImportError)
+
+
+def test_a_leader_needs_a_callable_get_action() -> None:
+    class Leader:
+        def get_action(self) -> dict[str, float]:
+            return {}
+
+    assert utils.teleoperator_contract_error(Leader()) is None
+    assert "get_action" in str(utils.teleoperator_contract_error(object()))
