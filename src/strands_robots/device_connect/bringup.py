@@ -99,12 +99,12 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     driver = driver_for(robot, peer_type)
     announceable(driver)
     said = _listen_to_the_framework(name)
-    seats: list[SafetySeat | None] = []
+    seat = asyncio.create_task(asyncio.to_thread(take_seat, name, driver, reach, named=peer_id is not None))
 
     async def before_live(messaging: Any) -> None:
         await refuse_duplicate(name, reach, messaging)
         # Before it can be called, it can be stopped.
-        seats.append(await asyncio.to_thread(take_seat, name, driver, reach, named=peer_id is not None))
+        await asyncio.shield(seat)
 
     runtime = Runtime(
         driver=driver,
@@ -116,7 +116,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     )
     if isinstance(driver, RobotDriver):
         runtime.set_heartbeat_provider(driver.heartbeat)
-    task = asyncio.create_task(_live(runtime, seats), name=f"device {name}")
+    task = asyncio.create_task(_live(runtime, seat), name=f"device {name}")
     try:
         await runtime.wait_ready(bringup_timeout)
     except BaseException as exc:
@@ -267,17 +267,19 @@ def announceable(driver: DeviceDriver) -> None:
         ValidationError: naming the functions and events to mend.
     """
     capabilities = driver.capabilities
+    with contextlib.suppress(TypeError, ValueError):  # what is at fault is looked for below, part by part
+        json.dumps(capabilities.model_dump(), allow_nan=False)
+        return
     faults = []
     for part in (*capabilities.functions, *capabilities.events):
         try:
             json.dumps(part.model_dump(), allow_nan=False)
         except (TypeError, ValueError) as exc:
             faults.append(f"{part.name} ({exc})")
-    if faults:
-        raise ValidationError(
-            f"{type(driver).__name__} cannot be announced, because JSON cannot carry a default or a label of: "
-            f"{', '.join(faults)}."
-        )
+    raise ValidationError(
+        f"{type(driver).__name__} cannot be announced, because JSON cannot carry a default or a label of "
+        f"{', '.join(faults) or 'the device itself'}."
+    )
 
 
 async def refuse_duplicate(name: str, link: LinkConfig, messaging: Any) -> None:
@@ -306,14 +308,18 @@ async def _put_down(runtime: Runtime, task: asyncio.Task[None]) -> None:
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def _live(runtime: Runtime, seats: list[SafetySeat | None]) -> None:
+async def _live(runtime: Runtime, seat: asyncio.Task[SafetySeat | None]) -> None:
     try:
         await runtime.run()
     finally:
-        for seat in seats:
-            if seat is not None:
-                # Closing a link blocks, so it is done on a thread, to its end.
-                await asyncio.shield(asyncio.to_thread(seat.leave))
+        # Closing a link blocks, so it is done on a thread, to its end.
+        await asyncio.shield(_leave(seat))
+
+
+async def _leave(seat: asyncio.Task[SafetySeat | None]) -> None:
+    (taken,) = await asyncio.gather(seat, return_exceptions=True)
+    if isinstance(taken, SafetySeat):
+        await asyncio.to_thread(taken.leave)
 
 
 def _ended(runtime: Runtime, task: asyncio.Task[None]) -> None:

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from enum import Enum
-from typing import Any
+from typing import Any, ClassVar
 
 import psutil
 import pytest
@@ -182,6 +182,13 @@ def test_a_driver_that_cannot_be_announced_says_so(link: LinkConfig) -> None:
 
     with pytest.raises(ValidationError, match="shine"):
         init_device_connect_sync(Lamp(), link=link)
+
+    class Box(DeviceDriver):  # type: ignore[misc]
+        device_type = "box"
+        labels: ClassVar[dict[str, Any]] = {"size": float("nan")}
+
+    with pytest.raises((ValidationError, ValueError)):
+        init_device_connect_sync(Box(), link=link)
 
 
 def test_twenty_start_and_stop_cycles_leave_nothing(link: LinkConfig, world: ToyWorld) -> None:

@@ -1,0 +1,250 @@
+"""Bring-up, import, many robots in one process, and a stop while the robot blocks: ours and the bare framework."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from device_connect_edge import DeviceRuntime
+from fixtures.echo_device import EchoDriver
+from fixtures.nats_server import NatsServer
+from fixtures.toy_robots import ToyRobot
+from fixtures.waiting import free_port
+from fixtures.zenoh_router import ZenohRouter
+
+from benchmarks.table import Row
+from strands_robots.device_connect import FleetClient, LinkConfig, init_device_connect_sync, stop_device_connect
+from strands_robots.device_connect.client import NoAnswerError
+
+ROOT = Path(__file__).parent.parent
+IN_ONE_PROCESS = 32
+
+
+def run(quick: bool = False) -> list[Row]:
+    """Measure and give the rows of the table."""
+    logging.getLogger("device_connect_edge").addHandler(logging.NullHandler())
+    logging.disable(logging.ERROR)
+    try:
+        return [
+            *_bring_up(5 if quick else 20),
+            _imports(5 if quick else 15),
+            *_fleet(8 if quick else IN_ONE_PROCESS),
+            _blocked_stop(3 if quick else 25),
+        ]
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def _bring_up(repeats: int) -> Iterator[Row]:
+    with ZenohRouter() as router:
+        yield _to_discoverable("Zenoh router", repeats, LinkConfig(connect=(router.endpoint,)), "zenoh")
+    with NatsServer() as server:
+        yield _to_discoverable("NATS", repeats, LinkConfig(transport="nats", connect=(server.url,)), "nats")
+    yield _to_discoverable("Zenoh D2D, multicast", repeats, LinkConfig(multicast=True), "zenoh")
+
+
+def _to_discoverable(name: str, repeats: int, link: LinkConfig, backend: str) -> Row:
+    ours: list[float] = []
+    bare: list[float] = []
+    with FleetClient(link) as fleet, _discovery_by_presence():
+        for number in range(repeats + 1):
+            # The first of each is warm-up.
+            bare.append(_bare_up(fleet, link, backend, f"bare-{number}"))
+            ours.append(_ours_up(fleet, link, f"ours-{number}"))
+    mine, theirs = statistics.median(ours[1:]), statistics.median(bare[1:])
+    ratio = mine / theirs
+    return Row(
+        f"bring-up to discoverable, {name}",
+        f"{mine * 1e3:.0f} ms",
+        f"bare runtime {theirs * 1e3:.0f} ms",
+        ratio,
+        "≤ 1.2",
+        ratio <= 1.2,
+    )
+
+
+def _ours_up(fleet: FleetClient, link: LinkConfig, name: str) -> float:
+    began = time.perf_counter()
+    runtime = init_device_connect_sync(ToyRobot(), peer_id=name, link=link, allow_insecure=True)
+    took = _until_known(fleet, name) - began
+    stop_device_connect(runtime)
+    return took
+
+
+def _bare_up(fleet: FleetClient, link: LinkConfig, backend: str, name: str) -> float:
+    logging.getLogger(f"device_connect_edge.device.{name}").addHandler(logging.NullHandler())
+    began = time.perf_counter()
+    ends: list[Callable[[], object]] = []
+
+    async def serve() -> None:
+        over = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        ends.append(lambda: loop.call_soon_threadsafe(over.set))
+        runtime = DeviceRuntime(
+            driver=EchoDriver(),
+            device_id=name,
+            messaging_backend=backend,
+            messaging_urls=list(link.connect) or None,
+            allow_insecure=True,
+        )
+        task = asyncio.create_task(runtime.run())
+        await over.wait()
+        await runtime.stop()
+        await asyncio.gather(task, return_exceptions=True)
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    thread.start()
+    took = _until_known(fleet, name) - began
+    # It has to be up altogether before its stop is heard.
+    time.sleep(0.3)
+    ends[0]()
+    thread.join(10)
+    return took
+
+
+def _until_known(fleet: FleetClient, name: str) -> float:
+    deadline = time.perf_counter() + 10
+    while name not in fleet.known():
+        if time.perf_counter() > deadline:
+            return float("nan")
+        time.sleep(0.0005)
+    return time.perf_counter()
+
+
+@contextlib.contextmanager
+def _discovery_by_presence() -> Iterator[None]:
+    before = os.environ.get("DEVICE_CONNECT_DISCOVERY_MODE")
+    os.environ["DEVICE_CONNECT_DISCOVERY_MODE"] = "d2d"
+    yield
+    if before is None:
+        del os.environ["DEVICE_CONNECT_DISCOVERY_MODE"]
+    else:
+        os.environ["DEVICE_CONNECT_DISCOVERY_MODE"] = before
+
+
+def _imports(repeats: int) -> Row:
+    def median(program: str) -> float:
+        took = []
+        for _ in range(repeats):
+            began = time.perf_counter()
+            subprocess.run([sys.executable, "-c", program], check=True)
+            took.append(time.perf_counter() - began)
+        return statistics.median(took)
+
+    nothing = median("pass")
+    ours = median("import strands_robots.device_connect") - nothing
+    theirs = median("import device_connect_edge") - nothing
+    return Row(
+        "import strands_robots.device_connect",
+        f"{ours * 1e3:.1f} ms",
+        f"device_connect_edge {theirs * 1e3:.0f} ms",
+        ours / theirs,
+        "≤ 0.08",
+        ours / theirs <= 0.08,
+    )
+
+
+def _fleet(count: int) -> Iterator[Row]:
+    ours = _child("fleet-ours", str(count), str(free_port()))
+    theirs = _child("fleet-bare", str(count))
+    share = count / IN_ONE_PROCESS
+    for what, unit, bound in (("mb", " MB", 120), ("threads", " threads", 80), ("fds", " descriptors", 200)):
+        mine = ours["after"][what] - (ours["before"][what] if what == "mb" else 0)
+        bare = theirs["after"][what] - (theirs["before"][what] if what == "mb" else 0)
+        yield Row(
+            f"{count} robots in one process{', over their own' if what == 'mb' else ''}",
+            f"{mine:.0f}{unit}",
+            f"{count} bare runtimes {bare:.0f}{unit}",
+            mine / bare if bare else None,
+            f"≤ {bound}{unit}",
+            mine <= bound * max(share, 0.5),
+        )
+
+
+def _blocked_stop(repeats: int) -> Row:
+    ours = sorted(_stops_while_blocked("ours", repeats))
+    bare = _stops_while_blocked("bare", 2)
+    worst = ours[-1] if len(ours) < 100 else ours[int(len(ours) * 0.99)]
+    return Row(
+        "stop answered while a handler's robot call blocks 2 s, p99",
+        f"{worst * 1e3:.1f} ms",
+        f"bare driver {statistics.median(bare) * 1e3:.0f} ms",
+        worst / statistics.median(bare),
+        "≤ 20 ms",
+        worst <= 0.020,
+    )
+
+
+def _stops_while_blocked(kind: str, blocks: int) -> list[float]:
+    port = free_port()
+    environment = {"DEVICE_CONNECT_RPC_ALLOW": "bench", "BYPASS_TOOL_CONSENT": "true"}
+    link = LinkConfig(mode="peer", meet_port=port, multicast=False)
+    if kind == "bare":
+        environment |= {"ZENOH_LISTEN": f"tcp/127.0.0.1:{port}"}
+        link = LinkConfig(connect=(f"tcp/127.0.0.1:{port}",), mode="peer", multicast=False)
+    took: list[float] = []
+    with _serving(kind, port, environment), FleetClient(link, "bench") as fleet:
+        for _ in range(blocks):
+            blocked = threading.Thread(target=_ignoring(lambda: fleet.call("slow", "execute", {"instruction": "x"})))
+            blocked.start()
+            time.sleep(0.3)
+            for _ in range(8 if kind == "ours" else 1):
+                began = time.perf_counter()
+                fleet.call("slow", "stop")
+                took.append(time.perf_counter() - began)
+            blocked.join()
+            with contextlib.suppress(NoAnswerError):
+                fleet.call("slow", "stop")
+    return took
+
+
+def _ignoring(work: Callable[[], object]) -> Callable[[], None]:
+    def quietly() -> None:
+        with contextlib.suppress(TimeoutError):
+            work()
+
+    return quietly
+
+
+@contextlib.contextmanager
+def _serving(kind: str, port: int, environment: dict[str, str]) -> Iterator[None]:
+    command = [sys.executable, "-m", "benchmarks.device_children", "blocking", kind, str(port)]
+    child = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stdin is not None
+    child.stdout.readline()
+    try:
+        yield
+    finally:
+        child.stdin.close()
+        try:
+            child.wait(5)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+
+def _child(*arguments: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "benchmarks.device_children", *arguments]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=True)
+    facts: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return facts
