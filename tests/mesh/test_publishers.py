@@ -37,7 +37,8 @@ def test_joints_task_and_simulated_time_are_published(peers: Fleet) -> None:
     sim = next(body for body in states if body["peer_id"] == "sim-1")
     assert arm["joints"] == {"shoulder": 1.5}
     assert arm["task"]["status"] == "idle"
-    assert sim["joints"] == {"joint": {"position": 0.5, "velocity": 0.0}}
+    assert sim["joints"]["joint"]["position"] == 0.5
+    eventually(lambda: {"joint": {"position": 0.5, "velocity": 0.0}} in [body["joints"] for body in states], within=3)
     assert sim["sim_time"] == 1.25
     assert sim["robots"] == {"left": False}
 

@@ -108,8 +108,8 @@ class Assembled:
         every("describe", rates["presence"].rate_hz, self.herald.refresh)
         every("state", rates["state"].rate_hz, self._publish_state)
         every("prune", PRUNE_HZ, self._prune, quick=True)
-        frames = getattr(self.mesh.robot, "camera_frames", None)
-        if callable(frames):
+        frames = camera.frames_of(self.mesh.robot)
+        if frames is not None:
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), lambda: self._publish_frames(frames))
         self.scheduler.start()
         # A robot whose bus is wedged is announced all the same, by its name alone.

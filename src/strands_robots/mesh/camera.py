@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from strands_robots import settings
+from strands_robots.contract import WorldRobot
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.topics import camera as camera_topic
 from strands_robots.utils import ValidationError, identifier, missing_extra
@@ -21,6 +22,23 @@ Frames = Callable[[], Mapping[str, Any]]
 def enabled() -> bool:
     """False while the privacy switch is on; a word that is no boolean keeps the cameras off."""
     return not settings.boolean("STRANDS_MESH_CAMERA_DISABLED", safe=True)
+
+
+def frames_of(robot: Any) -> Frames | None:
+    """How to take a picture with each of a robot's cameras; None for one without.
+
+    A robot's own ``camera_frames()`` comes first, then a simulation's ``render``, then the pictures in a device's
+    ``get_observation()``. A camera ``arm/wrist`` is called ``arm.wrist`` on the wire, which allows no slash.
+    """
+    body = getattr(robot, "wrapped", robot)
+    own, render, observe = (getattr(body, verb, None) for verb in ("camera_frames", "render", "get_observation"))
+    if callable(own):
+        return lambda: dict(own())
+    if isinstance(robot, WorldRobot) and callable(render):
+        return lambda: {str(name).replace("/", "."): render(name) for name in robot.get_features().get("cameras", ())}
+    if callable(observe):
+        return lambda: {str(name): value for name, value in observe().items() if getattr(value, "ndim", 0) == 3}
+    return None
 
 
 def frame_message(peer_id: str, name: str, now: float, pixels: Any) -> dict[str, Any]:

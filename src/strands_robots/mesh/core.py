@@ -71,6 +71,7 @@ class Mesh(SensorLoopsMixin):
             transport = self._parts.acquire()
             if transport is None:
                 return
+            self._assembled.door.open()
             self._assembled.begin(transport)
         with _local_lock:
             _local[self.peer_id] = self
@@ -82,7 +83,9 @@ class Mesh(SensorLoopsMixin):
                 return
             self._assembled.end(LOOP_JOIN_TIMEOUT_S)
             self._parts.release()
-            # A peer that starts again gets fresh threads and queues; its lockout stays with the safety plane.
+            # A locked peer stays with the safety plane: leaving and joining again must not unlock it.
+            if not self._assembled.door.epochs():
+                self._assembled.door.close()
             self._assembled = assemble(self, self._parts, self._assembled)
             self._context = self._assembled.context
             self._scheduler = self._assembled.scheduler

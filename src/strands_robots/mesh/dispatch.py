@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from strands_robots.contract import TaskRobot, WorldRobot, adapt
+from strands_robots.contract import RolloutEvent, TaskRobot, WorldRobot, adapt
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mesh.security import policy_host_refusal
 from strands_robots.safety.stopping import StopVerdict, explain, grade
@@ -17,6 +17,7 @@ logger = logging.getLogger(__name__)
 
 POLL_S = 0.05
 EXECUTE_GRACE_S = 10.0
+TOLD_S = 0.5
 POLICY_FIELDS = (
     "policy_port",
     "policy_host",
@@ -140,27 +141,49 @@ class Dispatcher:
         return robot.start_task(instruction, policy_provider=provider, duration=command["duration"], **fields)
 
     def _execute(self, robot: Robot, command: dict[str, Any]) -> Any:
-        started = self._start(robot, command)
-        if is_error(started):
-            return started
-        deadline = time.monotonic() + command["duration"] + EXECUTE_GRACE_S
-        while not self._closing() and time.monotonic() < deadline:
-            if not self._moving(robot, command.get("robot_name")):
-                return self._outcome(robot, started)
+        name = command.get("robot_name") or (robot.list_robots() or [""])[0] if isinstance(robot, WorldRobot) else None
+        ends: list[RolloutEvent] = []
+
+        def heard(event: RolloutEvent) -> None:
+            if event.kind == "finished" and name in (None, event.robot):
+                ends.append(event)
+
+        unsubscribe = robot.subscribe(heard)
+        try:
+            started = self._start(robot, command)
+            if is_error(started):
+                return started
+            return self._ended(robot, name, started, ends, command["duration"])
+        finally:
+            unsubscribe()
+
+    def _ended(
+        self, robot: Robot, name: str | None, started: Envelope, ends: list[RolloutEvent], duration: float
+    ) -> Envelope:
+        deadline = time.monotonic() + duration + EXECUTE_GRACE_S
+        while not self._closing() and time.monotonic() < deadline and not ends:
+            if not _moving(robot, name):
+                break
             time.sleep(POLL_S)
-        return error("execute: the policy outlived its duration.", started=started)
+        else:
+            if not ends:
+                return error("execute: the policy outlived its duration.", started=started)
+        last = time.monotonic() + TOLD_S
+        while not ends and not isinstance(robot, TaskRobot) and time.monotonic() < last:
+            time.sleep(POLL_S)  # what runs no more has said how it ended, or is about to
+        if not ends:
+            return robot.get_task_status() if isinstance(robot, TaskRobot) else {**started, "state": "unknown"}
+        end = ends[-1]
+        facts = {"state": end.state, "task_status": end.state, "step_count": end.step, "elapsed_s": end.elapsed_s}
+        if end.state == "error":
+            return error(f"execute: {end.error or 'the policy failed'}", robot=end.robot, **facts)
+        return success(f"{end.robot} {end.state} after {end.step} steps.", robot=end.robot, **facts)
 
-    @staticmethod
-    def _moving(robot: Robot, name: str | None) -> bool:
-        if isinstance(robot, WorldRobot):
-            wanted = name or next(iter(robot.list_robots()), "")
-            return any(row.get("robot") == wanted for row in robot.list_policies_running())
-        return str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
 
-    def _outcome(self, robot: Robot, started: Envelope) -> Envelope:
-        if isinstance(robot, WorldRobot):
-            return {**started, "task_status": "completed"}
-        return robot.get_task_status()
+def _moving(robot: Robot, name: str | None) -> bool:
+    if isinstance(robot, WorldRobot):
+        return any(row.get("robot") == name for row in robot.list_policies_running())
+    return str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
 
 
 def told(verdict: StopVerdict) -> dict[str, Any]:

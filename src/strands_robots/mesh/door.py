@@ -20,6 +20,9 @@ logger = logging.getLogger(__name__)
 class SafetyDoor(Protocol):
     """What the mesh needs of the safety plane, for the robot of one peer."""
 
+    def open(self) -> None:
+        """Put this peer's robot on the plane; twice is once."""
+
     def epochs(self) -> tuple[str, ...]:
         """The epochs held, oldest first; empty while the robot may move."""
 
@@ -33,7 +36,7 @@ class SafetyDoor(Protocol):
         """Clear one epoch, when the assertion is an operator's and for this robot; else the one rejection."""
 
     def close(self) -> None:
-        """Take this peer's robot off the plane."""
+        """Take this peer's robot off the plane; twice is once."""
 
 
 class Nothing:
@@ -61,17 +64,19 @@ class PlaneDoor:
         self, peer_id: str, robot: Stoppable | None, key: str | None = None, own: SafetyPlane | None = None
     ) -> None:
         self._plane = own or plane()
-        body = robot or Nothing()
-        try:
-            self._entry: Registered = self._plane.register(peer_id, body, key=key)
-        except ValidationError:
-            # Its other network wrapped the same foreign robot anew; both wrappers are locked by every stop.
-            logger.warning("%s is in the safety plane already; the mesh's road to it is %s.mesh.", peer_id, peer_id)
-            self._entry = self._plane.register(f"{peer_id}.mesh", body)
+        self._peer_id = peer_id
+        self._robot = robot or Nothing()
+        self._key = key
+        self._entry: Registered | None = None
         self._decision = Decision()
+        self.open()
+
+    def open(self) -> None:
+        if self._entry is None:
+            self._entry = self._register()
 
     def epochs(self) -> tuple[str, ...]:
-        return self._entry.epochs
+        return self._entry.epochs if self._entry is not None else ()
 
     def counts(self, source: str) -> str | None:
         return self._decision.source_refusal(source)
@@ -81,11 +86,23 @@ class PlaneDoor:
         if run is None:
             return None
         run.wait(run.deadline_s + 2.0)
-        report = self._entry.reports.get(order.epoch)
+        report = self._entry.reports.get(order.epoch) if self._entry is not None else None
         return report.verdict if report is not None else None
 
     def resume(self, assertion: object) -> str | None:
-        return REJECTED if is_error(self._entry.resume(assertion, "mesh")) else None
+        entry = self._entry
+        return REJECTED if entry is None or is_error(entry.resume(assertion, "mesh")) else None
 
     def close(self) -> None:
-        self._entry.close()
+        entry, self._entry = self._entry, None
+        if entry is not None:
+            entry.close()
+
+    def _register(self) -> Registered:
+        try:
+            return self._plane.register(self._peer_id, self._robot, key=self._key)
+        except ValidationError:
+            # Its other network wrapped the same foreign robot anew; both wrappers are locked by every stop.
+            name = f"{self._peer_id}.mesh"
+            logger.warning("%s is in the safety plane already; the mesh's road to it is %s.", self._peer_id, name)
+            return self._plane.register(name, self._robot)

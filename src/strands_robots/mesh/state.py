@@ -29,6 +29,7 @@ class StateReader:
         self._robot = robot
         self._clock = clock
         self._troubles: dict[str, _Trouble] = {}
+        self._before: dict[str, tuple[float, float]] = {}
 
     def read(self) -> dict[str, Any] | None:
         """The message, or None when there is nothing to say."""
@@ -79,14 +80,14 @@ class StateReader:
         running = {str(row.get("robot", "")): row for row in robot.list_policies_running()}
         names = robot.list_robots()
         joints: dict[str, Any] = {}
+        at = state.get("sim_time")
         for name, values in dict(state.get("robots") or {}).items():
             inner = values.get("joints", values) if isinstance(values, Mapping) else {}
-            speeds = values.get("velocities", {}) if isinstance(values, Mapping) else {}
             for joint, value in inner.items():
                 if isinstance(value, Mapping):
                     entry = {"position": value.get("position"), "velocity": value.get("velocity")}
                 elif isinstance(value, int | float):
-                    entry = {"position": float(value), "velocity": float(speeds.get(joint, 0.0))}
+                    entry = {"position": float(value), "velocity": self._speed(f"{name}/{joint}", float(value), at)}
                 else:
                     continue
                 joints[joint if len(names) == 1 else f"{name}/{joint}"] = entry
@@ -104,6 +105,17 @@ class StateReader:
                 "duration": first.get("elapsed_s", 0.0),
             }
         return found
+
+    def _speed(self, joint: str, position: float, at: object) -> float | None:
+        """Velocity by simulated time between two messages; 0 while the world stands still, None for the first."""
+        if not isinstance(at, int | float):
+            return None
+        known = self._before.get(joint)
+        self._before[joint] = (float(at), position)
+        if known is None:
+            return None
+        passed = float(at) - known[0]
+        return (position - known[1]) / passed if passed > 0 else 0.0
 
 
 def task_of(status: Mapping[str, Any]) -> dict[str, Any]:

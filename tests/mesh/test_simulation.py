@@ -1,0 +1,56 @@
+"""A real simulated arm on the mesh: state, camera, a policy started, stopped and locked over the wire."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet
+
+from strands_robots.simulation import Simulation
+
+
+@pytest.fixture
+def arm() -> Iterator[Simulation]:
+    simulation = Simulation()
+    simulation.create_world()
+    simulation.add_robot("so100")
+    yield simulation
+    simulation.cleanup()
+
+
+def test_an_arm_is_driven_watched_and_stopped_over_the_mesh(peers: Fleet, arm: Simulation) -> None:
+    states: list[dict[str, Any]] = []
+    peers.stranger().declare_subscriber("strands/sim-1/state", lambda sample: states.append(json.loads(sample.payload)))
+    peers.join(arm, "sim-1", "sim")
+    console = peers.join(None, "console")
+    start = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 20}
+    assert console.send("sim-1", start, timeout=10)["result"]["status"] == "success"
+    eventually(lambda: states and states[-1].get("robots") == {"so100": True}, within=5)
+    eventually(lambda: any(joint["velocity"] for joint in states[-1]["joints"].values()), within=5)
+    assert console.send("sim-1", {"action": "stop"}, timeout=5)["result"]["ok"] is True
+    assert arm.list_policies_running() == []
+    console.emergency_stop()
+    assert console.send("sim-1", start, timeout=5)["error"] == "command rejected"
+    assert arm.start_policy("so100", "wave")["status"] == "error"
+
+
+def test_execute_runs_to_its_end_and_says_so(peers: Fleet, arm: Simulation) -> None:
+    peers.join(arm, "sim-1", "sim")
+    console = peers.join(None, "console")
+    reply = console.tell("sim-1", "wave", policy_provider="mock", duration=0.5)
+    assert reply["result"]["status"] == "success"
+    assert reply["result"]["state"] == "completed"
+    assert reply["result"]["step_count"] > 10
+    assert arm.list_policies_running() == []
+
+
+def test_a_provider_that_the_robot_lacks_is_its_own_answer(peers: Fleet, arm: Simulation) -> None:
+    peers.join(arm, "sim-1", "sim")
+    console = peers.join(None, "console")
+    reply = console.send("sim-1", {"action": "start", "instruction": "x", "policy_provider": "groot"}, timeout=5)
+    assert reply["type"] == "response"
+    assert reply["result"]["status"] == "error"
