@@ -1,0 +1,95 @@
+"""``run`` serves a robot on the real network until a signal, and halts it before it departs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+from fixtures.devices import RecordingDevice
+from fixtures.waiting import eventually, free_port
+
+from strands_robots import HardwareRobot
+from strands_robots.device_connect import loopback_config
+from strands_robots.device_connect.client import open_client
+from strands_robots.robot import run
+from strands_robots.safety.stopping import StopVerdict
+
+SERVE = """
+import logging, threading
+from strands_robots import Robot
+logging.basicConfig(level=logging.INFO, format="%(message)s")
+robot = Robot("so100", peer_id="served-arm")
+robot.start_policy("so100", "wave", duration=60)
+verdict = robot.run()
+print("halted", verdict.stopped, list(verdict.halted), flush=True)
+robot.cleanup()
+print("threads", [t.name for t in threading.enumerate() if t.name.startswith("rollout")], flush=True)
+"""
+
+
+def status_of(port: int, device: str) -> dict[str, object] | None:
+    """The answer of a device to getStatus, or None when nobody answers."""
+
+    async def ask() -> dict[str, object] | None:
+        client = await open_client(loopback_config(port))
+        try:
+            request = {"jsonrpc": "2.0", "id": "1", "method": "getStatus", "params": {}}
+            answer = await client.request(
+                f"device-connect.default.{device}.cmd", json.dumps(request).encode(), timeout=1.0
+            )
+        except Exception:  # noqa: BLE001 - silence, whatever the transport calls it
+            return None
+        finally:
+            await client.close()
+        answered: dict[str, object] = json.loads(answer)
+        return answered
+
+    return asyncio.run(ask())
+
+
+def test_a_robot_is_served_until_its_event_and_is_halted_first() -> None:
+    robot = HardwareRobot(RecordingDevice(), "arm", control_hz=100)
+    robot.connect()
+    port, until = free_port(), threading.Event()
+    verdicts: list[StopVerdict] = []
+    thread = threading.Thread(
+        target=lambda: verdicts.append(run(robot, peer_id="run-arm", until=until, link=loopback_config(port)))
+    )
+    thread.start()
+    try:
+        assert eventually(lambda: status_of(port, "run-arm"), within=15)
+        robot.start_task("wave", duration=30)
+        eventually(lambda: robot.device.writes)
+    finally:
+        until.set()
+        thread.join(15)
+    assert not thread.is_alive()
+    assert verdicts[0].stopped is True
+    assert verdicts[0].halted == ("task",)
+    robot.cleanup()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_halts_the_robot_and_then_departs(number: signal.Signals, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
+    process = subprocess.Popen([sys.executable, "-c", SERVE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "Serving served-arm" in line:
+                break
+        else:
+            pytest.fail("it never served")
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    finally:
+        process.kill()
+        process.wait(5)
+    assert "halted True ['so100']" in out, err
+    assert "threads []" in out
+    assert process.returncode == 0

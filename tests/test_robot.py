@@ -1,0 +1,122 @@
+"""The factory: a running robot by its name, or one sentence that says why not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import pytest
+from fixtures.devices import RecordingDevice
+from fixtures.waiting import eventually
+
+import strands_robots
+from strands_robots import HardwareRobot, Robot, Simulation
+from strands_robots.contract import TaskRobot, WorldRobot
+from strands_robots.utils import MissingExtraError, ValidationError
+
+
+@dataclass
+class _Config:
+    port: str = ""
+    cameras: dict[str, Any] = field(default_factory=dict)
+
+
+class _Registry:
+    @staticmethod
+    def get_known_choices() -> dict[str, Any]:
+        return {"so100_follower": _Config, "lekiwi": _Config}
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[_Config]]:
+    """A package with the three names of ``lerobot.robots`` that the factory uses."""
+    configs: list[_Config] = []
+
+    def make(config: _Config) -> RecordingDevice:
+        configs.append(config)
+        return RecordingDevice()
+
+    robots = ModuleType("lerobot.robots")
+    robots.__path__ = []
+    robots.RobotConfig = _Registry  # type: ignore[attr-defined]
+    robots.make_robot_from_config = make  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "lerobot", ModuleType("lerobot"))
+    monkeypatch.setitem(sys.modules, "lerobot.robots", robots)
+    return configs
+
+
+def test_a_name_is_a_running_simulation_with_that_robot_in_it() -> None:
+    robot = Robot("so100", peer_id="bench-1")
+    try:
+        assert isinstance(robot, Simulation)
+        assert isinstance(robot, WorldRobot)
+        assert robot.list_robots() == ["so100"]
+        assert (robot.tool_name_str, robot.peer_id, robot.mesh) == ("so100", "bench-1", None)
+        assert robot.start_policy("so100", "wave", duration=0.2)["status"] == "success"
+        eventually(lambda: not robot.list_policies_running())
+    finally:
+        robot.cleanup()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"name": "so10"}, "near it: so101, so100"),
+        ({"name": ""}, "name must be"),
+        ({"name": 5}, "name must be"),
+        ({"name": "nope/arm.xml"}, "nope/arm.xml"),
+        ({"name": "so100", "mode": "dream"}, "mode must be one of sim, real"),
+        ({"name": "so100", "mesh": "yes"}, "mesh must be"),
+        ({"name": "so100", "peer_id": "a/b"}, "peer_id must be"),
+        ({"name": "so100", "bogus": 1}, "bogus"),
+        ({"name": "so100", "timestep": float("nan")}, "timestep must be"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_made_is_refused_by_name(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        Robot(**arguments)
+
+
+def test_a_real_robot_without_lerobot_is_one_sentence() -> None:
+    with pytest.raises(MissingExtraError, match=r"\[lerobot\] extra"):
+        Robot("so100", mode="real")
+
+
+def test_a_real_robot_is_built_configured_and_connected_without_calibration(stand_in: list[_Config]) -> None:
+    robot = Robot("so100", mode="real", port="/dev/ttyACM0", control_hz=100)
+    assert isinstance(robot, HardwareRobot)
+    assert isinstance(robot, TaskRobot)
+    assert stand_in == [_Config(port="/dev/ttyACM0")]
+    assert robot.device.is_connected
+    assert robot.control_hz == 100
+    robot.cleanup()
+
+
+def test_an_unknown_real_robot_lists_the_near_ones(stand_in: list[_Config]) -> None:
+    with pytest.raises(ValidationError, match="near it: so100_follower"):
+        Robot("so100_folower", mode="real")
+    with pytest.raises(ValidationError, match="do not configure"):
+        Robot("lekiwi", mode="real", speed=3)
+
+
+def test_the_package_imports_without_what_is_heavy() -> None:
+    code = (
+        "import sys, strands_robots; assert strands_robots.__version__;"
+        "heavy = {'numpy', 'mujoco', 'zenoh', 'nats', 'pydantic', 'websockets', 'device_connect_edge'};"
+        "heavy &= set(sys.modules);"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+
+
+def test_every_public_name_is_there_and_no_other() -> None:
+    for name in strands_robots.__all__:
+        assert getattr(strands_robots, name) is not None
+    assert dir(strands_robots) == sorted(strands_robots.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'Robots'"):
+        _ = strands_robots.Robots
