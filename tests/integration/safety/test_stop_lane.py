@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.nats_server import NatsServer
-from fixtures.recording_robot import RecordingRobot
+from fixtures.safety_site import Site
 from fixtures.waiting import eventually, free_port
 from fixtures.zenoh_router import ZenohRouter
 
@@ -20,10 +20,8 @@ from strands_robots.device_connect.backends import LinkConfig, loopback_config, 
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
 from strands_robots.safety.decision import Decision, signed_fields
-from strands_robots.safety.lane import StopLane
 from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, StopLink, notification
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.plane import SafetyPlane
 
 Broker = ZenohRouter | NatsServer
 
@@ -60,28 +58,6 @@ class Listener:
 
     def _hear(self, event: str, source: str, payload: bytes) -> None:
         self.got.append((source, json.loads(payload)["params"], time.monotonic()))
-
-
-class Site:
-    """A plane, a lane and some robots, as one process has them."""
-
-    def __init__(self, link: LinkConfig, *names: str, decide: Callable[[], Decision] = Decision) -> None:
-        self.plane = SafetyPlane(deadline_s=0.5)
-        self.lane = StopLane(self.plane, decide)
-        self.robots = {name: RecordingRobot() for name in names}
-        self.entries = [self.plane.register(name, robot) for name, robot in self.robots.items()]
-        self.seats = [self.lane.join(name, link, lambda: stop_link(link)) for name in names]
-
-    def ready(self) -> bool:
-        return all(seat.link.up for seat in self.seats)
-
-    def close(self) -> None:
-        for seat in self.seats:
-            seat.leave()
-        for entry in self.entries:
-            entry.close()
-        for robot in self.robots.values():
-            robot.close()
 
 
 @pytest.fixture

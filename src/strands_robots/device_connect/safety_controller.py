@@ -1,0 +1,107 @@
+"""A safety controller on Device Connect: by itself, or as a device that agents and operators find by name."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.types import DeviceIdentity, DeviceStatus
+
+from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.declare import emit, rpc
+from strands_robots.device_connect.links import usual_link
+from strands_robots.device_connect.stop_link import stop_link
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.safety.controller import DEADLINE_S, SafetyController, StopReport
+from strands_robots.utils import ValidationError, device_id, number, text
+
+
+def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
+    """A :class:`SafetyController` on ``link``, or on the network that the environment names.
+
+    Further arguments are those of :class:`SafetyController`.
+    """
+    where = link or usual_link()
+    return SafetyController(controller_id, lambda: stop_link(where), **options)
+
+
+def envelope(report: StopReport) -> Envelope:
+    """The report as an answer: an error unless every robot is known to be still."""
+    fields: dict[str, Any] = {
+        "estop_id": report.estop_id,
+        "stopped": {name: round(each.latency_ms, 3) for name, each in report.stopped.items()},
+        "not_stopped": {name: each.why for name, each in report.not_stopped.items()},
+        "refused": {name: each.why for name, each in report.refused.items()},
+        "silent": list(report.silent),
+        "link": report.link,
+        "elapsed_ms": round(report.elapsed_ms, 3),
+    }
+    if report.ok:
+        return success(f"Stopped {', '.join(sorted(report.stopped))}.", **fields)
+    doubts = [f"{name} did not stop" for name in report.not_stopped]
+    doubts += [f"{name} did not act on it" for name in report.refused]
+    doubts += [f"{name} gave no answer" for name in report.silent]
+    if not report.link:
+        doubts.append("the stop never left: the link is down")
+    return error(f"{'; '.join(doubts) or 'Nobody answered the emergency stop'}.", **fields)
+
+
+class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
+    """The controller as a device. Its stops leave on the controller's own link, never on the runtime's."""
+
+    device_type = "safety_controller"
+
+    def __init__(self, controller: SafetyController) -> None:
+        super().__init__()
+        self.controller = controller
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Who this device is."""
+        return DeviceIdentity(
+            device_type=self.device_type,
+            manufacturer="strands-robots",
+            model="safety-controller",
+            description="Stops robots",
+        )
+
+    @property
+    def status(self) -> DeviceStatus:
+        """Idle; a controller is never too busy."""
+        return DeviceStatus(availability="idle", busy_score=0.0)
+
+    @rpc(labels={"direction": "write", "safety": "critical"})
+    async def stopAll(
+        self, reason: str = "", expected: list[str] | None = None, deadline_s: float = DEADLINE_S
+    ) -> dict[str, Any]:
+        """Stop every robot of the tenant and answer for each by name.
+
+        Args:
+            reason: Why, told to the robots
+            expected: Ids of the robots that must answer
+            deadline_s: Seconds until a robot that gave no answer is reported as silent
+        """
+        try:
+            names = [device_id("expected", each) for each in expected or []]
+            why, within = (
+                text("reason", reason, longest=200, empty=True),
+                number("deadline_s", deadline_s, above=0, high=60),
+            )
+        except ValidationError as exc:
+            return error(str(exc))
+        return envelope(await asyncio.to_thread(self.controller.stop, names, why, deadline_s=within))
+
+    @rpc(labels={"direction": "read"})
+    async def getStatus(self) -> dict[str, Any]:
+        """Whether the controller's own link reaches anybody."""
+        up = self.controller.link_up
+        return success("The stop link is up." if up else "The stop link is down.", link_up=up)
+
+    @emit(labels={"safety": "critical"})
+    async def emergencyStop(self, reason: str = "") -> None:
+        """Part of every controller's description; the stop itself leaves on the controller's own link.
+
+        Args:
+            reason: Why
+        """

@@ -1,0 +1,291 @@
+"""The hand on the button: an emergency stop that is repeated until each expected robot has answered for itself.
+
+:class:`SafetyController` owns a link that carries stops, check-ins and verdicts and nothing else, so that no call
+and no telemetry of its process stands before a stop.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from strands_robots.safety import ed25519
+from strands_robots.safety.decision import signed_fields
+from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, StopLink, notification
+from strands_robots.safety.orders import new_epoch
+from strands_robots.utils import ValidationError, device_id, number
+
+logger = logging.getLogger(__name__)
+
+REPEAT_S = (0.02, 0.05, 0.1, 0.2)
+"""Pauses between repetitions; the last one goes on until the deadline or every answer."""
+
+UNCONFIRMED_S = 0.1
+DEADLINE_S = 3.0
+REFUSED = "resumed before"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One robot's verdict: ``latency_ms`` from the call of ``stop`` to our receipt, ``facts`` as it sent them."""
+
+    device_id: str
+    stopped: bool | None
+    latency_ms: float
+    why: str
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class StopReport:
+    """What became of one emergency stop, by name.
+
+    ``stopped``, ``not_stopped`` and ``refused`` map a robot to its answer; ``silent`` are the expected ones that
+    gave none. ``link``: the stop left this machine at least once. ``elapsed_ms`` is the time until the last answer
+    or the deadline.
+    """
+
+    estop_id: str
+    stopped: Mapping[str, Answer]
+    not_stopped: Mapping[str, Answer]
+    refused: Mapping[str, Answer]
+    silent: tuple[str, ...]
+    link: bool
+    elapsed_ms: float
+
+    @property
+    def ok(self) -> bool:
+        """True when every robot that was expected or answered is known to be still; nobody at all is not ok."""
+        return bool(self.stopped) and not (self.not_stopped or self.refused or self.silent)
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a running stop stands; given to ``on_progress`` at each change."""
+
+    estop_id: str
+    answered: Mapping[str, Answer]
+    unconfirmed: tuple[str, ...]
+    link_up: bool
+    elapsed_ms: float
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class SafetyController:
+    """Sends emergency stops and check-ins under its own id and collects what robots answer.
+
+    Args:
+        controller_id: the source that robots see; their allowlist must admit it.
+        make_link: gives the connection of its own.
+        signing_key: Ed25519 private key, for fleets that ask for signed stops.
+        on_link: told at once when the link is lost or back.
+    """
+
+    def __init__(
+        self,
+        controller_id: str,
+        make_link: Callable[[], StopLink],
+        *,
+        signing_key: Any = None,
+        on_link: Callable[[bool], None] = lambda up: None,
+    ) -> None:
+        self.controller_id = device_id("controller_id", controller_id)
+        self._key = signing_key
+        self._on_link = on_link
+        self._changed = threading.Condition()
+        self._stops: dict[str, _Running] = {}
+        self._closing = threading.Event()
+        self._check_in: threading.Thread | None = None
+        self._link = make_link()
+        self._link.open((VERDICT,), self._hear, self._link_changed)
+
+    @property
+    def link_up(self) -> bool:
+        """True while the link reaches somebody."""
+        return self._link.up
+
+    def wait_link(self, timeout: float) -> bool:
+        """True when the link is up within ``timeout`` seconds."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._link.up, timeout)
+
+    def stop(
+        self,
+        expected: Collection[str] = (),
+        reason: str = "",
+        *,
+        deadline_s: float = DEADLINE_S,
+        estop_id: str = "",
+        on_progress: OnProgress = lambda progress: None,
+    ) -> StopReport:
+        """Stop every robot of the tenant, now, and wait for their answers.
+
+        The stop is sent at once and again until each ``expected`` robot has answered or ``deadline_s`` is over; while
+        the link is down it waits for it and is sent in the moment it is back. Without ``expected`` it is repeated to
+        the deadline, and whoever answers is in the report.
+
+        Args:
+            expected: ids of the robots that must answer.
+            reason: told to the robots and their logs, at most 200 characters.
+            deadline_s: seconds until silence is reported as silence.
+            estop_id: 32 hex digits; a fresh one by default.
+            on_progress: called at each answer, when the link changes, and once 100 ms have passed.
+        """
+        number("deadline_s", deadline_s, above=0, high=3600)
+        if isinstance(expected, str):
+            raise ValidationError(f"expected must be a collection of robot ids, not the text {expected!r}.")
+        run = _Running(estop_id or new_epoch(), frozenset(expected), time.monotonic())
+        payload = self._signed(ESTOP, run.estop_id, {"reason": reason[:200]})
+        with self._changed:
+            self._stops[run.estop_id] = run
+        try:
+            # The first one leaves before anything else is done.
+            run.sent = self._link.publish(self.controller_id, ESTOP, payload)
+            self._repeat(run, payload, deadline_s, on_progress)
+        finally:
+            with self._changed:
+                del self._stops[run.estop_id]
+        return self._report(run)
+
+    def check_in_every(self, interval_s: float) -> None:
+        """Check in with the robots that need a live controller, from now until ``close``."""
+        number("interval_s", interval_s, low=0.02, high=60)
+        if self._check_in is None:
+            self._check_in = threading.Thread(
+                target=self._check_in_loop, args=(interval_s,), name="check-in", daemon=True
+            )
+            self._check_in.start()
+
+    def check_in(self) -> bool:
+        """Check in once; False when the link is down."""
+        return self._link.publish(self.controller_id, CHECK_IN, self._signed(CHECK_IN, new_epoch(), {}))
+
+    def close(self) -> None:
+        """Stop checking in and close the link. Safe to call twice."""
+        self._closing.set()
+        if self._check_in is not None:
+            self._check_in.join(2.0)
+        self._link.close()
+
+    def _repeat(self, run: _Running, payload: bytes, deadline_s: float, on_progress: OnProgress) -> None:
+        pauses, told = iter(REPEAT_S), -1
+        pause, next_send, again = 0.0, run.started, 0
+        while True:
+            now = time.monotonic()
+            late = now - run.started >= UNCONFIRMED_S
+            with self._changed:
+                state = hash((len(run.answers), late, self._link.up))
+                finished = run.complete or now - run.started >= deadline_s
+            if state != told or finished:
+                told = state
+                on_progress(run.progress(self._link.up, now))
+            if finished:
+                return
+            if now >= next_send:
+                if again or not run.sent:
+                    run.sent = self._link.publish(self.controller_id, ESTOP, payload) or run.sent
+                again += 1
+                pause = next(pauses, pause)
+                next_send = now + pause
+            marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
+            with self._changed:
+                seen = (len(run.answers), self._link.up)
+                self._changed.wait_for(
+                    lambda seen=seen: seen != (len(run.answers), self._link.up),  # type: ignore[misc]
+                    max(0.0, min(marks) - time.monotonic()),
+                )
+                if self._link.up and not seen[1]:
+                    # Back on the network: now, not at the next turn.
+                    next_send = 0.0
+
+    def _report(self, run: _Running) -> StopReport:
+        answers = dict(run.answers)
+        refused = {name: each for name, each in answers.items() if REFUSED in each.why}
+        report = StopReport(
+            run.estop_id,
+            {name: each for name, each in answers.items() if each.stopped is True},
+            {name: each for name, each in answers.items() if each.stopped is not True and name not in refused},
+            refused,
+            tuple(sorted(run.expected - answers.keys())),
+            run.sent,
+            (time.monotonic() - run.started) * 1000,
+        )
+        for name, each in {**report.not_stopped, **refused}.items():
+            logger.critical("%s DID NOT STOP: %s", name, each.why or each.facts)
+        if report.silent:
+            logger.critical("NO ANSWER to emergency stop %s from: %s", run.estop_id, ", ".join(report.silent))
+        if not report.link:
+            logger.critical("Emergency stop %s never left: the link of %s is down.", run.estop_id, self.controller_id)
+        return report
+
+    def _hear(self, event: str, source: str, payload: bytes) -> None:
+        at = time.monotonic()
+        try:
+            params = json.loads(payload)["params"]
+            estop_id, stopped = params["estop_id"], params.get("stopped")
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            logger.warning("An answer of %s is not to be read; it counts as none.", source)
+            return
+        with self._changed:
+            run = self._stops.get(estop_id) if isinstance(estop_id, str) else None
+            if run is not None:
+                known = run.answers.get(source)
+                if known is None or known.stopped is not True:
+                    answer = Answer(
+                        source,
+                        stopped if isinstance(stopped, bool) else None,
+                        (at - run.started) * 1000,
+                        _why(params),
+                        params,
+                    )
+                    run.answers[source] = answer
+                self._changed.notify_all()
+
+    def _link_changed(self, up: bool) -> None:
+        with self._changed:
+            self._changed.notify_all()
+        self._on_link(up)
+
+    def _check_in_loop(self, interval_s: float) -> None:
+        due = time.monotonic()
+        while not self._closing.wait(max(0.0, due - time.monotonic())):
+            due = max(due + interval_s, time.monotonic())
+            self.check_in()
+
+    def _signed(self, event: str, estop_id: str, params: Mapping[str, Any]) -> bytes:
+        fields: dict[str, Any] = {"estop_id": estop_id, "t": time.time(), "nonce": secrets.token_hex(16)}
+        if self._key is not None:
+            message = signed_fields(estop_id, self.controller_id, fields["t"], fields["nonce"])
+            fields["sig"] = ed25519.encode(self._key.sign(message))
+        return notification(event, {**params, **fields})
+
+
+@dataclass(eq=False)
+class _Running:
+    estop_id: str
+    expected: frozenset[str]
+    started: float
+    answers: dict[str, Answer] = field(default_factory=dict)
+    sent: bool = False
+
+    @property
+    def complete(self) -> bool:
+        return bool(self.expected) and self.expected <= self.answers.keys()
+
+    def progress(self, link_up: bool, now: float) -> Progress:
+        late = now - self.started >= UNCONFIRMED_S
+        open_ = tuple(sorted(self.expected - self.answers.keys())) if late or not link_up else ()
+        return Progress(self.estop_id, dict(self.answers), open_, link_up, (now - self.started) * 1000)
+
+
+def _why(params: Mapping[str, Any]) -> str:
+    reasons = [params.get("not_stopped"), params.get("unknown")]
+    return "; ".join(f"{name}: {why}" for each in reasons if isinstance(each, Mapping) for name, why in each.items())
