@@ -22,6 +22,8 @@ test: venv  ## Everything that needs nothing but wheels
 
 system:
 	@./scripts/system-packages.sh $(GL_PACKAGES)
+	@./scripts/reachy-daemon.sh 1.13.0
+	@./scripts/reachy-daemon.sh 1.4.1
 
 test-all: venv system  ## What needs Debian or npm packages besides
 	@$(BIN)/python -m pytest -m system $(ARGS)

@@ -68,10 +68,10 @@ class Target:
         """The largest share of a frame's allowed step between ``start`` and this: 1.0 is just one frame's."""
         steps = [0.0]
         if self.head and start.head:
-            steps.append(self.head.angle_to(start.head) / FRAME_STEP)
+            # The angles' sum bounds the turn and, unlike it, divides evenly over the frames of a ramp; and the body
+            # follows the head's yaw, so that a turn through the back is as long as it is.
+            steps.append(self.head.turn_to(start.head) / FRAME_STEP)
             steps.append(self.head.distance_to(start.head) / FRAME_STEP_M)
-            # The body follows the head's yaw, so a turn through the back is as long as it is.
-            steps.append(abs(self.head.yaw - start.head.yaw) / FRAME_STEP)
         if self.body_yaw is not None and start.body_yaw is not None:
             steps.append(abs(self.body_yaw - start.body_yaw) / FRAME_STEP)
         if self.antennas and start.antennas:

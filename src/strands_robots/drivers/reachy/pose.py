@@ -68,6 +68,10 @@ class HeadPose:
         chord = math.sqrt(sum((a[i] - b[i]) ** 2 for i in _ROTATION))
         return 2 * math.asin(min(1.0, chord / math.sqrt(8)))
 
+    def turn_to(self, other: HeadPose) -> float:
+        """Radians of roll, pitch and yaw added up: never less than :meth:`angle_to`."""
+        return abs(self.roll - other.roll) + abs(self.pitch - other.pitch) + abs(self.yaw - other.yaw)
+
     def distance_to(self, other: HeadPose) -> float:
         """Metres between the two head positions."""
         return math.dist((self.x, self.y, self.z), (other.x, other.y, other.z))

@@ -1,0 +1,166 @@
+"""What goes wrong with a daemon, on the stand-in, where it goes wrong on demand."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+
+import pytest
+from fixtures.reachy_daemon.process import Daemon, Kind
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.drivers.reachy import ReachyDriver, discovery
+from strands_robots.drivers.reachy.discovery import SERVICE, discover, make_reachy
+from strands_robots.drivers.reachy.envelope import FRAME_STEP, Target
+from strands_robots.drivers.reachy.pose import HeadPose
+from strands_robots.drivers.reachy.rest import DaemonUnreachable
+from strands_robots.safety.gate import MotionRefused
+from strands_robots.utils import ValidationError
+
+pytestmark = pytest.mark.timeout(90)
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Daemon]:
+    with Daemon(Kind("1.13.0")) as daemon:
+        yield daemon
+
+
+def test_a_slow_daemon_still_moves_by_frames_and_a_stop_never_claims_what_it_does_not_know(
+    daemon: Daemon, reachy: ReachyDriver
+) -> None:
+    daemon.control(slow_s=2.0)
+    reachy.gesture("shake")
+    eventually(lambda: reachy.motions.frames_sent > 3, 3.0, "frames")
+    started = time.monotonic()
+    verdict = reachy.halt("test")
+    assert time.monotonic() - started < 1.5
+    assert "shake" in verdict.halted
+    assert verdict.stopped is not True, "which moves the daemon runs was not answered in time"
+    sent = reachy.motions.frames_sent
+    time.sleep(0.1)
+    assert reachy.motions.frames_sent == sent
+
+
+def test_a_hub_that_never_answers_freezes_the_daemon_and_the_driver_says_so(
+    daemon: Daemon, reachy: ReachyDriver
+) -> None:
+    daemon.control(hub="frozen")
+    asked = threading.Thread(target=lambda: reachy.library.names("dances"))
+    asked.start()
+    try:
+        eventually(lambda: not reachy.is_connected, 4.0, "silence is noticed")
+        with pytest.raises(MotionRefused, match=r"no joint data|did not answer"):
+            reachy.gesture("nod")
+        assert reachy.halt("test").stopped is not True
+    finally:
+        asked.join(20)
+    eventually(lambda: reachy.is_connected, 15.0, "it thaws")
+
+
+def test_nan_in_the_stream_is_stale_joints_and_not_a_dead_link(daemon: Daemon, reachy: ReachyDriver) -> None:
+    daemon.control(nan=True)
+    eventually(lambda: reachy.get_joints()["status"] == "error", 4.0, "no usable numbers")
+    assert reachy.is_connected
+    assert reachy.facts()["unusable_frames"] > 10
+    with pytest.raises(DaemonUnreachable, match="unusable numbers"):
+        reachy.get_observation()
+    reachy.go(Target(antennas=(0.0, 0.0)))
+    daemon.control(nan=False)
+    eventually(lambda: reachy.get_joints()["status"] == "success", 4.0, "numbers again")
+
+
+def test_a_robot_that_an_application_holds_is_not_moved(daemon: Daemon, reachy: ReachyDriver) -> None:
+    daemon.control(holder="dance_party")
+    eventually(lambda: reachy.facts()["app"] == "dance_party", 4.0, "the lock is seen")
+    for verb in (reachy.wake_up, lambda: reachy.gesture("nod"), lambda: reachy.send_action({"head_yaw": 0.1})):
+        with pytest.raises(MotionRefused, match="held by dance_party"):
+            verb()
+    assert reachy.halt("test").stopped is True
+    daemon.control(holder="")
+    eventually(lambda: not reachy.facts()["app"], 4.0, "it is free")
+    reachy.gesture("nod")
+
+
+def test_a_daemon_that_is_stopped_says_so_and_one_that_is_started_is_used(daemon: Daemon, reachy: ReachyDriver) -> None:
+    daemon.request("POST", "/api/daemon/stop?goto_sleep=false")
+    eventually(lambda: "the daemon is stopped" in reachy.facts()["unavailable"], 6.0, "the reason")
+    with pytest.raises(MotionRefused, match="stopped"):
+        reachy.gesture("nod")
+    daemon.request("POST", "/api/daemon/start?wake_up=false")
+    eventually(lambda: reachy.is_connected, 6.0, "it is used")
+
+
+def test_no_frame_that_reaches_the_daemon_jumps_or_comes_faster_than_50_a_second(
+    daemon: Daemon, reachy: ReachyDriver
+) -> None:
+    before = len(daemon.frames())
+    started = time.monotonic()
+    for i in range(40):
+        reachy.send_action({"antenna_left": math.sin(i), "head_yaw": 0.5 * math.cos(i)})
+    elapsed = time.monotonic() - started
+    assert elapsed >= 39 * 0.02 * 0.9
+    yaws = [math.atan2(frame["head"][4], frame["head"][0]) for frame in daemon.frames()[before:] if frame.get("head")]
+    assert max(abs(a - b) for a, b in pairwise(yaws)) <= FRAME_STEP + 1e-6
+
+
+def test_a_thousand_bad_values_never_reach_the_wire(daemon: Daemon, reachy: ReachyDriver) -> None:
+    reachy.go(Target(body_yaw=0.0))
+    before = len(daemon.frames())
+    bad = (math.nan, math.inf, -math.inf, True, "0", None, [0], 10**400, 4.0)
+    for key in reachy.action_features:
+        for value in bad:
+            with pytest.raises(ValidationError, match=key):
+                reachy.send_action({key: value})
+    assert len(daemon.frames()) == before
+
+
+def test_a_whole_life_leaves_no_thread_behind(daemon: Daemon, connect: Callable[..., ReachyDriver]) -> None:
+    connect().disconnect()
+    mine = ("reachy-", "Thread-")
+    count = lambda: sum(thread.name.startswith(mine) for thread in threading.enumerate())  # noqa: E731
+    eventually(lambda: count() == 0, 5.0, "quiet before")
+    for _ in range(5):
+        reachy = connect()
+        reachy.gesture("nod")
+        reachy.wake_up()
+        reachy.disconnect()
+    eventually(lambda: count() == 0, 5.0, "quiet after")
+
+
+def test_connect_eagerly_never_raises_and_connects_later(daemon: Daemon) -> None:
+    reachy = ReachyDriver("127.0.0.1", api_port=free_port())
+    try:
+        answer = reachy.connect_eagerly(0.3)
+        assert answer["status"] == "error"
+        assert "Connection refused" in answer["reason"]
+        with pytest.raises(MotionRefused, match="Connection refused"):
+            reachy.go(Target(HeadPose()))
+    finally:
+        reachy.disconnect()
+    with pytest.raises(DaemonUnreachable, match="Connection refused"):
+        ReachyDriver("127.0.0.1", api_port=free_port()).connect(within_s=0.5)
+
+
+def test_a_robot_that_announces_itself_is_found(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    here = ["127.0.0.1"]
+    with Zeroconf(interfaces=here) as network:
+        info = ServiceInfo(
+            SERVICE, f"lab_head.{SERVICE}", port=daemon.port, parsed_addresses=here, server="reachy-mini.local."
+        )
+        network.register_service(info)
+        found = discover(1.5, interfaces=here)
+        if not found:
+            pytest.skip("multicast does not loop back on this machine")
+        assert [(each.name, each.host, each.port) for each in found] == [("lab_head", "127.0.0.1", daemon.port)]
+    monkeypatch.setattr(discovery, "discover", lambda within_s: found)
+    assert make_reachy().connection.port == daemon.port
+    monkeypatch.setattr(discovery, "discover", lambda within_s: found * 2)
+    with pytest.raises(ValidationError, match="2 were found: lab_head at"):
+        make_reachy()
+    monkeypatch.setattr(discovery, "discover", lambda within_s: [])
+    with pytest.raises(DaemonUnreachable, match="no Reachy Mini announced itself"):
+        make_reachy()
