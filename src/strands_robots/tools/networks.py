@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,12 +14,15 @@ from strands_robots.utils import MissingExtraError, ValidationError
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
+    from strands_robots.device_connect.client import Peer
 
 SOURCE = "robot-mesh-tool"
 """The name that the tool's calls carry; what a robot's allowlist has to hold."""
 
 ANSWER_S = 10.0
 STOP_S = 5.0
+ESTOP_S = 1.5
+"""Seconds in which robots answer an emergency stop; it is sent again and again until then."""
 
 
 class RobotNetwork(Protocol):
@@ -110,8 +114,33 @@ class DeviceConnect:
         return _with_fleet(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
-        """Stop every device at once; answers by name."""
-        return self.stop("")
+        """An emergency stop on a connection of its own; who can be seen and gave no answer to it is asked to stop
+        besides. Answers by name."""
+        from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415
+
+        def stopped(fleet: FleetClient) -> Envelope:
+            with ThreadPoolExecutor(1) as pool:
+                controller = safety_controller(SOURCE, fleet.link)
+                try:
+                    seen = pool.submit(fleet.peers)
+                    report = controller.stop((), reason, deadline_s=ESTOP_S)
+                finally:
+                    controller.close()
+            answered = {*report.stopped, *report.not_stopped, *report.refused}
+            rest = [peer.id for peer in seen.result() if peer.id not in answered and _can_stop(peer)]
+            if not rest:
+                return envelope(report)
+            answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
+            for name, answer in {**report.not_stopped, **report.refused}.items():
+                answers[name] = error(answer.why, stopped=False)
+            asked = {name: fleet.stop(name, STOP_S) for name in rest}
+            return {**verdict_of(answers | asked), "not_locked": rest}
+
+        return _with_fleet(stopped, stopped=None)
+
+
+def _can_stop(peer: Peer) -> bool:
+    return any(each.get("name") in ("stop", "stopMotion") for each in peer.functions)
 
 
 def verdict_of(answers: Mapping[str, Envelope]) -> Envelope:

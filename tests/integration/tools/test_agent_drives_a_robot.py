@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,11 +19,12 @@ from strands_robots.tools import robot_mesh
 
 
 @pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[ToyWorld]:
+def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ToyWorld]:
     """One toy world, served on a loopback port that the tool uses too."""
     for setting in settings.declared():
         monkeypatch.delenv(setting.name, raising=False)
     monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
+    monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
     toy = ToyWorld("toys", robots=("left",))
     runtime = init_device_connect_sync(toy, peer_id="toys", link=loopback_config())
     try:
@@ -56,14 +58,14 @@ def test_an_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
     assert world.writes
 
 
-def test_an_emergency_stop_reaches_every_robot_and_names_it(world: ToyWorld) -> None:
-    told = results(
-        {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20},
-        {"action": "emergency_stop", "instruction": "smoke"},
-    )
+def test_an_emergency_stop_halts_and_locks_every_robot_and_names_it(world: ToyWorld) -> None:
+    wave = {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20}
+    told = results(wave, {"action": "emergency_stop", "instruction": "smoke"}, wave)
     assert told[1]["status"] == "success"
     assert "toys" in str(told[1]["content"])
     eventually(lambda: not world.list_policies_running(), what="the toy world stands still")
+    assert told[2]["status"] == "error"
+    assert "lock" in str(told[2]["content"])
 
 
 def test_a_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None:
@@ -72,6 +74,14 @@ def test_a_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None
     (told,) = results({"action": "stop"})
     assert told["status"] == "error"
     assert "DID NOT STOP: toys" in str(told["content"])
+
+
+def test_an_emergency_stop_that_did_not_stop_a_robot_is_an_error_by_name(world: ToyWorld) -> None:
+    world.start_policy("left", "wave", duration=20)
+    world.stubborn = True
+    (told,) = results({"action": "emergency_stop"})
+    assert told["status"] == "error"
+    assert "toys did not stop" in str(told["content"])
 
 
 def test_silence_is_an_error(world: ToyWorld) -> None:

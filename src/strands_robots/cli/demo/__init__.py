@@ -46,14 +46,15 @@ def demo(
     try:
         with _ended_in_order():
             _tell(show, report, output)
+            seconds = time.monotonic() - started
+            show.say("")
+            show.say(f"Every step happened, in {seconds:.1f} s.", "green")
             if record is not None:
                 show.save(record)
     except Failure as failure:
         failure.fields.update(_facts(report))
         raise
-    seconds = time.monotonic() - started
     screen.data({"status": "success", "seconds": round(seconds, 2), **_facts(report)})
-    screen.say(f"Every step happened, in {seconds:.1f} s.", "green")
     if record is not None:
         screen.say(f"Recorded in {record}.")
 

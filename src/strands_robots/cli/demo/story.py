@@ -112,7 +112,7 @@ class Story:
 
     def stop(self) -> None:
         """A stop in mid-motion, its latency, and whether the arm stands still afterwards."""
-        self._show.head("It starts another one and stops it half-way")
+        self._show.head("It starts another one and stops it in mid-motion")
         with self.report.step("stop") as row, self._agent.events(self._peer) as stream:
             before = len(self.report.path)
             wanted = {"instruction": "keep waving", "policy_provider": "mock", "duration": 60.0}
@@ -127,7 +127,7 @@ class Story:
                 raise Failure(f"stop was answered, but nothing says that the arm stopped: {verdict}")
             row["braking_rad"], row["drift_rad"] = self._rest(stream)
         self._show.done(
-            f"stop answered in {row['latency_ms']:.1f} ms, in mid-motion; the arm came to rest within "
+            f"stop answered in {row['latency_ms']:.1f} ms; the arm came to rest within "
             f"{row['braking_rad']:.3f} rad and then stood still: {row['drift_rad']:.4f} rad in {WATCH_S:g} s"
         )
 
