@@ -11,6 +11,7 @@ from itertools import pairwise
 import pytest
 from fixtures.reachy_daemon.process import Daemon, Kind
 from fixtures.waiting import eventually, free_port
+from zeroconf import ServiceInfo, Zeroconf
 
 from strands_robots.drivers.reachy import ReachyDriver, discovery
 from strands_robots.drivers.reachy.discovery import SERVICE, discover, make_reachy
