@@ -6,6 +6,7 @@ nothing else: the file is written by a thread of its own, and the audit has its 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
@@ -106,27 +107,30 @@ class Reporter:
 
     def _run(self) -> None:
         next_tick = time.monotonic() + self._tick_s
-        while True:
-            try:
-                message = self._inbox.get(timeout=self._patience())
-            except queue.Empty:
-                message = None
-            else:
-                if message is None:
-                    for run in list(self._runs):
-                        self._time_out(run)
-                    return
+        while self._take():
             if time.monotonic() >= next_tick:
                 next_tick = time.monotonic() + self._tick_s
                 _call(self._tick)
-            if isinstance(message, StopRun):
-                self._runs.append(message)
-            elif isinstance(message, _Answer):
-                self._answered(message)
-            elif isinstance(message, _Kept):
-                message.run.kept = message.ok
             for run in list(self._runs):
                 self._advance(run, time.monotonic())
+        for run in list(self._runs):
+            self._time_out(run)
+
+    def _take(self) -> bool:
+        """Everything that has arrived, so that thirty answers cost one look at the run; False to end."""
+        with contextlib.suppress(queue.Empty):  # all taken, or it is time to look at the clock
+            message = self._inbox.get(timeout=self._patience())
+            while True:
+                if message is None:
+                    return False
+                if isinstance(message, StopRun):
+                    self._runs.append(message)
+                elif isinstance(message, _Answer):
+                    self._answered(message)
+                else:
+                    message.run.kept = message.ok
+                message = self._inbox.get_nowait()
+        return True
 
     def _patience(self) -> float:
         return min([self._tick_s, *(0.01 for _ in self._runs)])
