@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import threading
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -52,14 +53,16 @@ def Robot(  # the factory reads as the class it stands for
 
     Args:
         name: in simulation a model: ``so100``, ``so101``, ``rover``, the path of an MJCF or URDF file, or a
-            ``robot_descriptions`` name. Real: a LeRobot robot type, such as ``so100_follower`` or ``so100``.
+            ``robot_descriptions`` name. Real: a LeRobot robot type, such as ``so100_follower`` or ``so100``, or
+            ``reachy_mini``.
         mode: ``sim`` (MuJoCo, moving in real time) or ``real`` (a LeRobot device, connected without calibration).
         tool_name: what it is called on a network; the robot's name by default.
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
         options: ``sim``: what ``Simulation`` takes (``timestep``, ``gravity``, ``realtime``). ``real``:
             ``control_hz``, ``joint_ranges``, ``stop_level``, and every other one goes to the LeRobot
-            configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``.
+            configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``. ``reachy_mini``: ``host``
+            (looked for on the local network when there is none) and what ``ReachyDriver`` takes.
 
     Raises:
         ValidationError: an unknown name (the sentence lists the near ones) or an option outside its domain.
@@ -162,11 +165,23 @@ def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any
 
 
 def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
+    if name == "reachy_mini":
+        return _reachy(tool_name, options)
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - real hardware only
 
     ours = {key: options.pop(key) for key in ("control_hz", "joint_ranges", "stop_level") if key in options}
     robot = _made(_hardware_class(), make_device(name, options), tool_name=tool_name or _label(name), **ours)
     robot.connect()
+    return robot
+
+
+def _reachy(tool_name: str | None, options: dict[str, Any]) -> Any:
+    from strands_robots.drivers.reachy.discovery import make_reachy  # noqa: PLC0415 - as above
+
+    robot = _made(make_reachy, driver=_reachy_class(), **options)
+    robot.tool_name_str = tool_name or robot.tool_name_str
+    # A daemon that is away is connected to when it appears.
+    robot.connection.start()
     return robot
 
 
@@ -184,7 +199,14 @@ def _hardware_class() -> type[Any]:
     return type("Robot", (Networked, HardwareRobot), {"__doc__": HardwareRobot.__doc__})
 
 
-def _made(factory: type[Any], *args: Any, **options: Any) -> Any:
+@cache
+def _reachy_class() -> type[Any]:
+    from strands_robots.drivers.reachy import ReachyDriver  # noqa: PLC0415 - real hardware only
+
+    return type("Robot", (Networked, ReachyDriver), {"__doc__": ReachyDriver.__doc__})
+
+
+def _made(factory: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
         return factory(*args, **options)
     except TypeError as exc:

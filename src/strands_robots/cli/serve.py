@@ -42,7 +42,10 @@ def serve(
     *,
     robot: Annotated[str, typer.Argument(help="Such as so100, or an MJCF or URDF file.")],
     peer_id: Annotated[str | None, typer.Option("--peer-id", help="Its id on the network, without dots.")] = None,
-    mode: Annotated[str, typer.Option("--mode", help="sim or real.")] = "sim",
+    mode: Annotated[str, typer.Option("--mode", help="sim or real; reachy_mini is always real.")] = "sim",
+    host: Annotated[
+        str | None, typer.Option("--host", help="Of a Reachy Mini's daemon; without it one is looked for.")
+    ] = None,
     options: Annotated[
         list[str] | None,
         typer.Option("--set", help="An option of the robot, such as port=/dev/ttyACM0.", metavar="KEY=VALUE"),
@@ -71,7 +74,8 @@ def serve(
     link = network.link()
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
 
-    body = Robot(robot, mode=mode, **assignments(options or []))
+    chosen = assignments(options or []) | ({} if host is None else {"host": host})
+    body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
     try:
         _serve(screen, network, link, body, wanted=wanted, piped=until_stdin_closes)
     finally:

@@ -163,5 +163,5 @@ def test_a_robot_that_announces_itself_is_found(daemon: Daemon, monkeypatch: pyt
     with pytest.raises(ValidationError, match="2 were found: lab_head at"):
         make_reachy()
     monkeypatch.setattr(discovery, "discover", lambda within_s: [])
-    with pytest.raises(DaemonUnreachable, match="no Reachy Mini announced itself"):
+    with pytest.raises(ValidationError, match="none announced itself"):
         make_reachy()

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.drivers.reachy.driver import ReachyDriver
-from strands_robots.drivers.reachy.rest import DaemonUnreachable
 from strands_robots.utils import ValidationError, missing_extra, number
 
 SERVICE = "_reachy-mini._tcp.local."
@@ -59,25 +58,32 @@ def _found(name: str, info: Any) -> Found:
     return Found(name.removesuffix("." + SERVICE), addresses[0], int(info.port))
 
 
-def make_reachy(host: str = "", *, api_port: int = 8000, within_s: float = 3.0, **options: Any) -> ReachyDriver:
+def make_reachy(
+    host: str = "",
+    *,
+    api_port: int = 8000,
+    within_s: float = 3.0,
+    driver: type[ReachyDriver] = ReachyDriver,
+    **options: Any,
+) -> ReachyDriver:
     """A driver for ``host``, or for the one Reachy Mini that announces itself when no host is given.
 
     Args:
         host: bare hostname or IP literal; empty to look for it.
         api_port: TCP port of the daemon, when ``host`` is given.
         within_s: seconds to look.
+        driver: the class to make.
         options: further arguments of :class:`ReachyDriver`.
 
     Raises:
-        DaemonUnreachable: none was found.
-        ValidationError: several were found, or an argument is out of its domain.
+        ValidationError: not just one was found, or an argument is out of its domain.
     """
     if host:
-        return ReachyDriver(host, api_port=api_port, **options)
+        return driver(host, api_port=api_port, **options)
     found = discover(within_s)
     if not found:
-        raise DaemonUnreachable(f"no Reachy Mini announced itself within {within_s:g} s; name its host.")
+        raise ValidationError(f"host must name a Reachy Mini: none announced itself within {within_s:g} s.")
     if len(found) > 1:
         names = ", ".join(f"{each.name} at {each.host}:{each.port}" for each in found)
         raise ValidationError(f"host must name one Reachy Mini; {len(found)} were found: {names}.")
-    return ReachyDriver(found[0].host, api_port=found[0].port, **options)
+    return driver(found[0].host, api_port=found[0].port, **options)

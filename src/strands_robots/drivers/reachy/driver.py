@@ -137,6 +137,10 @@ class ReachyDriver:
         self.gate.revoke()
         self.connection.close()
 
+    def cleanup(self) -> None:
+        """The same as :meth:`disconnect`."""
+        self.disconnect()
+
     def get_observation(self) -> dict[str, float]:
         """Measured head pose, body yaw and antennas by action key, in metres and radians.
 
