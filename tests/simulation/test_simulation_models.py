@@ -196,3 +196,15 @@ def test_a_robot_description_is_found_by_its_name(empty: Simulation) -> None:
     assert "pole_mj_description" in empty.add_robot("typo", "pole_mj_descriptoin")["reason"]
     assert "cannot be fetched: no network" in empty.add_robot("far", "far_description")["reason"]
     assert empty.list_robots() == ["robot", "short"]
+
+
+def test_a_warning_of_the_engine_is_logged_and_leaves_no_file(
+    empty: Simulation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    body = '<body><joint name="hinge"/><geom size="0.1"/></body>'
+    model = tmp_path / "leaf.xml"
+    model.write_text(f'<mujoco><option impratio="10"/><worldbody>{body}</worldbody></mujoco>')
+    assert empty.add_robot("leaf", str(model))["status"] == "success"
+    assert "impratio" in caplog.text
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import sys
 
 from strands_robots.simulation import gl
+
+logger = logging.getLogger(__name__)
 
 _LATE = "mujoco" in sys.modules and gl.undecided()
 
@@ -24,5 +27,9 @@ def _make_up() -> None:
 
 if _LATE and BACKEND in gl.LIBRARIES:
     _make_up()
+
+if mujoco.get_mju_user_warning() is None:
+    # MuJoCo's own way is a file in whatever folder the program was started.
+    mujoco.set_mju_user_warning(lambda message: logger.warning("MuJoCo: %s", message.strip()))
 
 __all__ = ["BACKEND", "mujoco"]
