@@ -1,0 +1,185 @@
+"""Real devices under the safety plane: stopped by the lane whatever their loop does, locked, and lawfully resumed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.nats_server import NatsServer
+from fixtures.toy_robots import ToyRobot, ToyWorld
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.audit import read_audit_log, verify_audit_integrity
+from strands_robots.device_connect import (
+    FleetClient,
+    LinkConfig,
+    init_device_connect_sync,
+    loopback_config,
+    stop_device_connect,
+)
+from strands_robots.device_connect.backends import open_client
+from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.safety_controller import safety_controller
+from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.safety import ed25519
+from strands_robots.safety.controller import SafetyController
+from strands_robots.safety.lane import lane
+from strands_robots.safety.links import ESTOP, notification
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.plane import plane
+from strands_robots.safety.resume import sign
+
+MOVE = {"instruction": "wave", "duration": 20.0}
+
+
+@pytest.fixture(params=["zenoh", "nats"])
+def link(request: pytest.FixtureRequest) -> Iterator[LinkConfig]:
+    if request.param == "nats":
+        with NatsServer() as server:
+            yield LinkConfig(transport="nats", connect=(server.url,))
+    else:
+        yield loopback_config(free_port())
+
+
+@pytest.fixture
+def operator(monkeypatch: pytest.MonkeyPatch) -> Ed25519PrivateKey:
+    key = Ed25519PrivateKey.generate()
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", ed25519.encode(ed25519.public_half(key)))
+    return key
+
+
+class KnowsItsLoop:
+    """Remembers the event loop that it is served on, so that a test may block it."""
+
+    loop: asyncio.AbstractEventLoop | None = None
+
+    async def connect(self) -> None:
+        self.loop = asyncio.get_running_loop()
+        await super().connect()  # type: ignore[misc]
+
+
+class Simulated(KnowsItsLoop, SimulationDeviceDriver): ...
+
+
+class Real(KnowsItsLoop, RobotDeviceDriver): ...
+
+
+class Floor:
+    """A simulation and an arm on one network, an agent that drives them, and a controller that stops them."""
+
+    def __init__(self, link: LinkConfig) -> None:
+        self.link = link
+        self.world, self.arm = ToyWorld(), ToyRobot()
+        self.drivers = (Simulated(self.world), Real(self.arm))
+        self.runtimes = [
+            init_device_connect_sync(driver, peer_id=name, link=link, allow_insecure=True)
+            for name, driver in zip(("sim-1", "arm-1"), self.drivers, strict=True)
+        ]
+        self.agent = FleetClient(link, "tester").__enter__()
+        self.controller: SafetyController = safety_controller("safety-1", link)
+        assert self.controller.wait_link(10)
+        eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
+
+    def move(self) -> None:
+        for device in ("sim-1", "arm-1"):
+            answer = self.agent.call(device, "execute", MOVE)
+            assert answer["status"] == "success", answer
+        eventually(lambda: self.world.writes and self.arm.writes)
+
+    def close(self) -> None:
+        self.controller.close()
+        self.agent.close()
+        for runtime in self.runtimes:
+            stop_device_connect(runtime)
+
+
+@pytest.fixture
+def floor(link: LinkConfig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Floor]:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
+    monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "execute")
+    made = Floor(link)
+    yield made
+    made.close()
+    assert lane().seats == ()
+    assert plane().robots == {}
+
+
+def test_a_stop_halts_locks_and_is_answered_and_a_signed_resume_frees_without_moving(
+    floor: Floor, operator: Ed25519PrivateKey
+) -> None:
+    floor.move()
+    report = floor.controller.stop(["sim-1", "arm-1"], "smoke")
+    at = time.monotonic()
+    assert report.ok, report
+    time.sleep(0.05)
+    for toy in (floor.world, floor.arm):
+        assert toy.writes[-1] <= at
+    for device in ("sim-1", "arm-1"):
+        refused = floor.agent.call(device, "execute", MOVE)
+        assert refused["status"] == "error"
+        assert report.estop_id in refused["reason"]
+        assert "safety-1" in refused["reason"]
+        status = floor.agent.call(device, "getStatus")
+        assert status["status"] == "success"
+        assert status["locked"] is True
+        assert status["lockout"][0]["epoch"] == report.estop_id
+        assert floor.agent.call(device, "resume", {"assertion": {}})["reason"] == "resume rejected"
+        (assertion,) = sign(operator, report.estop_id, ["arm-1", "sim-1"])
+        assert floor.agent.call(device, "resume", {"assertion": assertion})["locked"] is False
+    writes = len(floor.arm.writes)
+    time.sleep(0.05)
+    assert len(floor.arm.writes) == writes
+    floor.move()
+    events = [each["event"] for each in read_audit_log()]
+    assert [events.count(name) for name in ("remote_estop_engaged", "resume_denied", "resume_ok")] == [2, 2, 2]
+    assert verify_audit_integrity()["ok"]
+
+
+def test_a_blocked_event_loop_of_every_device_does_not_hold_up_the_stop(floor: Floor) -> None:
+    floor.move()
+    release = threading.Event()
+    blocked = []
+    for driver in floor.drivers:
+        assert driver.loop is not None
+        driver.loop.call_soon_threadsafe(lambda: blocked.append(release.wait(10)))
+    try:
+        report = floor.controller.stop(["sim-1", "arm-1"])
+        at = time.monotonic()
+        assert report.ok
+        time.sleep(0.05)
+        assert max(floor.world.writes[-1], floor.arm.writes[-1]) <= at
+        assert blocked == []
+    finally:
+        release.set()
+
+
+def test_the_frameworks_own_road_and_the_lane_meet_and_halt_once(floor: Floor) -> None:
+    floor.move()
+
+    async def emit() -> None:
+        client = await open_client(floor.link)
+        payload = notification(ESTOP, {"reason": "button", "estop_id": new_epoch()})
+        separator = "." if floor.link.transport == "nats" else "/"
+        await client.publish(separator.join(("device-connect", "default", "panel-1", "event", ESTOP)), payload)
+        await asyncio.sleep(0.2)
+        await client.close()
+
+    asyncio.run(emit())
+    eventually(lambda: len(plane().lockouts()) == 2)
+    time.sleep(0.1)
+    records = [each for each in read_audit_log() if each["event"] == "remote_estop_engaged"]
+    assert sorted(each["peer_id"] for each in records) == ["arm-1", "sim-1"]
+    assert json.dumps(records[0]["payload"]["reason"]) == '"button"'
+
+
+def test_a_lockout_outlives_the_device_and_its_process_memory(floor: Floor) -> None:
+    report = floor.controller.stop(["sim-1", "arm-1"])
+    stop_device_connect(floor.runtimes[0])
+    floor.runtimes[0] = init_device_connect_sync(ToyWorld(), peer_id="sim-1", link=floor.link, allow_insecure=True)
+    refused = floor.agent.call("sim-1", "execute", MOVE)
+    assert report.estop_id in refused["reason"]
