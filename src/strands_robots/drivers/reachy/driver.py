@@ -54,6 +54,7 @@ class ReachyDriver:
 
     name = "reachy_mini"
     tool_name_str = "reachy_mini"
+    device_type = "reachy_mini"
 
     def __init__(
         self,
