@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
     from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
     from strands_robots.device_connect.bringup import (
-        DuplicateDeviceError,
         init_device_connect,
         init_device_connect_sync,
         stop_device_connect,
     )
     from strands_robots.device_connect.client import FleetClient
+    from strands_robots.device_connect.duplicates import DuplicateDeviceError
     from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
     from strands_robots.device_connect.robot_driver import RobotDeviceDriver
     from strands_robots.device_connect.signals import StopSignal
@@ -55,7 +55,7 @@ __all__ = [
 _HERE = "strands_robots.device_connect"
 _HOMES = {
     "DeviceRuntime": "device_connect_edge",
-    "DuplicateDeviceError": f"{_HERE}.bringup",
+    "DuplicateDeviceError": f"{_HERE}.duplicates",
     "FleetClient": f"{_HERE}.client",
     "LinkConfig": f"{_HERE}.backends",
     "ReachyMiniDriver": f"{_HERE}.reachy_mini_driver",

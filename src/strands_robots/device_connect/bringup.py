@@ -17,33 +17,26 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
-from device_connect_edge.messaging import MessagingError
 
 from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.backends.errors import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
+from strands_robots.device_connect.duplicates import refuse_duplicate
 from strands_robots.device_connect.limits import (
     BRINGUP_TIMEOUT_S,
+    LEAVE_TIMEOUT_S,
     LOOP_JOIN_TIMEOUT_S,
-    PROBE_EVERY_S,
-    PROBE_TIMEOUT_S,
-    PROBES,
 )
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.safety_seat import SafetySeat, take_seat
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
-from strands_robots.drivers.reachy.driver import ReachyDriver
+from strands_robots.device_connect.workers import Lane
 from strands_robots.utils import ValidationError, choice, device_id
 
 logger = logging.getLogger(__name__)
-
-
-class DuplicateDeviceError(RuntimeError):
-    """A device with the wanted id is live on this network and answered."""
 
 
 @dataclass(slots=True)
@@ -57,6 +50,7 @@ class Host:
 
 
 _hosts: dict[Runtime, Host] = {}
+_SEATING = Lane("bring-up", 1000)
 
 
 async def init_device_connect(  # noqa: PLR0917 - the documented signature
@@ -99,7 +93,9 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     driver = driver_for(robot, peer_type)
     announceable(driver)
     said = _listen_to_the_framework(name)
-    seat = asyncio.create_task(asyncio.to_thread(take_seat, name, driver, reach, named=peer_id is not None))
+    seat = asyncio.create_task(
+        _SEATING.run(lambda: take_seat(name, driver, reach, named=peer_id is not None), bringup_timeout)
+    )
 
     async def before_live(messaging: Any) -> None:
         await refuse_duplicate(name, reach, messaging)
@@ -241,7 +237,7 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
     """The driver of ``robot``: its own where it is one, else what the object is, else what ``peer_type`` says."""
     if isinstance(robot, DeviceDriver):
         return robot
-    if isinstance(robot, ReachyDriver):
+    if getattr(robot, "device_type", "") == "reachy_mini":
         from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver  # noqa: PLC0415 - for it alone
 
         return ReachyMiniDriver(robot=robot)
@@ -282,26 +278,6 @@ def announceable(driver: DeviceDriver) -> None:
     )
 
 
-async def refuse_duplicate(name: str, link: LinkConfig, messaging: Any) -> None:
-    """Raise :class:`DuplicateDeviceError` when a device with this id answers within a second. A ghost does not."""
-    request = {"jsonrpc": "2.0", "id": "probe", "method": "requestRegistration", "params": {}}
-    if link.is_peer:
-        # At a meeting point peers learn of one another one by one; elsewhere an open link knows who is there.
-        messaging.configure_d2d_retry(retries=PROBES if link.meet_port else 1, delay=PROBE_EVERY_S)
-    try:
-        await messaging.request(
-            f"device-connect.{link.tenant}.{name}.cmd", json.dumps(request).encode(), timeout=PROBE_TIMEOUT_S
-        )
-    except NoResponderError:
-        return
-    except MessagingError as exc:
-        logger.warning("A device %r is known on this network and does not answer (%s); taking its place.", name, exc)
-        return
-    raise DuplicateDeviceError(
-        f"A device {name!r} is live in tenant {link.tenant!r} and answered; give this one another peer_id."
-    )
-
-
 async def _put_down(runtime: Runtime, task: asyncio.Task[None]) -> None:
     await runtime.shutdown()
     task.cancel()
@@ -319,7 +295,7 @@ async def _live(runtime: Runtime, seat: asyncio.Task[SafetySeat | None]) -> None
 async def _leave(seat: asyncio.Task[SafetySeat | None]) -> None:
     (taken,) = await asyncio.gather(seat, return_exceptions=True)
     if isinstance(taken, SafetySeat):
-        await asyncio.to_thread(taken.leave)
+        await _SEATING.run(taken.leave, LEAVE_TIMEOUT_S)
 
 
 def _ended(runtime: Runtime, task: asyncio.Task[None]) -> None:

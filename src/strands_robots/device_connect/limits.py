@@ -11,3 +11,9 @@ PROBE_TIMEOUT_S = 1.0
 
 PROBES, PROBE_EVERY_S = 3, 0.05
 """How often, and how far apart, a peer asks for its own id before it is nobody's."""
+
+PRESENCE_WAIT_S = 0.25
+"""In which a live device has announced itself after a probe, where access rules forbid to call it."""
+
+LEAVE_TIMEOUT_S = 15.0
+"""For which a device's end waits for the stop lane's link to close."""

@@ -40,7 +40,12 @@ class WorkerPool:
                 self._free -= 1
                 self._jobs.put(job)
                 return
-        threading.Thread(target=self._work, args=(job,), name="robot-call", daemon=True).start()
+        thread = threading.Thread(target=self._work, args=(job,), name="robot-call", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:
+            # The interpreter is ending and starts no more threads.
+            job()
 
     def _work(self, job: Job) -> None:
         while True:

@@ -1,0 +1,44 @@
+"""SIGINT and SIGTERM as something to wait for."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from strands_robots.device_connect.signals import StopSignal
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_wait_and_the_handlers_are_as_before(number: signal.Signals) -> None:
+    before = [signal.getsignal(each) for each in StopSignal.SIGNALS]
+    with StopSignal() as asked:
+        assert asked.wait(0.01) is None
+        threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+        assert asked.wait(5) == number
+        assert [signal.getsignal(each) for each in StopSignal.SIGNALS] == before
+
+
+def test_leaving_without_a_signal_puts_the_handlers_back() -> None:
+    before = [signal.getsignal(each) for each in StopSignal.SIGNALS]
+    with StopSignal():
+        assert [signal.getsignal(each) for each in StopSignal.SIGNALS] != before
+    assert [signal.getsignal(each) for each in StopSignal.SIGNALS] == before
+
+
+def test_only_the_main_thread_has_signal_handlers() -> None:
+    refused: list[BaseException] = []
+
+    def enter() -> None:
+        try:
+            with StopSignal():
+                pass
+        except ValueError as exc:
+            refused.append(exc)
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert len(refused) == 1
