@@ -17,8 +17,11 @@ logger = logging.getLogger(__name__)
 PENDING_MAX = 2000
 """Steps that may wait for the event loop (40 s of one robot at 50 Hz); starts and ends always wait."""
 
-BURST = 5.0
-"""Steps that may follow one another at once after a pause, so that jitter of a steady loop loses none."""
+BURST = 25.0
+"""Steps that may follow one another at once after a pause: a steady loop that was held up loses none by catching up."""
+
+FIRST = 2.0
+"""Of these, what a loop has when it starts."""
 
 
 class Throttle:
@@ -32,7 +35,7 @@ class Throttle:
     def passes(self, key: str) -> bool:
         """True when one more may pass now."""
         now = self._clock()
-        tokens, since = self._tokens.get(key, (BURST, now))
+        tokens, since = self._tokens.get(key, (FIRST, now))
         tokens = min(BURST, tokens + (now - since) * self._hz)
         passing = tokens >= 1.0
         self._tokens[key] = (tokens - 1.0 if passing else tokens, now)

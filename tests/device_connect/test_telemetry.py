@@ -1,0 +1,139 @@
+"""From a robot's control thread to events: at their rate, in order, and nothing forgotten."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import threading
+import time
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from strands_robots.contract import RolloutEvent
+from strands_robots.device_connect import telemetry
+from strands_robots.device_connect.telemetry import BURST, RolloutPump, Throttle, paced
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def event(kind: str, step: int = 0, robot: str = "arm") -> RolloutEvent:
+    return RolloutEvent(kind, robot, "wave", "mock", step)  # type: ignore[arg-type]
+
+
+@given(st.lists(st.floats(0, 0.5), max_size=200), st.floats(1, 200))
+def test_no_more_pass_than_the_rate_and_one_burst(gaps: list[float], hz: float) -> None:
+    clock = Clock()
+    throttle = Throttle(hz, clock)
+    passed = 0
+    for gap in gaps:
+        clock.now += gap
+        passed += throttle.passes("arm")
+    assert passed <= BURST + clock.now * hz + 1
+
+
+def test_a_steady_loop_at_the_rate_loses_nothing_though_it_is_held_up() -> None:
+    clock = Clock()
+    throttle = Throttle(50.0, clock)
+    passed = 0
+    for step in range(1000):
+        due = step / 50
+        # Held up 0.3 s every 2 s, then catching up at once.
+        held = due >= 1 and due % 2 < 0.3
+        clock.now = max(clock.now, due if not held else due - due % 2 + 0.3)
+        passed += throttle.passes("arm")
+    assert passed == 1000
+
+
+def test_a_fast_loop_passes_at_the_rate_from_its_start() -> None:
+    clock = Clock()
+    throttle = Throttle(50.0, clock)
+    passed = 0
+    for step in range(1000):
+        clock.now = step / 1000
+        passed += throttle.passes("arm")
+    assert 50 <= passed <= 53
+
+
+async def test_starts_and_ends_are_never_dropped_however_far_behind_the_loop_is() -> None:
+    told: list[RolloutEvent] = []
+
+    over = asyncio.Event()
+
+    async def deliver(each: RolloutEvent) -> None:
+        told.append(each)
+        if each.kind == "finished":
+            over.set()
+
+    pump = RolloutPump(deliver, 1e9)
+
+    def robot() -> None:
+        for number in range(telemetry.PENDING_MAX * 2):
+            pump.observe(event("step", number))
+        pump.observe(event("finished"))
+
+    thread = threading.Thread(target=robot)
+    thread.start()
+    thread.join()
+    running = asyncio.create_task(pump.run())
+    await over.wait()
+    running.cancel()
+    steps = [each.step for each in told if each.kind == "step"]
+    assert steps == list(range(telemetry.PENDING_MAX))
+
+
+async def test_robots_do_not_take_each_others_rate() -> None:
+    pump = RolloutPump(_nothing, 50.0)
+    for number in range(100):
+        pump.observe(event("step", number, robot=f"arm-{number}"))
+    assert len(pump._waiting) == 100
+
+
+def test_an_observer_never_raises_after_the_loop_is_gone() -> None:
+    async def make() -> RolloutPump:
+        return RolloutPump(_nothing, 50.0)
+
+    asyncio.run(make()).observe(event("started"))
+
+
+async def test_a_beat_is_kept_and_missed_beats_are_not_made_up_for() -> None:
+    beats: list[float] = []
+
+    async def act() -> None:
+        beats.append(time.monotonic())
+        if len(beats) == 5:
+            await asyncio.sleep(0.2)
+
+    task = asyncio.create_task(paced(lambda: 50.0, act))
+    await asyncio.sleep(0.6)
+    task.cancel()
+    assert 15 <= len(beats) <= 24
+    assert min(b - a for a, b in itertools.pairwise(beats)) > 0.005
+
+
+async def test_a_wake_comes_at_once_and_a_cancel_is_never_forgotten() -> None:
+    beats = 0
+
+    async def act() -> None:
+        nonlocal beats
+        beats += 1
+
+    wake = asyncio.Event()
+    task = asyncio.create_task(paced(lambda: 0.1, act, wake))
+    await asyncio.sleep(0.01)
+    wake.set()
+    await asyncio.sleep(0.01)
+    assert beats == 2
+    wake.set()
+    task.cancel()
+    await asyncio.wait({task}, timeout=1)
+    assert task.done()
+
+
+async def _nothing(each: RolloutEvent) -> None:
+    """Deliver nowhere."""
