@@ -368,3 +368,33 @@ async def test_any_object_with_the_four_verbs_is_a_robot() -> None:
 def test_an_object_that_is_no_robot_is_refused_by_what_it_lacks() -> None:
     with pytest.raises(ValidationError, match="start_task"):
         RobotDeviceDriver(object())
+
+
+async def test_a_foreign_robot_that_tells_nothing_has_its_tasks_told_all_the_same() -> None:
+    class Mute:
+        tool_name_str = "mute"
+        status = "idle"
+
+        def start_task(self, instruction: str, **_: Any) -> Any:
+            self.status = "running"
+            return success("started")
+
+        def stop_task(self) -> Any:
+            self.status = "stopped"
+            return success("stopped", stopped=True)
+
+        def get_task_status(self) -> Any:
+            return {"task_status": self.status, "instruction": "wave", "step_count": 4}
+
+        def get_features(self) -> Any:
+            return {}
+
+    async with DriverBench(drive(Mute())) as bench:
+        await bench.call("execute", instruction="wave")
+        await bench.until(lambda: bench.of("taskStarted"))
+        await bench.call("stop")
+        await bench.until(lambda: bench.of("taskComplete"))
+        assert bench.of("taskStarted")[0]["policy_provider"] == "mock"
+        done = bench.of("taskComplete")[0]
+        assert (done["instruction"], done["steps"], done["state"]) == ("wave", 4, "stopped")
+        assert len(bench.of("taskStarted")) == len(bench.of("taskComplete")) == 1

@@ -243,6 +243,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             self.robot.gate.revoke()
             raise
         logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb, shown(caller))
+        self.changed.set()
         return answer
 
     def _start(self, verb: str, call: Call) -> object:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any, ClassVar
 
 from device_connect_edge.types import DeviceIdentity
 
-from strands_robots.contract import RolloutEvent, adapt
+from strands_robots.contract import AdaptedRobot, RolloutEvent, adapt
 from strands_robots.device_connect.base_driver import Activity, Call, RobotDriver
 from strands_robots.device_connect.declare import Labels, emit, on, rpc
 from strands_robots.device_connect.wire import numbers, record
@@ -55,6 +56,10 @@ class RobotDeviceDriver(RobotDriver):
         super().__init__(task_robot, hardware=hardware, authorization=authorization, approval=approval)
         self.task_robot = task_robot
         self._model = task_robot.tool_name_str
+        wrapped = task_robot.wrapped if isinstance(task_robot, AdaptedRobot) else task_robot
+        self._tells = callable(getattr(wrapped, "subscribe", None))
+        self._provider = ""
+        self._began: float | None = None
 
     @property
     def identity(self) -> DeviceIdentity:
@@ -82,6 +87,7 @@ class RobotDeviceDriver(RobotDriver):
         def prepare() -> Call:
             what, provider, seconds = task_arguments(self.authorization, instruction, policy_provider, duration)
             port = whole("policy_port", policy_port, low=0, high=65535)
+            self._provider = provider
             return lambda: self.task_robot.start_task(
                 what, policy_provider=provider, duration=seconds, policy_port=port
             )
@@ -176,8 +182,22 @@ class RobotDeviceDriver(RobotDriver):
         return Activity(state in RUNNING, told)
 
     async def tell(self, activity: Activity) -> None:
-        """Emit ``stateUpdate``."""
+        """Emit ``stateUpdate``, and the start and end of a task that a foreign robot does not tell by itself."""
+        if not self._tells:
+            await self._tell_change(activity)
         await self.stateUpdate(**activity.facts)
+
+    async def _tell_change(self, activity: Activity) -> None:
+        instruction = activity.facts["instruction"]
+        if activity.busy and self._began is None:
+            self._began = time.monotonic()
+            await self.taskStarted(instruction=instruction, policy_provider=self._provider)
+        elif not activity.busy and self._began is not None:
+            duration, self._began = time.monotonic() - self._began, None
+            state = activity.facts["task_status"]
+            await self.taskComplete(
+                instruction=instruction, steps=activity.facts["step_count"], duration=duration, state=state
+            )
 
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit ``taskStarted``, ``streamStep`` or ``taskComplete``."""
