@@ -24,6 +24,7 @@ PARTS = {
     "simulation": "Physics",
     "safety": "From the controller's call to the last write",
     "reachy": "Reachy Mini",
+    "mesh": "The native mesh beside bare Zenoh",
 }
 
 

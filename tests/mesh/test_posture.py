@@ -26,7 +26,7 @@ def test_without_any_setting_the_mesh_stays_on_loopback_without_certificates() -
     assert config["namespace"] == "strands"
     assert config["adminspace"]["enabled"] is False
     assert config["transport"]["unicast"]["max_sessions"] == 256
-    limits = {rule["key_exprs"][0]: rule["size_limit"] for rule in config["low_pass_filter"]}
+    limits = {key: rule["size_limit"] for rule in config["low_pass_filter"] for key in rule["key_exprs"]}
     assert limits["strands/strands/*/cmd"] == 16 * 1024
     assert limits["strands/strands/safety/estop"] == 4 * 1024
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
 from tests.mesh.peers import Clock, Fleet
 
 from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
@@ -133,7 +134,7 @@ def test_subscriptions_deliver_objects_and_end_with_the_stay(peers: Fleet) -> No
     assert name == "all"
     assert one.subscribe("strands/two/note") == "strands/two/note"
     two.publish("strands/two/note", {"x": 1})
-    peers.meshes[0].ping("two")
+    eventually(lambda: one.inbox["strands/two/note"], within=2)
     assert ("strands/two/note", {"x": 1}, peers.transports["two"].session_id) in heard
     assert one.inbox["strands/two/note"][0]["x"] == 1
     one.unsubscribe("all")

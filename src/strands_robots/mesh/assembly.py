@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PRUNE_HZ = 1.0
+TOKENS_HZ = 5.0
 DESCRIBE_S = 0.2
 
 
@@ -107,6 +108,7 @@ class Assembled:
         self.sensors = self.mesh.add_robot_sensors() if self.mesh.robot is not None else []
         every("describe", rates["presence"].rate_hz, self.herald.refresh)
         every("state", rates["state"].rate_hz, self._publish_state)
+        every("tokens", TOKENS_HZ, self.herald.judge_tokens, quick=True)
         every("prune", PRUNE_HZ, self._prune, quick=True)
         frames = camera.frames_of(self.mesh.robot)
         if frames is not None:

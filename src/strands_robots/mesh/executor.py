@@ -1,4 +1,4 @@
-"""Bounded work: commands on a few workers, ``stop`` and ``ping`` each on one of their own."""
+"""Bounded work: commands on a few workers, stops on one of their own, fleet stops on another."""
 
 from __future__ import annotations
 
@@ -95,28 +95,24 @@ class Lane:
 
 
 class Lanes:
-    """The lanes of one peer: ``commands`` (4 workers, 32 waiting), ``stop``, ``ping``, ``safety`` and ``delivery``."""
+    """The lanes of one peer: commands (4 workers, 32 waiting), stops, the safety topics, and delivery to its user."""
 
     def __init__(self, peer_id: str) -> None:
         self.safety = Lane(f"{peer_id}-safety", 1, 256)
         self.stop_lane = Lane(f"{peer_id}-stop", 1, 64)
-        self.ping = Lane(f"{peer_id}-ping", 1, 256)
         self.commands = Lane(f"{peer_id}-command", 4, 32)
         self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)
 
     def of(self, action: object) -> Lane:
         """The lane an action runs on."""
-        if action == "stop":
-            return self.stop_lane
-        return self.ping if action == "ping" else self.commands
+        return self.stop_lane if action == "stop" else self.commands
 
     def start(self) -> None:
         self.safety.start()
-        self.stop_lane.start()
 
     def stop(self, timeout: float) -> list[str]:
         deadline = time.monotonic() + timeout
         alive: list[str] = []
-        for lane in (self.commands, self.ping, self.delivery, self.stop_lane, self.safety):
+        for lane in (self.commands, self.delivery, self.stop_lane, self.safety):
             alive += lane.stop(max(0.0, deadline - time.monotonic()))
         return alive

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +16,10 @@ from strands_robots.mesh.transport.base import LiveTransport, Sample, Subscripti
 from strands_robots.mesh.wire_identity import IdentityError
 
 logger = logging.getLogger(__name__)
+
+TOKEN_PATIENCE_S = 0.3
+SAME_LOSS_S = 0.5
+LEAVING_MAX = 4096
 
 
 class Herald:
@@ -32,6 +37,8 @@ class Herald:
         self._facts: dict[str, Any] = {}
         self._trouble = ""
         self.described = threading.Event()
+        self._leaving: dict[tuple[str, str], float] = {}
+        self._judged_later = False
         self._held: list[Subscription] = []
         self._host = socket.gethostname()
 
@@ -44,6 +51,8 @@ class Herald:
         session = transport.session_id
         if isinstance(transport, LiveTransport) and session is not None:
             self._held.append(transport.declare_token(topics.token(self._context.peer_id, session)))
+            # Where a link can be lost, its loss and that of the tokens come in any order.
+            self._judged_later = hasattr(transport, "lost_link_at")
             self._held.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
 
     def stop(self) -> None:
@@ -113,17 +122,34 @@ class Herald:
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
 
     def on_token(self, key: str, there: bool) -> None:
-        """A liveliness token came or went. Its going means that the session ended, if our own link holds."""
+        """A liveliness token came or went; one that went is judged a moment later, by :meth:`judge_tokens`."""
         parts = key.split("/")
-        if there or len(parts) != 4:
+        if len(parts) != 4 or parts[1] == self._context.peer_id:
             return
-        peer, session = parts[1], parts[3]
-        anchored = getattr(self._context.transport, "anchored", None)
-        if peer == self._context.peer_id or (callable(anchored) and not anchored()):
-            # Without a hub every token goes at once, and none of the sessions need have ended.
-            return
-        if self._context.registry.lost(peer, session):
-            logger.info("%s left.", peer)
+        mark = (parts[1], parts[3])
+        if there:
+            self._leaving.pop(mark, None)
+        elif len(self._leaving) < LEAVING_MAX:
+            self._leaving[mark] = time.monotonic()
+            if not self._judged_later:
+                self.judge_tokens(0.0)
+
+    def judge_tokens(self, patience: float = TOKEN_PATIENCE_S) -> None:
+        """Take a peer whose token went for gone, unless it went because our own link did.
+
+        When a hub dies every token goes at once, and none of the sessions need have ended.
+        """
+        now, transport = time.monotonic(), self._context.transport
+        anchored, lost_link = getattr(transport, "anchored", None), getattr(transport, "lost_link_at", None)
+        for mark, went in list(self._leaving.items()):
+            if now - went < patience:
+                continue
+            self._leaving.pop(mark, None)
+            ours = isinstance(lost_link, float) and abs(went - lost_link) < SAME_LOSS_S
+            if ours or (callable(anchored) and not anchored()):
+                continue
+            if self._context.registry.lost(*mark):
+                logger.info("%s left.", mark[0])
 
     def _impostor(self, sample: Sample) -> None:
         ours = self._context.session_id()

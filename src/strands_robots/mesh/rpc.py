@@ -14,7 +14,7 @@ from strands_robots.mesh import topics, wire
 from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.security import validate_command
-from strands_robots.mesh.transport.base import ConfirmingTransport, Sample, TransportError
+from strands_robots.mesh.transport.base import PutConfirmed, Sample, TransportError
 from strands_robots.utils import ValidationError, number, shown
 
 logger = logging.getLogger(__name__)
@@ -24,6 +24,7 @@ BROADCAST_RESPONDER = "\x00broadcast"
 """Expected responder of a broadcast; the NUL keeps it apart from every peer id."""
 
 REPLIES_MAX = 4096
+REPEAT_S = 0.5
 
 Refusal = dict[str, Any]
 
@@ -84,12 +85,13 @@ class Caller:
         return {"status": "ok", "latency_ms": latency, "via": via, "confirmed": via == "direct"}
 
     def broadcast(
-        self, command: object, timeout: object, expect: Callable[[list[dict[str, Any]]], bool] | None = None
+        self, command: object, timeout: object, missing: Callable[[list[dict[str, Any]]], set[str]] | None = None
     ) -> list[dict[str, Any]]:
         """Every reply that came within ``timeout``; ``[]`` for a refused precondition.
 
         Args:
-            expect: ends the collection early when it finds the replies complete.
+            missing: the peers still to answer. The collection ends when there is none, and until then the command
+                is sent to each of them again twice a second.
         """
         prepared = self._prepare("all", command, timeout)
         if isinstance(prepared, str):
@@ -102,21 +104,38 @@ class Caller:
             if problem is not None:
                 logger.warning("broadcast: %s", problem)
                 return []
-            deadline = time.monotonic() + seconds
-            while (left := deadline - time.monotonic()) > 0:
-                if expect is None:
-                    turn.over.wait(left)
-                    break
-                turn.done.wait(left)
-                with self._lock:
-                    turn.done.clear()
-                    replies = list(turn.replies)
-                if turn.over.is_set() or expect(replies):
-                    break
+            if missing is None:
+                turn.over.wait(seconds)
+            else:
+                self._collect(turn, turn_id, clean, seconds, missing)
             with self._lock:
                 return list(turn.replies)
         finally:
             self._close(turn_id)
+
+    def _collect(
+        self,
+        turn: Turn,
+        turn_id: str,
+        command: dict[str, Any],
+        seconds: float,
+        missing: Callable[[list[dict[str, Any]]], set[str]],
+    ) -> None:
+        now = time.monotonic()
+        deadline, again = now + seconds, now + REPEAT_S
+        while now < deadline and not turn.over.is_set():
+            turn.done.wait(min(deadline, again) - now)
+            with self._lock:
+                turn.done.clear()
+                replies = list(turn.replies)
+            absent = missing(replies)
+            if not absent:
+                return
+            now = time.monotonic()
+            if now >= again:
+                again = now + REPEAT_S
+                for peer in absent:
+                    self._publish(topics.command(peer), command, turn_id, turn)
 
     def on_response(self, sample: Sample) -> None:
         """A sample on our response topic: counted, or refused and audited."""
@@ -189,20 +208,19 @@ class Caller:
 
     def _confirms(self, target: object) -> bool:
         """Whether this target's commands go by a transport that tells if anybody takes them."""
-        transport: object = self._context.transport
-        return isinstance(transport, ConfirmingTransport) and isinstance(target, str)
+        return callable(getattr(self._context.transport, "put_confirmed", None)) and isinstance(target, str)
 
     def _publish(
         self, key: str, command: dict[str, Any], turn_id: str, turn: Turn, seconds: float | None = None
     ) -> str | None:
         context = self._context
         request = wire.Request(context.peer_id, turn_id, command, context.clock())
-        transport: object = context.transport
+        confirmed: PutConfirmed | None = getattr(context.transport, "put_confirmed", None)
         try:
             body = context.identity.sign(request.to_wire())
-            if seconds is not None and isinstance(transport, ConfirmingTransport):
+            if seconds is not None and confirmed is not None:
                 turn.via = "direct"
-                return None if transport.put_confirmed(key, body, seconds) is not False else OFFLINE
+                return None if confirmed(key, body, seconds) is not False else OFFLINE
             context.put(key, body)
         except (wire.WireError, TransportError) as exc:
             return str(exc)

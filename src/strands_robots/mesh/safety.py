@@ -14,9 +14,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from strands_robots.mesh import topics, wire
+from strands_robots.mesh import dispatch, topics, wire
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.dispatch import told
 from strands_robots.mesh.door import SafetyDoor
 from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.rpc import Caller
@@ -30,8 +29,8 @@ from strands_robots.utils import ValidationError, identifier
 logger = logging.getLogger(__name__)
 
 COLLECT_S = 3.0
-RESUME_SPACING_S = 0.55
-"""Between two relays: peers in the field let two a second through on this topic."""
+SPACING_S = 0.55
+"""Between two messages on a safety topic: peers in the field let two a second through."""
 
 RECENT_MAX = 512
 
@@ -73,14 +72,26 @@ class FleetSafety:
         # The fleet hears of it while the local robot is being halted, and the other way round.
         if not self._lane.submit(halt):
             halt()
-        self._publish_estop(order, {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0})
+        none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
+        self._publish_estop(order, none)
         roster = {row["peer_id"] for row in context.registry.all() if row["reachable"]} - {context.peer_id}
-        replies = self._caller.broadcast(
-            {"action": "stop"}, COLLECT_S, lambda have: roster <= {str(reply["responder_id"]) for reply in have}
-        )
+        told = time.monotonic()
+
+        def missing(have: list[dict[str, Any]]) -> set[str]:
+            nonlocal told
+            absent = roster - {str(reply["responder_id"]) for reply in have}
+            if absent and time.monotonic() - told >= SPACING_S:
+                # A link that was down when the stop was published may be back: the same stop again.
+                told = time.monotonic()
+                self._publish_estop(order, none)
+            return absent
+
+        replies = self._caller.broadcast({"action": "stop"}, COLLECT_S, missing)
         halted.wait(COLLECT_S)
         verdict = local[0] if local and local[0] is not None else StopVerdict(unknown={context.peer_id: "no answer"})
-        own = wire.Reply("response", context.peer_id, order.epoch, told(verdict), timestamp=context.clock()).to_wire()
+        own = wire.Reply(
+            "response", context.peer_id, order.epoch, dispatch.told(verdict), timestamp=context.clock()
+        ).to_wire()
         responses = [own, *replies]
         not_stopped = [str(each["responder_id"]) for each in responses if not _stopped(each)]
         silent = sorted(roster - {str(each["responder_id"]) for each in replies})
@@ -198,7 +209,7 @@ class FleetSafety:
                 if rejected is not None:
                     return {"status": "error", "error": rejected}
             if not first:
-                time.sleep(RESUME_SPACING_S)
+                time.sleep(SPACING_S)
             first = False
             self._relay(assertion)
         return {"status": "ok"}

@@ -150,9 +150,17 @@ def _covers(pattern: tuple[str, ...], key: tuple[str, ...]) -> bool:
     return all(part == "**" for part in pattern[at:])
 
 
-@lru_cache(maxsize=4096)
 def topic_of(key: str) -> Topic:
     """The row a key falls under; :data:`OTHER` where it is nobody's."""
+    # A reply's key is used once, so remembering it would only push the others out.
+    parts = key.split("/", 3)
+    if len(parts) > 2 and parts[0] == ROOT and parts[2] == "response":
+        return BY_NAME["response"]
+    return _topic_of(key)
+
+
+@lru_cache(maxsize=4096)
+def _topic_of(key: str) -> Topic:
     for topic in TABLE:
         if matches(topic.pattern, key):
             return topic

@@ -34,7 +34,7 @@ def encode(payload: Mapping[str, Any], limit: int) -> bytes:
         WireError: a value that JSON cannot hold.
     """
     try:
-        data = json.dumps(payload, allow_nan=False, separators=(",", ":")).encode()
+        data = _ENCODER.encode(payload).encode()
     except ValueError:
         data = _encode_finite(payload)
     except (TypeError, RecursionError) as exc:
@@ -53,7 +53,7 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
     if len(data) > limit:
         raise TooLargeError(f"a message of {len(data)} bytes is above the topic's {limit}.")
     try:
-        value = json.loads(data, parse_constant=_refuse_constant)
+        value = _DECODER.decode(data.decode())
     except (ValueError, RecursionError) as exc:
         raise WireError(f"not JSON: {type(exc).__name__}") from None
     if not isinstance(value, dict):
@@ -101,6 +101,11 @@ def _scrubbed(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_scrubbed(entry) for entry in value]
     return value
+
+
+# Made once: a coder with options is otherwise made anew for every message.
+_ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
+_DECODER = json.JSONDecoder(parse_constant=_refuse_constant)
 
 
 @dataclass(frozen=True, slots=True)

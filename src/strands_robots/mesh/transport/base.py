@@ -78,9 +78,8 @@ class LiveTransport(Protocol):
         """Hear tokens come and go, those that are there already included."""
 
 
-@runtime_checkable
-class ConfirmingTransport(Protocol):
-    """A transport that can tell whether a message has a taker."""
+PutConfirmed = Callable[[str, bytes | Mapping[str, Any], float], bool | None]
+"""``put_confirmed(key, payload, timeout)``, which a transport may have: publish, and tell if anybody hears the key.
 
-    def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
-        """Publish; True when somebody hears the key, False when nobody does, None when that is not known."""
+True: somebody does. False: nobody does. None: that is not known within ``timeout`` seconds.
+"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -120,6 +121,12 @@ class BridgeTransport:
     def watch_tokens(self, key: str, callback: LivenessCallback) -> Subscription:
         watch: Callable[[str, LivenessCallback], Subscription] = getattr(self._local, "watch_tokens", _nothing)
         return watch(key, callback) if self._local.is_alive() else _Both([])
+
+    @property
+    def lost_link_at(self) -> float:
+        """When the local leg last lost its hub, monotonic seconds."""
+        at: float = getattr(self._local, "lost_link_at", -math.inf)
+        return at
 
     def anchored(self) -> bool:
         """Whether the local leg can tell who is alive."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import secrets
 import threading
 import time
@@ -44,6 +45,7 @@ class ZenohTransport:
         self._zenoh: Any = None
         self._links: Any = None
         self._hub = False
+        self.lost_link_at = -math.inf
         self._numbers = count()
         self._publishers: dict[str, tuple[Any, Any]] = {}
         self._closing = threading.Event()
@@ -127,6 +129,9 @@ class ZenohTransport:
         if len(data) > topic.max_bytes:
             raise wire.TooLargeError(f"{key}: a message of {len(data)} bytes is above the topic's {topic.max_bytes}.")
         try:
+            if topic.name == "response":
+                self._put_once(key, data)
+                return
             publisher, source = self._publishers.get(key) or self._publisher(key, topic)
             publisher.put(data, source_info=self._zenoh.SourceInfo(source, next(self._numbers) & 0xFFFFFFFF))
         except self.errors() as exc:
@@ -182,6 +187,18 @@ class ZenohTransport:
         except self.errors() as exc:
             raise TransportError(f"{key}: {exc}") from None
 
+    def _put_once(self, key: str, data: bytes) -> None:
+        """Publish on a key that is used once, such as a reply's: a publisher would be declared for nothing."""
+        zenoh, session = self._zenoh, self._require()
+        session.put(
+            key,
+            data,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=True,
+            source_info=zenoh.SourceInfo(session.id, next(self._numbers) & 0xFFFFFFFF),
+        )
+
     def _publisher(self, key: str, topic: topics.Topic) -> tuple[Any, Any]:
         zenoh = self._zenoh
         session = self._require()
@@ -228,6 +245,7 @@ class ZenohTransport:
     def _watch_hub(self, session: Any) -> None:
         def changed(event: Any) -> None:
             if event.kind != self._zenoh.SampleKind.PUT and not self._closing.is_set():
+                self.lost_link_at = time.monotonic()
                 threading.Thread(target=self._rescue, name="mesh-rescue", daemon=True).start()
 
         direct = self._zenoh.handlers.Callback(changed, indirect=False)

@@ -17,6 +17,7 @@ from strands_robots.mesh.transport.posture import Posture
 
 RETRY_MS = 250
 LEASE_MS = 4000
+WAIT_BEFORE_DROP_US = 10_000
 HOW_TO_ACL = "STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"
 
 
@@ -57,7 +58,12 @@ _RETRY = {"period_init_ms": RETRY_MS, "period_max_ms": RETRY_MS, "period_increas
 
 def _base(posture: Posture, session: str | None) -> dict[str, Any]:
     prefix = f"{posture.namespace}/" if posture.namespace else ""
-    link: dict[str, Any] = {"tx": {"lease": LEASE_MS}}
+    # A burst of replies or stops must find room: Zenoh's own queues hold two batches and wait one millisecond.
+    queue = {
+        "size": {"real_time": 16, "interactive_high": 16, "data": 16},
+        "congestion_control": {"drop": {"wait_before_drop": WAIT_BEFORE_DROP_US}},
+    }
+    link: dict[str, Any] = {"tx": {"lease": LEASE_MS, "queue": queue}}
     config: dict[str, Any] = {
         "scouting": {
             "multicast": {"enabled": posture.multicast},
@@ -152,13 +158,15 @@ def _downsampling(prefix: str) -> list[dict[str, Any]]:
 
 
 def _low_pass(prefix: str) -> list[dict[str, Any]]:
+    # One rule a size, on the way in: each rule costs every message time, and our own are measured before they leave.
+    sizes = sorted({topic.max_bytes for topic in topics.TABLE})
     return [
         {
-            "id": f"size-{topic.name}",
-            "flows": ["ingress", "egress"],
+            "id": f"size-{size}",
+            "flows": ["ingress"],
             "messages": ["put"],
-            "key_exprs": [f"{prefix}{topic.pattern}"],
-            "size_limit": topic.max_bytes,
+            "key_exprs": [f"{prefix}{topic.pattern}" for topic in topics.TABLE if topic.max_bytes == size],
+            "size_limit": size,
         }
-        for topic in topics.TABLE
+        for size in sizes
     ]
