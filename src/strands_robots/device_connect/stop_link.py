@@ -37,10 +37,25 @@ def stop_link(link: LinkConfig) -> StopLink:
 
 
 def _apart(link: LinkConfig) -> LinkConfig:
-    """``link`` without its meeting port: the lane joins the others there and never hosts them."""
-    if link.meeting_point is None:
+    """``link`` without what one session alone can have: the meeting port, and ports that are listened on.
+
+    The lane joins the others there and listens on ports of its own, of which they learn by gossip.
+    """
+    if not link.is_peer or not (link.meeting_point or link.listen):
         return link
-    return replace(link, mode="peer", meet_port=None, connect=(*link.connect, link.meeting_point), multicast=False)
+    joined = [*link.connect, *(_from_here(endpoint) for endpoint in link.listen)]
+    joined += [link.meeting_point] if link.meeting_point else []
+    own = tuple(f"{endpoint.rpartition(':')[0]}:0" for endpoint in link.listen)
+    multicast = False if link.meeting_point else link.multicast
+    return replace(link, mode="peer", meet_port=None, connect=tuple(joined), listen=own, multicast=multicast)
+
+
+def _from_here(endpoint: str) -> str:
+    """How this machine itself dials what it listens on; the certificate is checked, its name cannot be."""
+    host, _, port = endpoint.rpartition(":")
+    scheme, _, name = host.partition("/")
+    near = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}.get(name, name)
+    return f"{scheme}/{near}:{port}" + ("#verify_name_on_connect=false" if scheme == "tls" else "")
 
 
 class _State:

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.certificates import Authority, Identity
+from fixtures.nats_server import NatsServer
 from fixtures.waiting import eventually, free_port
 
 from strands_robots import settings
@@ -195,3 +197,39 @@ def test_doctor_renders_in_a_process_of_its_own(shell: Shell) -> None:
     found = {each["name"]: each for each in said["checks"]}
     assert code == 0
     assert found["rendering"]["mark"] == "ok" or found["rendering"]["remedy"]
+
+
+def test_an_arm_is_served_and_stopped_over_a_broker(shell: Shell) -> None:
+    with NatsServer() as server:
+        there = ("--nats", server.url)
+        served = shell.start("serve", "so100", "--peer-id", "arm-5", "--json", *there)
+        try:
+            assert served.stdout is not None
+            assert json.loads(served.stdout.readline())["event"] == "serving"
+            assert [peer["id"] for peer in shell.json("peers", *there)[1]["peers"]] == ["arm-5"]
+            assert shell.json("call", "arm-5", "execute", "instruction=wave", *there)[0] == 0
+            assert shell.json("stop", "--all", *there)[0] == 0
+        finally:
+            served.terminate()
+            served.communicate(timeout=WITHIN_S)
+
+
+def test_certificates_are_the_way_out_of_this_machine(shell: Shell, tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    arm, operator = authority.issue("arm"), authority.issue("operator")
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    served = shell.start("serve", "so100", "--peer-id", "arm-6", "--json", "--listen", endpoint, *tls(arm))
+    try:
+        assert served.stdout is not None
+        ready = json.loads(served.stdout.readline())
+        assert "both sides prove who they are" in ready.get("network", ""), ready
+        assert shell.json("stop", "arm-6", "--connect", endpoint, *tls(operator))[0] == 0
+        stranger = Authority(tmp_path, "stranger").issue("stranger")
+        assert shell.json("peers", "--connect", endpoint, *tls(stranger))[0] == 3
+    finally:
+        served.terminate()
+        served.communicate(timeout=WITHIN_S)
+
+
+def tls(who: Identity) -> tuple[str, ...]:
+    return ("--tls-ca", str(who.ca), "--tls-cert", str(who.cert), "--tls-key", str(who.key))
