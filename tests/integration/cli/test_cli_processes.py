@@ -122,6 +122,16 @@ def test_events_are_told_one_json_value_a_line(shell: Shell, arm: dict[str, Any]
     assert {"observationUpdate"} <= {event["event"] for event in events}
 
 
+def test_ctrl_c_ends_a_watch_with_130(shell: Shell, arm: dict[str, Any]) -> None:
+    watching = shell.start("watch", "arm-1", "--json")
+    assert watching.stdout is not None
+    assert json.loads(watching.stdout.readline())["device"] == "arm-1"
+    watching.send_signal(signal.SIGINT)
+    _, complaints = watching.communicate(timeout=WITHIN_S)
+    assert watching.returncode == 130
+    assert "Traceback" not in complaints
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)], ids=["Ctrl-C", "SIGTERM"])
 def test_a_signal_stops_the_robot_first_and_leaves_no_ghost(shell: Shell, number: signal.Signals, code: int) -> None:
     served = shell.start("serve", "so100", "--peer-id", "arm-2", "--json")

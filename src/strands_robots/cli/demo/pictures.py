@@ -13,7 +13,7 @@ from strands_robots.utils import ValidationError
 
 POSES_A_SECOND = 32.0
 POSES_A_FRAME = 4
-FRAMES_MOST = 48
+FRAMES_MOST = 40
 SIZE = (360, 270)
 """Pixels of the animation; it stays below a megabyte."""
 
