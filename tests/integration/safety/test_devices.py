@@ -82,8 +82,9 @@ class Floor:
         ]
         self.agent = FleetClient(link, "tester").__enter__()
         self.controller: SafetyController = safety_controller("safety-1", link)
-        assert self.controller.wait_link(10)
-        eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
+
+    def ready(self) -> bool:
+        return self.controller.link_up and all(seat.link.up for seat in lane().seats)
 
     def move(self) -> None:
         for device in ("sim-1", "arm-1"):
@@ -103,8 +104,11 @@ def floor(link: LinkConfig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Floor]:
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
     monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "execute")
     made = Floor(link)
-    yield made
-    made.close()
+    try:
+        eventually(made.ready, within=15)
+        yield made
+    finally:
+        made.close()
     assert lane().seats == ()
     assert plane().robots == {}
 
