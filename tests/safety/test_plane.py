@@ -19,6 +19,7 @@ from strands_robots.safety.orders import RobotReport, StopOrder, derived_epoch, 
 from strands_robots.safety.persistence import LockoutStore, hardware_key
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.resume import sign
+from strands_robots.safety.stopping import stop_level
 from strands_robots.utils import ValidationError
 
 Add = Callable[..., RecordingRobot]
@@ -283,6 +284,22 @@ def test_a_slip_laid_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane
     assert list(clearance.clearances().iterdir()) == []
 
 
+def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_says_of_a_third_that_it_is_free(
+    plane: SafetyPlane, add: Add
+) -> None:
+    running = add("arm-1", key="k1")
+    add("arm-2", key="k2")
+    plane.emergency_stop(order())
+    plane.robots["arm-2"].close()
+    outcome = clearance.clear_here("ann", ["arm-1", "arm-2", "arm-3"], wait_s=1.0)
+    assert outcome == {"arm-1": "cleared", "arm-2": "cleared on disk", "arm-3": "not locked here"}
+    assert not running.refuses()
+    after = add("arm-2", key="k2")
+    assert not after.refuses()
+    cleared = [each for each in read_audit_log() if each["event"] == "resume_local"]
+    assert {each["peer_id"] for each in cleared} == {"arm-1", "arm-2"}
+
+
 def test_a_slip_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:
     robot = add()
     plane.emergency_stop(order())
@@ -290,6 +307,12 @@ def test_a_slip_directory_that_others_may_write_is_not_read(plane: SafetyPlane, 
     clearance.clearances().chmod(0o777)
     time.sleep(0.6)
     assert robot.refuses()
+
+
+@pytest.mark.parametrize(("word", "level"), [("", "hold"), ("hold", "hold"), ("LIMP", "limp"), ("off", "hold")])
+def test_the_stop_level_is_hold_unless_limp_was_chosen(monkeypatch: pytest.MonkeyPatch, word: str, level: str) -> None:
+    monkeypatch.setenv("STRANDS_ESTOP_TORQUE", word)
+    assert stop_level() == level
 
 
 def test_the_name_of_another_robot_is_refused_and_the_same_robot_is_shared(plane: SafetyPlane, add: Add) -> None:

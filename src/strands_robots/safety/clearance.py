@@ -14,10 +14,14 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from strands_robots.audit import flush_audit, log_safety_event
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.lockout import LockoutState
+from strands_robots.safety.persistence import LockoutStore
 from strands_robots.utils import identifier, text
 
 logger = logging.getLogger(__name__)
@@ -42,6 +46,44 @@ def lay(who: str, robot_ids: Iterable[str]) -> list[Path]:
     directory = clearances()
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     return [_lay(directory, {"who": who, "robot_id": name, "t": time.time()}) for name in names]
+
+
+def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[str, str]:
+    """Clear robots of this machine at the word of ``who``, whether their process runs or not.
+
+    Returns, for each name: ``cleared`` by its running process, ``cleared on disk`` where none runs, or ``not locked
+    here``. Recorded in the audit either way.
+
+    Raises:
+        ValidationError: ``who`` is blank, or a name is no identifier.
+        OSError, ValueError: the state directory or the lockout file cannot be used.
+    """
+    names = list(dict.fromkeys(robot_ids))
+    slips = dict(zip(names, lay(who, names), strict=True))
+    deadline = time.monotonic() + wait_s
+    while any(path.exists() for path in slips.values()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    outcome: dict[str, str] = {}
+    for name, path in slips.items():
+        try:
+            path.unlink()
+        except FileNotFoundError:
+            outcome[name] = "cleared"
+        else:
+            outcome[name] = "cleared on disk" if _clear_on_disk(who, name) else "not locked here"
+    return outcome
+
+
+def _clear_on_disk(who: str, name: str) -> bool:
+    store = LockoutStore()
+    locked = {key: kept for key, kept in store.load_all().items() if kept.name == name and kept.state.locked}
+    if not locked:
+        return False
+    store.save({key: replace(kept, state=LockoutState()) for key, kept in locked.items()})
+    for kept in locked.values():
+        log_safety_event("resume_local", name, {"who": who, "epochs": list(kept.state.epochs), "persisted": True})
+    flush_audit()
+    return True
 
 
 def _lay(directory: Path, slip: dict[str, Any]) -> Path:

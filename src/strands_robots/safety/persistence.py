@@ -31,10 +31,11 @@ FILE_MAX_BYTES = 16 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What a robot comes up with: its holds, and the ids of stops that it has seen."""
+    """What a robot comes up with: its holds, the ids of stops it has seen, and the name it had on its network."""
 
     state: LockoutState = field(default_factory=LockoutState)
     seen: tuple[str, ...] = ()
+    name: str = ""
 
 
 def hardware_key(kind: str, stable_id: str) -> str:
@@ -111,8 +112,12 @@ class LockoutStore:
 
 
 def _record(kept: Kept) -> dict[str, Any]:
-    overflow = asdict(kept.state.overflow) if kept.state.overflow else None
-    return {"holds": [asdict(hold) for hold in kept.state.holds], "overflow": overflow, "seen": list(kept.seen)}
+    return {
+        "name": kept.name,
+        "holds": [asdict(hold) for hold in kept.state.holds],
+        "overflow": asdict(kept.state.overflow) if kept.state.overflow else None,
+        "seen": list(kept.seen),
+    }
 
 
 def _kept(record: Mapping[str, Any]) -> Kept:
@@ -121,7 +126,7 @@ def _kept(record: Mapping[str, Any]) -> Kept:
     if len(holds) > MAX_EPOCHS or len({hold.epoch for hold in holds}) != len(holds):
         raise ValueError("more epochs than a robot holds, or one of them twice")
     seen = tuple(each for each in record["seen"] if is_epoch(each))
-    return Kept(LockoutState(holds, overflow), seen)
+    return Kept(LockoutState(holds, overflow), seen, str(record.get("name", "")))
 
 
 def _hold(data: Mapping[str, Any]) -> Hold:

@@ -271,7 +271,9 @@ class SafetyPlane:
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.
         with self._keeping:
-            records = {entry.key: Kept(entry.latch.state, entry.latch.seen) for entry in entries if entry.key}
+            records = {
+                entry.key: Kept(entry.latch.state, entry.latch.seen, entry.wire_id) for entry in entries if entry.key
+            }
             if records:
                 self.store.save(records)
 

@@ -7,13 +7,18 @@ a timeout and a shape nobody knows are four different answers, and only an affir
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Literal
 
+from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.utils import shown
+
+logger = logging.getLogger(__name__)
 
 
 class Outcome(Enum):
@@ -68,6 +73,19 @@ class StopVerdict:
         doubts = [f"{name} did not stop: {why}" for name, why in self.not_stopped.items()]
         doubts += [f"{name}: {why}" for name, why in self.unknown.items()]
         return error("; ".join(doubts), **fields)
+
+
+def stop_level() -> Literal["hold", "limp"]:
+    """What a halt does to torque: ``hold`` keeps it on, so that an arm does not fall; ``limp`` takes it off.
+
+    ``STRANDS_ESTOP_TORQUE``; a word that is neither is ``hold``, with one line in the log.
+    """
+    word = settings.raw("STRANDS_ESTOP_TORQUE").lower()
+    if word == "limp":
+        return "limp"
+    if word != "hold":
+        logger.warning("STRANDS_ESTOP_TORQUE=%s is neither hold nor limp; hold is used.", shown(word))
+    return "hold"
 
 
 def grade(answer: object) -> Outcome:
