@@ -21,7 +21,7 @@ test: venv  ## Everything that needs nothing but wheels
 	@$(BIN)/python -m pytest -m "not system" $(ARGS)
 
 system:
-	@./scripts/system-packages.sh $(GL_PACKAGES)
+	@./scripts/system-packages.sh $(GL_PACKAGES) mosquitto
 	@./scripts/reachy-daemon.sh 1.13.0
 	@./scripts/reachy-daemon.sh 1.4.1
 

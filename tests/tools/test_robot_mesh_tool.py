@@ -2,11 +2,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from fixtures.mesh_robots import Arm, World
 
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.mesh import init_mesh
+from strands_robots.mesh.session import clear_peers
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.networks import DeviceConnect, NativeMesh, verdict_of
 
@@ -114,13 +118,51 @@ def test_only_affirmative_answers_are_a_stop() -> None:
 
 
 @pytest.mark.parametrize("word", ["off", "OFF", "0", "false"])
-def test_with_device_connect_off_the_native_mesh_answers_for_itself(monkeypatch: pytest.MonkeyPatch, word: str) -> None:
+def test_with_device_connect_off_the_native_mesh_is_used(monkeypatch: pytest.MonkeyPatch, word: str) -> None:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", word)
     assert isinstance(networks.network(), NativeMesh)
+
+
+@pytest.fixture
+def on_the_mesh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
+    monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
+    monkeypatch.setattr(networks, "HEAR_S", 0.05)
+    clear_peers()
+    yield
+    clear_peers()
+
+
+def test_on_a_mesh_without_robots_everything_is_an_error(on_the_mesh: None) -> None:
     for asked in ({"action": "peers"}, {"action": "stop"}, {"action": "emergency_stop"}):
-        answer = robot_mesh(**asked)
-        assert answer["status"] == "error"
-        assert "native mesh" in answer["reason"]
+        assert robot_mesh(**asked)["status"] == "error"
+
+
+def test_a_kill_switch_says_that_the_mesh_is_off(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH", "false")
+    answer = robot_mesh(action="stop")
+    assert "native mesh is off" in answer["reason"]
+    assert answer["stopped"] is None
+
+
+def test_robots_on_the_mesh_are_found_told_and_stopped_by_name(on_the_mesh: None) -> None:
+    left, stuck = World("left"), Arm("stuck", stops=False)
+    meshes = [init_mesh(left, "sim-1", "sim"), init_mesh(stuck, "arm-1")]
+    try:
+        assert {row["id"] for row in robot_mesh(action="peers")["peers"]} == {"sim-1", "arm-1"}
+        assert robot_mesh(action="tell", target="sim-1", instruction="wave")["status"] == "success"
+        assert left.running == {"left": "wave"}
+        assert robot_mesh(action="status", target="sim-1")["task_status"] == "running"
+        assert robot_mesh(action="stop", target="sim-1")["stopped"] is True
+        assert "operator approval" in robot_mesh(action="tell", target="arm-1", instruction="wave")["reason"]
+        verdict = robot_mesh(action="emergency_stop")
+        assert verdict["status"] == "error"
+        assert verdict["not_stopped"] == ["arm-1"]
+        assert meshes[0] is not None and meshes[0].lockout_epoch == verdict["estop_id"]
+    finally:
+        for mesh in meshes:
+            if mesh is not None:
+                mesh.close()
 
 
 @pytest.mark.parametrize("word", ["auto", "on", "", "maybe"])

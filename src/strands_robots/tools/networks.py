@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+import secrets
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,10 +18,12 @@ from strands_robots.utils import MissingExtraError, ValidationError
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.client import Peer
+    from strands_robots.mesh import Mesh
 
 SOURCE = "robot-mesh-tool"
 """The name that the tool's calls carry; what a robot's allowlist has to hold."""
 
+HEAR_S = 1.1
 ANSWER_S = 10.0
 STOP_S = 5.0
 ESTOP_S = 1.5
@@ -45,31 +50,102 @@ class RobotNetwork(Protocol):
 
 
 def network() -> RobotNetwork:
-    """The network that is in use: Device Connect, unless ``STRANDS_ROBOT_MESH_DC`` says off."""
-    if settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_WORDS:
+    """The network that is in use: Device Connect, unless it is absent or ``STRANDS_ROBOT_MESH_DC`` says off."""
+    absent = importlib.util.find_spec("device_connect_edge") is None
+    if absent or settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_WORDS:
         return NativeMesh()
     return DeviceConnect()
 
 
 class NativeMesh:
-    """The native mesh, which this release does not have: every verb says so."""
-
-    _REASON = "The native mesh is not part of this release; unset STRANDS_ROBOT_MESH_DC to use Device Connect."
+    """Robots on the native mesh, asked by a peer of this process that has no robot. Its silence is an error too."""
 
     def peers(self) -> Envelope:
-        return error(self._REASON)
+        """Every peer in reach, with its type and state."""
+
+        def listed(console: Mesh) -> Envelope:
+            rows = [
+                {"id": row["peer_id"], "type": row["type"], "status": row.get("task_status", "")}
+                for row in console.peers
+                if row["reachable"]
+            ]
+            if not rows:
+                return error("No robot answered.", peers=[])
+            return success(f"{len(rows)} robots: {', '.join(row['id'] for row in rows)}.", peers=rows)
+
+        return _with_console(listed)
 
     def tell(self, target: str, instruction: str, policy_provider: str, duration: float) -> Envelope:
-        return error(self._REASON)
+        """The peer's ``start``."""
+        command = {
+            "action": "start",
+            "instruction": instruction,
+            "policy_provider": policy_provider,
+            "duration": duration,
+        }
+        return _with_console(lambda console: _answer_of(target, console.send(target, command, ANSWER_S)))
 
     def status(self, target: str) -> Envelope:
-        return error(self._REASON)
+        """The peer's ``status``."""
+        return _with_console(lambda console: _answer_of(target, console.send(target, {"action": "status"}, ANSWER_S)))
 
     def stop(self, target: str) -> Envelope:
-        return error(self._REASON, stopped=None)
+        """The peer's ``stop``, or that of every peer in reach at once; answers by name."""
+
+        def stopped(console: Mesh) -> Envelope:
+            if target:
+                return verdict_of({target: _stop_answer(target, console.send(target, {"action": "stop"}, STOP_S))})
+            expected = [row["peer_id"] for row in console.peers if row["reachable"]]
+            return verdict_of(_by_name(console.broadcast({"action": "stop"}, ESTOP_S), expected))
+
+        return _with_console(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
-        return error(self._REASON, stopped=None)
+        """The mesh's emergency stop; who can be seen and gave no answer is named."""
+
+        def stopped(console: Mesh) -> Envelope:
+            expected = [row["peer_id"] for row in console.peers if row["reachable"]]
+            replies = [each for each in console.emergency_stop() if each["responder_id"] != console.peer_id]
+            return {**verdict_of(_by_name(replies, expected)), "estop_id": console.lockout_epoch}
+
+        return _with_console(stopped, stopped=None)
+
+
+def _by_name(replies: list[dict[str, Any]], expected: list[str]) -> dict[str, Envelope]:
+    silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in expected}
+    return silent | {each["responder_id"]: _stop_answer(each["responder_id"], each) for each in replies}
+
+
+def _stop_answer(target: str, reply: dict[str, Any]) -> Envelope:
+    if reply.get("status") in ("timeout", "error"):
+        return error(f"{target} did not answer.", stopped=None)
+    result = reply.get("result")
+    if grade(result).stopped:
+        return success("stopped", stopped=True)
+    return error(explain(result) if result is not None else str(reply.get("error", "")), stopped=False)
+
+
+def _answer_of(target: str, reply: dict[str, Any]) -> Envelope:
+    if reply.get("status") == "timeout":
+        return error(f"{target} did not answer.")
+    if reply.get("type") != "response":
+        return error(f"{target}: {reply.get('error', 'refused')}")
+    result = reply.get("result")
+    return result if isinstance(result, dict) else error(f"{target} answered nothing known.")
+
+
+def _with_console(work: Callable[[Mesh], Envelope], **fields: Any) -> Envelope:
+    from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the network is loaded when it is used
+
+    console = init_mesh(None, f"{SOURCE}-{secrets.token_hex(4)}", "tool")
+    if console is None or not console.alive:
+        return error("The native mesh is off or has no session; see the log.", **fields)
+    try:
+        # Two heartbeats: who is there has been heard by then.
+        time.sleep(HEAR_S)
+        return work(console)
+    finally:
+        console.close()
 
 
 class DeviceConnect:

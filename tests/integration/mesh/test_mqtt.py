@@ -1,0 +1,136 @@
+"""The mesh over a real MQTT 5 broker with mutual TLS. Not AWS: see docs/mesh.md."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from fixtures.mesh_peer import MeshPeer
+from fixtures.mqtt_broker import PROGRAM, MqttBroker
+from fixtures.waiting import eventually
+
+from strands_robots.mesh import keys
+from strands_robots.mesh.resume_authority import keygen
+from strands_robots.mesh.transport.base import TransportError
+from strands_robots.mesh.transport.iot import Account, IotMqttTransport, filter_of
+
+Join = Callable[..., MeshPeer]
+PASSPHRASE = "Correct-Horse-7-Battery"
+
+
+def test_key_expressions_become_topic_filters() -> None:
+    assert filter_of("strands/*/presence") == "strands/+/presence"
+    assert filter_of("strands/a/response/**") == "strands/a/response/#"
+
+
+def test_what_is_not_stated_is_named() -> None:
+    with pytest.raises(TransportError, match="STRANDS_IOT_ENDPOINT"):
+        Account.from_settings()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    if PROGRAM is None:
+        reason = "mosquitto is not installed (Debian package mosquitto)"
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+    made = tmp_path / "keys"
+    keys.init(made)
+    keys.issue(made, "broker")
+    return made
+
+
+@pytest.fixture
+def broker(folder: Path, tmp_path: Path) -> Iterator[MqttBroker]:
+    with MqttBroker(tmp_path, folder / "ca.pem", folder / "broker.pem", folder / "broker.key") as running:
+        yield running
+
+
+@pytest.fixture
+def join(broker: MqttBroker, folder: Path, tmp_path: Path) -> Iterator[Join]:
+    with ExitStack() as stack:
+
+        def start(peer_id: str, robot: str = "world", **settings: str) -> MeshPeer:
+            if not (folder / f"{peer_id}.pem").exists():
+                keys.issue(folder, peer_id)
+            state = tmp_path / peer_id
+            state.mkdir(mode=0o700, exist_ok=True)
+            account = {
+                "STRANDS_MESH_BACKEND": "iot",
+                "STRANDS_IOT_ENDPOINT": f"localhost:{broker.port}",
+                "STRANDS_IOT_THING_NAME": peer_id,
+                "STRANDS_IOT_CERT_DIR": str(folder),
+                "STRANDS_IOT_CA_FILE": str(folder / "ca.pem"),
+                "STRANDS_STATE_DIR": str(state),
+            }
+            peer = MeshPeer(peer_id, robot, {**account, **settings})
+            stack.callback(peer.close)
+            return peer
+
+        yield start
+
+
+@pytest.mark.system
+def test_peers_meet_command_and_tell_how_it_was_delivered(join: Join) -> None:
+    sim, console = join("sim-1"), join("console", "none")
+    console.sees("sim-1")
+    answer = console.ask("ping", "sim-1")
+    assert (answer["status"], answer["via"], answer["confirmed"]) == ("ok", "direct", True)
+    start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
+    assert console.ask("send", "sim-1", start, 5)["result"]["status"] == "success"
+    assert sim.ask("moving") == ["left"]
+    offline = console.ask("ping", "nobody")
+    assert (offline["status"], offline["reason"], offline["via"]) == ("offline", "offline", "direct")
+
+
+@pytest.mark.system
+def test_real_hardware_cannot_be_moved_by_a_sender_that_no_session_proves(join: Join) -> None:
+    join("arm-1", "arm", BYPASS_TOOL_CONSENT="true")
+    console = join("console", "none")
+    console.sees("arm-1")
+    start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
+    assert "operator approval" in console.ask("send", "arm-1", start, 5)["error"]
+
+
+@pytest.mark.system
+def test_a_late_joiner_locks_on_the_kept_stop_and_not_once_it_was_resumed(join: Join, tmp_path: Path) -> None:
+    key = str(tmp_path / "operator.pem")
+    trusted = {"STRANDS_MESH_RESUME_PUBLIC_KEY": keygen(key, PASSPHRASE)}
+    first, console = join("sim-1", **trusted), join("console", "none", **trusted)
+    console.sees("sim-1")
+    console.ask("estop")
+    eventually(lambda: first.ask("epoch"), within=3)
+    late = join("sim-2", **trusted)
+    eventually(lambda: late.ask("epoch") == console.ask("epoch"), within=3)
+    console.sees("sim-1", "sim-2")
+    assert console.ask("resume", key, PASSPHRASE) == {"status": "ok"}
+    for peer in (first, late):
+        eventually(lambda peer=peer: peer.ask("epoch") is None, within=3)
+    late.close()
+    again = join("sim-2", **trusted)
+    again.sees("sim-1")
+    assert again.ask("epoch") is None
+
+
+@pytest.mark.system
+def test_peers_meet_again_when_the_broker_comes_back(join: Join, broker: MqttBroker) -> None:
+    sim, console = join("sim-1"), join("console", "none")
+    console.sees("sim-1")
+    broker.stop()
+    broker.start()
+    eventually(lambda: console.ask("ping", "sim-1", 1)["status"] == "ok", within=15)
+    assert sim.ask("reachable")
+
+
+@pytest.mark.system
+def test_a_certificate_of_another_authority_gets_no_connection(
+    broker: MqttBroker, tmp_path: Path, folder: Path
+) -> None:
+    foreign = tmp_path / "foreign"
+    keys.init(foreign)
+    issued = keys.issue(foreign, "sim-1")
+    transport = IotMqttTransport(Account("localhost", broker.port, "sim-1", issued.cert, issued.key, folder / "ca.pem"))
+    with pytest.raises(TransportError, match="no MQTT connection"):
+        transport.connect()

@@ -1,0 +1,88 @@
+"""Two legs as one transport, on two in-memory buses."""
+
+from __future__ import annotations
+
+import pytest
+from tests.mesh.peers import Clock
+
+from strands_robots.mesh.transport.base import TransportError
+from strands_robots.mesh.transport.bridge import BridgeTransport, Seen
+from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
+
+
+class Down(MemoryTransport):
+    """A leg that does not connect."""
+
+    def connect(self) -> None:
+        raise TransportError("no broker")
+
+
+@pytest.fixture
+def buses() -> tuple[MemoryBus, MemoryBus]:
+    return MemoryBus(), MemoryBus()
+
+
+def bridge(buses: tuple[MemoryBus, MemoryBus]) -> BridgeTransport:
+    made = BridgeTransport(MemoryTransport(buses[0]), MemoryTransport(buses[1], sessionless=True))
+    made.connect()
+    return made
+
+
+def on(bus: MemoryBus) -> MemoryTransport:
+    transport = MemoryTransport(bus)
+    transport.connect()
+    return transport
+
+
+def test_presence_goes_both_ways_and_state_stays_local(buses: tuple[MemoryBus, MemoryBus]) -> None:
+    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
+    heard: list[tuple[str, str]] = []
+    near.declare_subscriber("strands/**", lambda sample: heard.append(("near", sample.key)))
+    far.declare_subscriber("strands/**", lambda sample: heard.append(("far", sample.key)))
+    both.put("strands/a/presence", {"x": 1})
+    both.put("strands/a/state", {"x": 1})
+    assert heard == [("near", "strands/a/presence"), ("far", "strands/a/presence"), ("near", "strands/a/state")]
+
+
+def test_a_command_that_comes_by_both_legs_is_served_once(buses: tuple[MemoryBus, MemoryBus]) -> None:
+    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
+    served: list[str] = []
+    both.declare_subscriber("strands/a/cmd", lambda sample: served.append(sample.key))
+    body = {"sender_id": "x", "turn_id": "t", "command": {"action": "stop"}, "timestamp": 1.0}
+    near.put("strands/a/cmd", body)
+    far.put("strands/a/cmd", {**body, "timestamp": 2.0})
+    assert len(served) == 1
+    far.put("strands/a/cmd", {**body, "turn_id": "u"})
+    assert len(served) == 2
+
+
+def test_it_is_connected_while_either_leg_is(buses: tuple[MemoryBus, MemoryBus]) -> None:
+    half = BridgeTransport(MemoryTransport(buses[0]), Down(buses[1]))
+    half.connect()
+    assert half.is_alive()
+    half.put("strands/a/presence", {"x": 1})
+    half.close()
+    with pytest.raises(TransportError):
+        half.put("strands/a/presence", {"x": 1})
+    with pytest.raises(TransportError, match="neither leg"):
+        BridgeTransport(Down(buses[0]), Down(buses[1])).connect()
+
+
+def test_an_unknown_topic_in_the_setting_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_BRIDGE_TOPICS", "presence, everything")
+    with pytest.raises(TransportError, match="everything"):
+        BridgeTransport(MemoryTransport(MemoryBus()), MemoryTransport(MemoryBus()))
+
+
+def test_what_was_seen_is_forgotten_by_age_and_number() -> None:
+    clock = Clock()
+    seen = Seen(clock)
+    message = b'{"sender_id":"x","turn_id":"t","command":{}}'
+    assert seen.first(message) is True
+    assert seen.first(message) is False
+    clock.pass_(121)
+    assert seen.first(message) is True
+    assert seen.first(b"no json") is True
+    for number in range(10_001):
+        seen.first(b'{"sender_id":"x","turn_id":"%d","command":{}}' % number)
+    assert seen.first(message) is True
