@@ -13,6 +13,7 @@ from fixtures.recording_robot import RecordingRobot
 from fixtures.waiting import eventually
 
 from strands_robots.audit import read_audit_log
+from strands_robots.contract import AdaptedRobot
 from strands_robots.envelope import is_error
 from strands_robots.safety import clearance, ed25519
 from strands_robots.safety.orders import RobotReport, StopOrder, derived_epoch, epoch_of, new_epoch
@@ -325,6 +326,39 @@ def test_the_name_of_another_robot_is_refused_and_the_same_robot_is_shared(plane
     assert "arm-1" in plane.robots
     entry.close()
     assert plane.robots == {}
+
+
+def test_a_second_network_that_brings_a_key_brings_the_lockout_kept_under_it(plane: SafetyPlane, add: Add) -> None:
+    epoch = new_epoch()
+    add("arm-1", key="k")
+    plane.emergency_stop(order(epoch))
+    plane.robots["arm-1"].close()
+    robot = add("arm-1")
+    assert not robot.refuses()
+    entry = plane.register("arm-1", robot, key="k")
+    assert robot.refuses()
+    assert entry.epochs == (epoch,)
+    entry.close()
+
+
+def test_a_robot_wrapped_anew_for_its_second_network_is_locked_by_both_gates(plane: SafetyPlane) -> None:
+    class Foreign:
+        tool_name_str = "foreign"
+
+        def __getattr__(self, name: str) -> Any:
+            if name in ("start_task", "stop_task", "get_task_status", "get_features"):
+                return lambda *_: {"status": "success"}
+            raise AttributeError(name)
+
+    foreign = Foreign()
+    one, two = AdaptedRobot(foreign), AdaptedRobot(foreign)
+    plane.register("arm-1", one)
+    plane.register("arm-1", two)
+    permits = [one.gate.permit("x"), two.gate.permit("x")]
+    plane.emergency_stop(order())
+    assert not any(permit.valid for permit in permits)
+    assert all(is_error(robot.start_task("wave")) for robot in (one, two))
+    plane.robots["arm-1"].close()
 
 
 def test_the_last_robot_out_ends_the_threads() -> None:

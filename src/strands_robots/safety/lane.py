@@ -7,6 +7,7 @@ lane's thread, that one locks every robot and hands each to the thread that halt
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Mapping
@@ -26,6 +27,10 @@ ANSWER_AGAIN_S = 0.01
 REFUSALS_TOLD_S = 10.0
 SOURCES_TOLD = 256
 CHECK_IN_AGE_S = 60.0
+
+SWITCH_S = 0.0005
+"""How long a busy Python thread may keep the interpreter from the stop's threads, while there is a lane; Python's own
+default is ten times that, and a stop wakes three threads."""
 
 
 class Seat:
@@ -59,8 +64,10 @@ class StopLane:
         self._decision = Decision(allow=(), keys=())
         self._checked_in: dict[str, float] = {}
         self._answered: dict[tuple[str, str], float] = {}
+        self._redundant: dict[tuple[str, str], None] = {}
         self._intake: Intake | None = None
         self._thread: threading.Thread | None = None
+        self._switch_s = sys.getswitchinterval()
 
     @property
     def seats(self) -> tuple[Seat, ...]:
@@ -93,6 +100,7 @@ class StopLane:
         if last_of_link:
             seat.link.close()
         if intake is not None:
+            sys.setswitchinterval(self._switch_s)
             intake.close()
         if thread is not None and thread is not threading.current_thread():
             thread.join(2.0)
@@ -112,6 +120,8 @@ class StopLane:
                 "The source of an emergency stop is what it says it is: DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not set, "
                 "and only a broker's access rules can vouch for it."
             )
+        self._switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(min(self._switch_s, SWITCH_S))
         self._intake = Intake()
         self._thread = threading.Thread(target=self._run, args=(self._intake,), name="stop-lane", daemon=True)
         self._thread.start()
@@ -162,6 +172,12 @@ class StopLane:
         key, now = (report.robot_id, report.epoch), time.monotonic()
         if report.repeated and now - self._answered.get(key, 0.0) < ANSWER_AGAIN_S:
             return
+        if report.repeated and key not in self._redundant:
+            # Once for each stop: a controller repeats until it has heard everybody.
+            self._redundant[key] = None
+            log_safety_event("remote_estop_redundant", report.robot_id, {"epoch": report.epoch})
+            while len(self._redundant) > SOURCES_TOLD:
+                del self._redundant[next(iter(self._redundant))]
         self._answered[key] = now
         while len(self._answered) > SOURCES_TOLD:
             del self._answered[next(iter(self._answered))]

@@ -75,6 +75,15 @@ class Registered:
         """Take the robot out of the plane."""
         self._plane.unregister(self)
 
+    def adopt(self, key: str, kept: Kept) -> None:
+        """Keep this robot under ``key`` from now on, and hold what was kept there."""
+        self.key = key
+        for hold in kept.state.all:
+            self.latch.engage(hold.epoch, hold.source, hold.reason)
+        if self.locked:
+            for gate in self.gates:
+                gate.revoke()
+
     def remember(self, report: RobotReport) -> None:
         """Keep the report for whoever asks about this stop again."""
         self.reports[report.epoch] = report
@@ -135,6 +144,8 @@ class SafetyPlane:
                 if robot.gate not in known.gates:
                     robot.gate.attach(known.latch)
                     known.gates = (*known.gates, robot.gate)
+                if key and known.key is None:
+                    known.adopt(key, self.store.load(key))
                 return known
             kept = self.store.load(key) if key else Kept()
             entry = Registered(self, robot_id, robot, key=key, kept=kept, wire_id=wire_id or robot_id)
