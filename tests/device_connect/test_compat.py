@@ -9,7 +9,11 @@ import pytest
 from strands_robots.device_connect import _compat
 
 SOURCE_HASHES = {
+    "DeviceDriver._get_functions": "7dc82c18974d7295",
+    "DeviceDriver._invoke_decorated": "2edf78c79ad0cb8d",
+    "DeviceDriver.invoke": "275902836c43f991",
     "DeviceRuntime.__init__": "df4dbaf9278fcd85",
+    "DeviceRuntime._build_registration_params": "da0e9a8d64b409de",
     "DeviceRuntime._cmd_subscription": "8b7c088c5623da36",
     "DeviceRuntime._connect_messaging": "2b6523fb05815087",
     "DeviceRuntime._event_dispatch_loop": "6502b78a542fcf6a",
@@ -20,6 +24,7 @@ SOURCE_HASHES = {
     "DeviceRuntime.enqueue_event": "40b84ccb6d07b492",
     "DeviceRuntime.run": "a2472bb8763ce3c6",
     "DeviceRuntime.stop": "e2d84df25977a1c9",
+    "decorators.rpc": "4c6b571e695dcfd9",
 }
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import Future
@@ -14,12 +15,11 @@ from typing import Any
 
 from device_connect_edge import device as framework
 from device_connect_edge.device import DeviceRuntime
-from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.drivers import DeviceDriver, decorators
 from device_connect_edge.messaging.exceptions import MessagingError, NotConnectedError
 
 from .. import settings
-from .backends import LinkConfig, register
-from .backends.jsonrpc import valid_json
+from .backends import LinkConfig, jsonrpc, register
 
 FRAMEWORK_VERSION = "0.2.5"
 
@@ -35,8 +35,11 @@ LEANED_ON = {
         "_validate_startup_config",
         "_resubscribe_after_reconnect",
         "_notify_conn_state",
+        "_build_registration_params",
         "enqueue_event",
-    )
+    ),
+    "DeviceDriver": ("_get_functions", "_invoke_decorated", "invoke"),
+    "decorators": ("rpc",),
 }
 """Members that are called, replaced or whose way of working is relied upon."""
 
@@ -172,6 +175,30 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
                 "or opt in with allow_insecure=True"
             )
 
+    async def _cmd_subscription(self) -> None:
+        if _traced():
+            await super()._cmd_subscription()
+            return
+        functions = self._driver._get_functions()
+        functions.update({name: _quick(function) for name, function in functions.items()})
+        await self.messaging.serve(f"device-connect.{self.tenant}.{self.device_id}.cmd", self._serve)
+
+    async def _serve(self, command: jsonrpc.Command) -> bytes:
+        """The framework's answer to a command, without its spans: they would be recorded for nobody."""
+        method, params = command.method, command.params
+        if method == "requestRegistration":
+            return jsonrpc.result(command.id, self._build_registration_params())
+        source = params.pop("_dc_meta", {}).get("source_device")
+        if method not in self._driver._get_functions():
+            return jsonrpc.error(command.id, jsonrpc.METHOD_NOT_FOUND, f"Unknown method: {method}")
+        if source:
+            params["source_device"] = source
+        try:
+            return jsonrpc.result(command.id, await self._driver.invoke(method, **params))
+        except Exception as problem:  # noqa: BLE001 - whatever a driver raises is its answer
+            self._logger.warning("Driver function %s failed: %s", method, problem)
+            return jsonrpc.error(command.id, jsonrpc.FUNCTION_FAILED, str(problem))
+
     async def _heartbeat_loop(self) -> None:
         # The last thing the framework starts: from here on the device is callable and announced.
         self._ready.set()
@@ -186,7 +213,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
 
     async def _send_event(self, subject: str, data: bytes) -> None:
         assert self.messaging is not None
-        if not valid_json(data):
+        if not jsonrpc.valid_json(data):
             _log.error("dropped an event on %s: it holds NaN or Infinity, which JSON cannot carry", subject)
             return
         try:
@@ -224,10 +251,53 @@ class _NoTelemetry:
 _telemetry = framework.DeviceConnectTelemetry
 
 
+def _traced() -> bool:
+    """True when somebody records spans or metrics in this process, whether our runtime or the application."""
+    try:
+        from opentelemetry import metrics, trace  # noqa: PLC0415 - an optional part of the framework
+    except ImportError:
+        return False
+    # What the API package itself provides until an application sets something up records nothing.
+    providers = trace.get_tracer_provider(), metrics.get_meter_provider()
+    return any(
+        not type(each).__module__.startswith(("opentelemetry.trace", "opentelemetry.metrics")) for each in providers
+    )
+
+
+def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
+    """An ``@rpc`` method without the framework's log lines, spans and metrics while nobody listens to them.
+
+    The caller is where ``get_rpc_source_device`` looks for it, and failures are logged, as always.
+    """
+    original, owner = getattr(function, "_original_func", None), getattr(function, "__self__", None)
+    if original is None or owner is None or callable(getattr(owner, "log_integration", None)):
+        return function
+    name = function._function_name  # type: ignore[attr-defined]  # the decorator sets it
+
+    @functools.wraps(function)
+    async def called(*, source_device: str | None = None, **params: Any) -> Any:
+        if decorators.logger.isEnabledFor(logging.INFO):
+            return await function(source_device=source_device, **params)
+        token = decorators._rpc_source_device.set(source_device)
+        try:
+            answer = await original(owner, **params)
+        except Exception as problem:
+            decorators.logger.warning("%s of %s failed: %s", name, source_device or "unknown", problem)
+            raise
+        finally:
+            decorators._rpc_source_device.reset(token)
+        if isinstance(answer, dict) and "error" in answer:
+            decorators.logger.warning("%s of %s is partial: %s", name, source_device or "unknown", answer["error"])
+        return answer
+
+    return called
+
+
 def sources() -> dict[str, Callable[..., Any] | Coroutine[Any, Any, Any]]:
     """The framework's functions named in ``LEANED_ON``, for the test that watches them."""
+    owners = {"DeviceRuntime": DeviceRuntime, "DeviceDriver": DeviceDriver, "decorators": decorators}
     return {
-        f"{owner}.{name}": getattr(getattr(framework, owner), name)
+        f"{owner}.{name}": getattr(owners[owner], name)
         for owner, names in LEANED_ON.items()
         for name in names
     }

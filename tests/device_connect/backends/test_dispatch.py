@@ -23,7 +23,8 @@ class Desk:
         self.open = asyncio.Event()
         self.served = []
         self.replied = set()
-        self.desk = dispatch.CommandDesk("arm-1.cmd", self._handle, self._answer, self._unanswered)
+        relay = dispatch.relaying(self._handle, str, self._unanswered)
+        self.desk = dispatch.CommandDesk("arm-1.cmd", relay, self._answer)
 
     async def _handle(self, data, reply):
         self.served.append(json.loads(data)["method"])
@@ -33,6 +34,8 @@ class Desk:
         if json.loads(data)["method"] == "fail":
             raise RuntimeError("broken")
         self.replied.add(reply)
+        if json.loads(data)["method"] == "answer and fail":
+            raise RuntimeError("broken")
 
     def _answer(self, reply, data):
         self.answers[reply] = json.loads(data)
@@ -76,6 +79,39 @@ async def test_a_handler_that_leaves_its_caller_without_an_answer_is_answered_fo
     await until(lambda: "a" in desk.answers)
     assert desk.answers["a"]["error"]["code"] == jsonrpc.INTERNAL_ERROR
     assert desk.answers["a"]["id"] == 7
+
+
+async def test_whoever_gives_the_reply_need_not_send_it():
+    answers = []
+
+    async def serve(command):
+        await asyncio.sleep(0)
+        if command.params["fail"]:
+            raise RuntimeError("broken")
+        return jsonrpc.result(command.id, command.method)
+
+    async def send(_reply, data):
+        await asyncio.sleep(0)
+        answers.append(json.loads(data))
+
+    desk = dispatch.CommandDesk("arm-1.cmd", dispatch.serving(serve), send)
+    for number, fail in enumerate((False, True)):
+        desk.accept(json.dumps({"id": number, "method": "move", "params": {"fail": fail}}).encode(), "a")
+    desk.accept(b"no json", "a")
+    desk.accept(json.dumps({"id": 3, "method": "move", "params": {"fail": False}}).encode(), None)
+    await until(lambda: len(answers) == 3)
+    await desk.close()
+    assert {"jsonrpc": "2.0", "id": 0, "result": "move"} in answers
+    codes = {each["id"]: each["error"]["code"] for each in answers if "error" in each}
+    assert codes == {1: jsonrpc.INTERNAL_ERROR, None: jsonrpc.PARSE_ERROR}
+
+
+async def test_a_handler_that_fails_after_its_answer_is_not_answered_for(desk):
+    desk.open.set()
+    desk.desk.accept(command("answer and fail"), "a")
+    await until(lambda: "a" in desk.replied)
+    await asyncio.sleep(0)
+    assert desk.answers == {}
 
 
 async def test_ten_thousand_bad_messages_cost_one_log_line(desk, caplog):

@@ -36,8 +36,14 @@ MAX_ARRIVED = 4_096
 # One turn of the loop serves this many messages, then timers and sockets have their turn.
 DRAIN_AT_ONCE = 256
 
-Answer = Callable[[bytes], None]
 Handler = Callable[[bytes, str | None], Awaitable[None]]
+"""The framework's: gets a message, and the subject to publish its reply to."""
+
+Serve = Callable[[jsonrpc.Command], Awaitable[bytes]]
+"""Carries a command out and gives the encoded reply."""
+
+Relay = Callable[[bytes, Any, jsonrpc.Command], Awaitable[bytes | None]]
+"""Hands a command on, as it came, to somebody who replies; the reply that is still owed afterwards, if any."""
 
 
 def never_behind_motion(method: str) -> bool:
@@ -101,65 +107,102 @@ class CommandDesk:
 
     Args:
         subject: for the log.
-        handler: the framework's; it answers by publishing to the reply subject.
-        answer: sends an encoded reply to a reply subject.
-        finish: told a reply subject whose command is over; True when nobody has answered it yet.
+        relay: carries a command out.
+        answer: sends an encoded reply to whoever waits for it; what it returns, if anything, is awaited.
     """
 
-    def __init__(
-        self,
-        subject: str,
-        handler: Handler,
-        answer: Callable[[str, bytes], None],
-        finish: Callable[[str], bool],
-    ) -> None:
+    def __init__(self, subject: str, relay: Relay, answer: Callable[[Any, bytes], Awaitable[None] | None]) -> None:
         self._subject = subject
-        self._handler = handler
+        self._relay = relay
         self._answer = answer
-        self._finish = finish
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Future[None]] = set()
+        self._refusals: set[asyncio.Future[None]] = set()
         self._log = Throttled(logger)
 
-    def accept(self, data: bytes, reply: str | None) -> None:
-        """Start a command or refuse it at once. On the loop's thread."""
+    def accept(self, data: bytes, reply: Any) -> None:
+        """Start a command or refuse it at once. On the loop's thread.
+
+        Args:
+            data: the command as it came.
+            reply: where the answer goes; None where nobody waits for one.
+        """
         found = jsonrpc.check(data)
         if isinstance(found, jsonrpc.Command):
             room = MAX_COMMANDS + (RESERVED_COMMANDS if never_behind_motion(found.method) else 0)
             if len(self._tasks) < room:
-                task = asyncio.ensure_future(self._serve(data, reply, found))
-                self._tasks.add(task)
-                task.add_done_callback(self._tasks.discard)
+                _track(self._serve(data, reply, found), self._tasks)
                 return
             found = jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {len(self._tasks)} commands are running", found.id)
         self.refuse(found, reply)
 
-    def refuse(self, refusal: jsonrpc.Refusal, reply: str | None) -> None:
+    def refuse(self, refusal: jsonrpc.Refusal, reply: Any) -> None:
         """Answer a message that is no command, when somebody waits for an answer, and log it."""
         self._log.warning("refused a message on %s: %d %s", self._subject, refusal.code, refusal.reason)
         if reply is not None:
-            self._answer(reply, refusal.encoded())
+            sending = self._answer(reply, refusal.encoded())
+            if sending is not None:
+                _track(sending, self._refusals)
 
     async def close(self) -> None:
         """Cancel what runs and wait for it."""
-        tasks = [task for task in self._tasks if task is not asyncio.current_task()]
+        tasks = [task for task in self._tasks | self._refusals if task is not asyncio.current_task()]
         for task in tasks:
             task.cancel()
         if tasks:
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _serve(self, data: bytes, reply: str | None, command: jsonrpc.Command) -> None:
+    async def _serve(self, data: bytes, reply: Any, command: jsonrpc.Command) -> None:
         try:
-            await self._handler(data, reply)
+            answer = await self._relay(data, reply, command)
         except Exception as problem:
-            # The framework's own handler catches its own; what comes here must still not leave a caller waiting.
+            # Whoever serves catches what is its own; what comes here must still not leave a caller waiting.
             logger.exception("the handler of %s failed", self._subject)
-            self._close_books(reply, command, f"{type(problem).__name__} in the device")
-        else:
-            self._close_books(reply, command, "the device gave no answer")
+            answer = jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, f"{type(problem).__name__} in the device")
+        if reply is not None and answer is not None:
+            sending = self._answer(reply, answer)
+            if sending is not None:
+                await sending
 
-    def _close_books(self, reply: str | None, command: jsonrpc.Command, reason: str) -> None:
-        if reply is not None and self._finish(reply):
-            self._answer(reply, jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, reason))
+
+def serving(serve: Serve) -> Relay:
+    """A relay to somebody who gives the reply."""
+
+    async def relay(_data: bytes, _reply: Any, command: jsonrpc.Command) -> bytes:
+        return await serve(command)
+
+    return relay
+
+
+def relaying(handler: Handler, keep: Callable[[Any], str], owed: Callable[[str], bool]) -> Relay:
+    """A relay to a handler that publishes its reply.
+
+    Args:
+        handler: gets the command as it came, and the subject to reply to.
+        keep: the subject for a caller who waits.
+        owed: forgets a subject; True when nothing was published on it.
+    """
+
+    async def relay(data: bytes, reply: Any, command: jsonrpc.Command) -> bytes | None:
+        if reply is None:
+            await handler(data, None)
+            return None
+        subject, reason, unanswered = keep(reply), "the device gave no answer", False
+        try:
+            await handler(data, subject)
+        except Exception as problem:
+            logger.exception("a handler of commands failed")
+            reason = f"{type(problem).__name__} in the device"
+        finally:
+            unanswered = owed(subject)
+        return jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, reason) if unanswered else None
+
+    return relay
+
+
+def _track(work: Awaitable[None], among: set[asyncio.Future[None]]) -> None:
+    task = asyncio.ensure_future(work)
+    among.add(task)
+    task.add_done_callback(among.discard)
 
 
 class Room:

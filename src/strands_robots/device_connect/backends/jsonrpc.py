@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 from ...utils import shown
 
 PARSE_ERROR = -32700
 INVALID_REQUEST = -32600
+METHOD_NOT_FOUND = -32601
 INVALID_PARAMS = -32602
 INTERNAL_ERROR = -32603
+FUNCTION_FAILED = -32000
 BUSY = -32001
 
 MAX_COMMAND_BYTES = 2**20
@@ -35,10 +37,11 @@ RpcId = str | int | float | None
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What dispatching needs to know of a well-formed command."""
+    """A well-formed command, parsed."""
 
     method: str
     id: RpcId
+    params: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +60,21 @@ class Refusal:
 def error(rpc_id: RpcId, code: int, reason: str) -> bytes:
     """An encoded JSON-RPC error reply."""
     return json.dumps({"jsonrpc": "2.0", "id": rpc_id, "error": {"code": code, "message": reason}}).encode()
+
+
+def result(rpc_id: RpcId, value: object) -> bytes:
+    """An encoded JSON-RPC result, or the error that a value with NaN or Infinity in it is owed.
+
+    Raises:
+        TypeError, ValueError: the value has no JSON at all.
+    """
+    encoded = json.dumps({"jsonrpc": "2.0", "id": rpc_id, "result": value}).encode()
+    return encoded if valid_json(encoded) else no_number(rpc_id)
+
+
+def no_number(rpc_id: RpcId) -> bytes:
+    """The error that stands for a result with NaN or Infinity in it."""
+    return error(rpc_id, INTERNAL_ERROR, "the result holds NaN or Infinity, which JSON cannot carry")
 
 
 def check(data: bytes) -> Command | Refusal:
@@ -112,8 +130,9 @@ def _check_request(request: dict[str, Any]) -> Command | Refusal:
     method = request.get("method")
     if not isinstance(method, str) or not method:
         return Refusal(INVALID_REQUEST, f"method must be a name, not {shown(method)}", rpc_id)
-    problem = _params_problem(request.get("params", {}))
-    return Refusal(INVALID_PARAMS, problem, rpc_id) if problem else Command(method, rpc_id)
+    params = request.get("params", {})
+    problem = _params_problem(params)
+    return Refusal(INVALID_PARAMS, problem, rpc_id) if problem else Command(method, rpc_id, params)
 
 
 def _params_problem(params: object) -> str:

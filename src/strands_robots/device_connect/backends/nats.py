@@ -33,7 +33,7 @@ from nats.aio.subscription import Subscription as NatsSubscription
 
 from . import jsonrpc
 from .config import LinkConfig
-from .dispatch import CommandDesk, OrderedFeed, Throttled
+from .dispatch import CommandDesk, OrderedFeed, Serve, Throttled, relaying, serving
 from .errors import NoResponderError
 
 logger = logging.getLogger(__name__)
@@ -147,10 +147,20 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
             SubscribeError: the subject is none.
         """
         if subject.endswith(".cmd") and not subscribe_only:
-            desk = CommandDesk(subject, callback, self._answer, self._unanswered.__contains__)
-            return await self._declare(subject, queue, partial(self._command, desk), desk)
+            desk = CommandDesk(subject, relaying(callback, self._await_reply, self._owed), self._answer)
+            return await self._declare(subject, queue, lambda msg: desk.accept(msg.data, msg.reply or None), desk)
         feed = OrderedFeed(subject, callback)
         return await self._declare(subject, queue, lambda msg: feed.accept(msg.data, msg.reply or None), feed)
+
+    async def serve(self, subject: str, serve: Serve) -> Subscription:
+        """Have every command on ``subject`` carried out by ``serve``, concurrently, and its reply sent.
+
+        Raises:
+            NotConnectedError: no server at this moment.
+            SubscribeError: the subject is none.
+        """
+        desk = CommandDesk(subject, serving(serve), self._answer)
+        return await self._declare(subject, None, lambda msg: desk.accept(msg.data, msg.reply or None), desk)
 
     async def subscribe_with_subject(
         self,
@@ -234,20 +244,18 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
         self._desks.add(subscription)
         return subscription
 
-    def _command(self, desk: CommandDesk, message: Msg) -> None:
-        reply = message.reply or None
-        if reply is not None:
-            self._unanswered.add(reply)
-        desk.accept(message.data, reply)
+    def _await_reply(self, reply: str) -> str:
+        self._unanswered.add(reply)
+        return reply
 
-    def _answer(self, reply: str, data: bytes) -> None:
-        task = asyncio.ensure_future(self._send_answer(reply, data))
-        task.add_done_callback(lambda done: done.cancelled() or done.exception())
-
-    async def _send_answer(self, reply: str, data: bytes) -> None:
+    def _owed(self, reply: str) -> bool:
+        owed = reply in self._unanswered
         self._unanswered.discard(reply)
+        return owed
+
+    async def _answer(self, reply: str, data: bytes) -> None:
         with contextlib.suppress(PublishError, NotConnectedError):  # the caller is out of reach
-            await self.publish(reply, data)
+            await self.publish(reply, self._fit_to_send(data))
 
     def _fit_to_send(self, data: bytes) -> bytes:
         limit = self._client.max_payload
@@ -258,9 +266,7 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
                 f"the result has {len(data)} bytes and the NATS server takes at most {limit}",
             )
         if not jsonrpc.valid_json(data):
-            return jsonrpc.error(
-                jsonrpc.id_of(data), jsonrpc.INTERNAL_ERROR, "the result holds NaN or Infinity, which JSON cannot carry"
-            )
+            return jsonrpc.no_number(jsonrpc.id_of(data))
         return data
 
     async def _tell(self, what: str, callback: Callable[[], Awaitable[None]] | None) -> None:

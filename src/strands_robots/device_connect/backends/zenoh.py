@@ -27,7 +27,7 @@ from device_connect_edge.messaging.exceptions import (
 
 from . import jsonrpc, sessions
 from .config import LinkConfig
-from .dispatch import CommandDesk, Inbox, OrderedFeed
+from .dispatch import CommandDesk, Inbox, OrderedFeed, Serve, relaying, serving
 from .errors import NoResponderError
 from .threads import on_a_thread
 from .zenoh_ask import LARGE_BYTES, ask
@@ -134,8 +134,18 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             SubscribeError: the subject is no key expression.
         """
         if key_of(subject).endswith("/cmd") and not subscribe_only:
-            return self._declare(subject, queue, desk=CommandDesk(subject, callback, self._answer, self._unanswered))
+            relay = relaying(callback, partial(self.keep, until_answered=True), self._owed)
+            return self._declare(subject, queue, desk=CommandDesk(subject, relay, _answer))
         return self._declare(subject, queue, OrderedFeed(subject, callback, self.hand_over), answers=not subscribe_only)
+
+    async def serve(self, subject: str, serve: Serve) -> Subscription:
+        """Have every command on ``subject`` carried out by ``serve``, concurrently, and its reply sent.
+
+        Raises:
+            NotConnectedError: not connected.
+            SubscribeError: the subject is no key expression.
+        """
+        return self._declare(subject, None, desk=CommandDesk(subject, serving(serve), _answer))
 
     async def subscribe_with_subject(
         self,
@@ -256,26 +266,18 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             self._queries[reply] = (query, now + REPLY_TTL_S)
         return reply
 
-    def _unanswered(self, reply: str) -> bool:
-        return reply in self._queries
-
-    def _answer(self, reply: str, data: bytes) -> None:
-        query, _ = self._queries.pop(reply, (None, 0.0))
-        if query is not None:
-            answer_query(query, data)
+    def _owed(self, reply: str) -> bool:
+        return self._queries.pop(reply, None) is not None
 
     async def _reply(self, reply: str, data: bytes) -> None:
         query, _ = self._queries.pop(reply, (None, 0.0))
         if query is None:
             raise PublishError("the caller no longer waits for this reply")
         if not jsonrpc.valid_json(data):
-            data = jsonrpc.error(
-                jsonrpc.id_of(data), jsonrpc.INTERNAL_ERROR, "the result holds NaN or Infinity, which JSON cannot carry"
-            )
-        if len(data) < LARGE_BYTES:
-            answer_query(query, data)
-        else:
-            await on_a_thread(partial(answer_query, query, data))
+            data = jsonrpc.no_number(jsonrpc.id_of(data))
+        sending = _answer(query, data)
+        if sending is not None:
+            await sending
 
     def _on_link(self, linked: bool) -> None:
         self.hand_over(self._tell, linked)
@@ -287,3 +289,11 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             task = asyncio.ensure_future(callback())
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
+
+
+def _answer(query: Any, data: bytes) -> Awaitable[None] | None:
+    """Reply to a query; what has to wait for room is returned and awaited."""
+    if len(data) < LARGE_BYTES:
+        answer_query(query, data)
+        return None
+    return on_a_thread(partial(answer_query, query, data))

@@ -65,11 +65,10 @@ class Intake:
     def _command(self, data: bytes | int, size: int, query: Any) -> None:
         assert self._desk is not None
         self._room.give_back(size)
-        reply = None if query is None else self._client.keep(query, until_answered=True)
         if isinstance(data, int):
-            self._desk.refuse(jsonrpc.too_large(data), reply)
+            self._desk.refuse(jsonrpc.too_large(data), query)
         else:
-            self._desk.accept(data, reply)
+            self._desk.accept(data, query)
 
     def _question(self, data: bytes, query: Any) -> None:
         assert self._feed is not None
