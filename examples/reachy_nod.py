@@ -1,0 +1,101 @@
+"""Let a Reachy Mini in MuJoCo wake up and nod under our driver, and draw what its joints did.
+
+    ./scripts/reachy-daemon.sh 1.13.0
+    python -m examples.reachy_nod docs/images/reachy-mini-nod.png
+
+The daemon is Pollen's own in its MuJoCo simulation; the picture is Pollen's model, posed by the joint positions that
+the daemon streamed to our driver. Needs OpenGL (EGL or OSMesa) to draw.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+from fixtures.reachy_daemon.process import Daemon, Kind
+from fixtures.waiting import eventually
+
+from strands_robots.drivers.reachy import ReachyDriver
+from strands_robots.drivers.reachy.envelope import Target
+from strands_robots.drivers.reachy.feed import Joints
+from strands_robots.drivers.reachy.pose import HeadPose
+
+SIZE = (400, 480)
+Sample = tuple[Joints, float]
+"""Joints, and the head's pitch in radians."""
+
+
+def recorded(daemon: Daemon) -> list[Sample]:
+    """The joints at 50 Hz from upright through a nod and a happy wiggle."""
+    reachy = ReachyDriver("127.0.0.1", api_port=daemon.port)
+    reachy.connect()
+    try:
+        print(reachy.wake_up()["content"][0]["text"])
+        eventually(lambda: reachy.facts()["moving"] == "", 15.0, "awake")
+        reachy.go(Target(HeadPose(), 0.0, (-0.1745, 0.1745)))
+        time.sleep(1.0)
+        seen: list[Sample] = []
+        for gesture in ("nod", "happy"):
+            print(reachy.gesture(gesture)["content"][0]["text"])
+            while reachy.facts()["moving"]:
+                joints, pose = reachy.connection.feed.joints, reachy.connection.feed.pose()
+                if joints is not None and pose is not None and (not seen or joints.at > seen[-1][0].at):
+                    seen.append((joints, pose.pitch))
+                time.sleep(0.01)
+        return seen
+    finally:
+        reachy.disconnect()
+
+
+def drawn(model_path: Path, seen: list[Sample], picture: Path) -> None:
+    """A strip of stills, and beside it the whole motion as an animation."""
+    # MuJoCo reads this while it is imported.
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    import mujoco  # noqa: PLC0415 - after the choice above
+    from PIL import Image  # noqa: PLC0415 - only to draw
+
+    model = mujoco.MjModel.from_xml_path(str(model_path))
+    model.vis.global_.offheight = model.vis.global_.offwidth = max(SIZE)
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0, 0, 0.19), 0.62, 225, -12
+    images: list[Image.Image] = []
+    started = seen[0][0].at
+    with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
+        for joints, _ in seen:
+            # The daemon's MuJoCo counts the antennas the other way round.
+            data.ctrl[:] = [*joints.head, *(-angle for angle in joints.antennas)]
+            while data.time < 1.0 + joints.at - started:
+                mujoco.mj_step(model, data)
+            renderer.update_scene(data, camera)
+            images.append(Image.fromarray(renderer.render()))
+    pitches, antennas = [pitch for _, pitch in seen], [joints.antennas[0] for joints, _ in seen]
+    stills = [pitches.index(max(pitches)), pitches.index(min(pitches))]
+    stills = [0, *stills, antennas.index(max(antennas)), antennas.index(min(antennas))]
+    strip = Image.new("RGB", (SIZE[0] * len(stills), SIZE[1]))
+    for column, index in enumerate(stills):
+        strip.paste(images[index], (column * SIZE[0], 0))
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    strip.save(picture, optimize=True)
+    small = [image.resize((SIZE[0] // 2, SIZE[1] // 2)).quantize(64) for image in images[::3]]
+    small[0].save(picture.with_suffix(".gif"), save_all=True, append_images=small[1:], duration=60, loop=0)
+    print(f"{picture} and {picture.with_suffix('.gif')} hold {len(images)} samples.")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("picture", type=Path)
+    options = parser.parse_args()
+    kind = Kind("1.13.0", "mujoco")
+    if why := kind.missing():
+        parser.error(why)
+    with Daemon(kind) as daemon:
+        seen = recorded(daemon)
+    scene = next(kind.venv.glob("lib/*/site-packages/reachy_mini/descriptions/reachy_mini/mjcf/scenes/empty.xml"))
+    drawn(scene, seen, options.picture)
+
+
+if __name__ == "__main__":
+    main()
