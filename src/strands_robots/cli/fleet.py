@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
+from strands_robots.cli.mesh import peers_on_mesh
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Exit, Failure, Screen, label, plain, table
 from strands_robots.cli.words import assignments
@@ -39,8 +40,12 @@ def peers(
     network: Network,
     device: Annotated[str | None, typer.Argument(help="Show what this one can do.")] = None,
     timeout: Annotated[float, _WAIT] = 2.0,
+    on_mesh: Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")] = False,
 ) -> None:
     """List the robots on the network, or what one of them can do."""
+    if on_mesh:
+        peers_on_mesh(screen, number("--timeout", timeout, above=0, high=60))
+        return
     with reached(network) as fleet:
         found = fleet.peers(number("--timeout", timeout, above=0, high=60))
     if device is not None:

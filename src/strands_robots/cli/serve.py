@@ -13,6 +13,7 @@ import typer
 
 from strands_robots import settings
 from strands_robots.cli.command import command
+from strands_robots.cli.mesh import serve_on_mesh
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Failure, Screen, label, plain, table
 from strands_robots.cli.words import assignments
@@ -57,6 +58,7 @@ def serve(
         str | None, _allow("--command-allow", "Verbs approved on real hardware: verb or verb@peer.")
     ] = None,
     state_hz: Annotated[float | None, typer.Option("--state-hz", help="stateUpdate events a second, idle.")] = None,
+    on_mesh: Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")] = False,
     until_stdin_closes: Annotated[bool, typer.Option("--until-stdin-closes", hidden=True)] = False,
 ) -> None:
     """Put a robot on the network. Ctrl-C or SIGTERM stops the robot first, then departs."""
@@ -71,13 +73,16 @@ def serve(
         if value is not None:
             settings.put(name, value)
     wanted = None if peer_id is None else device_id("--peer-id", peer_id)
-    link = network.link()
+    link = None if on_mesh else network.link()
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
 
     chosen = assignments(options or []) | ({} if host is None else {"host": host})
     body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
     try:
-        _serve(screen, network, link, body, wanted=wanted, piped=until_stdin_closes)
+        if link is None:
+            serve_on_mesh(screen, body, wanted, mode)
+        else:
+            _serve(screen, network, link, body, wanted=wanted, piped=until_stdin_closes)
     finally:
         cleanup = getattr(body, "cleanup", None)
         if callable(cleanup):

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ BROADCAST_RESPONDER = "\x00broadcast"
 """Expected responder of a broadcast; the NUL keeps it apart from every peer id."""
 
 REPLIES_MAX = 4096
+_NO_ID = frozenset("/*$?#")
 REPEAT_S = 0.5
 
 Refusal = dict[str, Any]
@@ -35,7 +36,7 @@ class Turn:
 
     expected: str
     done: threading.Event = field(default_factory=threading.Event)
-    over: threading.Event = field(default_factory=threading.Event)
+    over: bool = False
     replies: list[dict[str, Any]] = field(default_factory=list)
     answered: set[tuple[str | None, str]] = field(default_factory=set)
     via: str = "publish"
@@ -104,10 +105,7 @@ class Caller:
             if problem is not None:
                 logger.warning("broadcast: %s", problem)
                 return []
-            if missing is None:
-                turn.over.wait(seconds)
-            else:
-                self._collect(turn, turn_id, clean, seconds, missing)
+            self._collect(turn, turn_id, clean, seconds, missing)
             with self._lock:
                 return list(turn.replies)
         finally:
@@ -119,20 +117,20 @@ class Caller:
         turn_id: str,
         command: dict[str, Any],
         seconds: float,
-        missing: Callable[[list[dict[str, Any]]], set[str]],
+        missing: Callable[[list[dict[str, Any]]], set[str]] | None,
     ) -> None:
         now = time.monotonic()
         deadline, again = now + seconds, now + REPEAT_S
-        while now < deadline and not turn.over.is_set():
-            turn.done.wait(min(deadline, again) - now)
+        while now < deadline and not turn.over:
+            turn.done.wait(deadline - now if missing is None else min(deadline, again) - now)
             with self._lock:
                 turn.done.clear()
                 replies = list(turn.replies)
-            absent = missing(replies)
+            absent = missing(replies) if missing is not None else {""}
             if not absent:
                 return
             now = time.monotonic()
-            if now >= again:
+            if missing is not None and now >= again:
                 again = now + REPEAT_S
                 for peer in absent:
                     self._publish(topics.command(peer), command, turn_id, turn)
@@ -162,7 +160,7 @@ class Caller:
         with self._lock:
             turns = list(self._turns.values())
         for turn in turns:
-            turn.over.set()
+            turn.over = True
             turn.done.set()
 
     def _hijacked(self, sample: Sample, reply: wire.Reply, turn: Turn) -> str | None:
@@ -181,19 +179,20 @@ class Caller:
             return context.identity.refusal(reply.body, reply.responder_id)
         return None
 
-    def _count(self, sample: Sample, reply: wire.Reply, turn: Turn, body: Mapping[str, Any]) -> None:
+    def _count(self, sample: Sample, reply: wire.Reply, turn: Turn, body: dict[str, Any]) -> None:
         who = (sample.session, reply.responder_id)
         with self._lock:
             duplicate = who in turn.answered
             if not duplicate and len(turn.replies) < REPLIES_MAX:
                 turn.answered.add(who)
-                turn.replies.append({key: value for key, value in body.items() if key != "sig"})
+                body.pop("sig", None)
+                turn.replies.append(body)
                 turn.done.set()
         if duplicate:
             self._context.audit("response_duplicate_rejected", reply.responder_id, turn_id=reply.turn_id)
 
     def _prepare(self, target: object, command: object, timeout: object) -> tuple[str, dict[str, Any], float] | str:
-        if not self._context.running():
+        if self._context.transport is None:
             return "the mesh is not running."
         if not isinstance(target, str) or not target or "\x00" in target:
             return f"target must be a non-empty string without NUL, not {shown(target)}."
@@ -202,7 +201,7 @@ class Caller:
             seconds = number("timeout", timeout, above=0)
         except ValidationError as exc:
             return f"validation: {exc}"
-        if any(part in target for part in "/*$?#"):
+        if not _NO_ID.isdisjoint(target):
             return f"target must be a peer id, not {shown(target)}."
         return target, clean, seconds
 

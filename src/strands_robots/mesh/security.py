@@ -105,9 +105,10 @@ def validate_command(command: object, *, providers: Sequence[str] = ()) -> dict[
     if not isinstance(action, str) or action not in ACTIONS:
         raise ValidationError(f"action must be one of {', '.join(ACTIONS)}, not {shown(action)}.")
     clean: dict[str, Any] = {"action": action}
-    for name, check in _FIELDS.items():
-        if name in given and given[name] is not None:
-            clean[name] = check(name, given[name])
+    for name, value in given.items():
+        check = _FIELDS.get(name)
+        if check is not None and value is not None:
+            clean[name] = check(name, value)
     if action in ("execute", "start"):
         clean["policy_provider"] = _provider(given.get("policy_provider"), providers)
         clean.setdefault("duration", 30.0)
