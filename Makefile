@@ -1,7 +1,8 @@
-.PHONY: help demo test test-all lint bench serve api system venv clean
+.PHONY: help demo test test-all lint bench serve api system venv clean real-arm
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
+REAL_ARM := .venv-lerobot/bin
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 
 help:  ## Show these targets
@@ -24,9 +25,15 @@ system:
 	@./scripts/system-packages.sh $(GL_PACKAGES) mosquitto
 	@./scripts/reachy-daemon.sh 1.13.0
 	@./scripts/reachy-daemon.sh 1.4.1
+	@./scripts/real-arm.sh
 
 test-all: venv system  ## What needs Debian or npm packages besides
 	@$(BIN)/python -m pytest -m system $(ARGS)
+	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
+
+real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot, and its tests
+	@./scripts/real-arm.sh
+	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
 
 lint: venv  ## ruff and mypy --strict
 	@$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from collections.abc import Mapping
@@ -9,12 +10,17 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal
 
 from strands_robots.bus_access import action_ranges, bus_lock, read_joints
+from strands_robots.hardware._compat import drop, unplugged
+from strands_robots.hardware.calibration import write_to_servos
 from strands_robots.policies.base import Action
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.utils import ValidationError, number, shown
 
 StopLevel = Literal["hold", "release"]
 STOP_LEVELS = ("hold", "release")
+
+HOLD_FRESH_S = 0.25
+"""How old the last joint read may be to be held at when a new one fails."""
 
 _INTERFACE = ("get_observation", "send_action", "connect", "disconnect")
 
@@ -51,6 +57,13 @@ class DeviceBody:
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         self._latest: tuple[float, dict[str, float]] | None = None
+        self._lost = False
+
+    @property
+    def lost(self) -> bool:
+        """True from when its port was found gone until it is connected again."""
+        self._lost = self._lost or unplugged(self.device)
+        return self._lost
 
     @property
     def is_connected(self) -> bool:
@@ -62,6 +75,24 @@ class DeviceBody:
         """Seconds since the last joint read, and its joints; None before the first."""
         latest = self._latest
         return None if latest is None else (time.monotonic() - latest[0], dict(latest[1]))
+
+    def connect(self) -> None:
+        """Connect the device, a LeRobot device without a prompt; nothing when it is. Raises what the device raises."""
+        with self.lock:
+            if self.lost:
+                drop(self.device)
+            elif self.is_connected and hasattr(self.device, "is_connected"):
+                return
+            try:
+                write_to_servos(self.device)
+                if "calibrate" in inspect.signature(self.device.connect).parameters:
+                    self.device.connect(calibrate=False)
+                else:
+                    self.device.connect()
+            except BaseException:
+                drop(self.device)
+                raise
+            self._lost = False
 
     def get_observation(self) -> dict[str, Any]:
         with self.lock:
@@ -86,10 +117,17 @@ class DeviceBody:
                 self._hold()
 
     def stop(self) -> None:
-        """Freeze, or let go, as the stop level says."""
+        """Freeze, or let go, as the stop level says.
+
+        Raises:
+            ConnectionError: the port is gone, or some motors did not confirm that they let go.
+            Exception: what else the device raises.
+        """
         with self.lock:
+            if self.lost:
+                raise ConnectionError("its port is gone; a servo goes on to its last goal")
             if self.stop_level == "release":
-                self.device.bus.disable_torque()
+                self._release()
             else:
                 self._hold()
 
@@ -103,11 +141,37 @@ class DeviceBody:
             own()
             return
         still = {key: 0.0 for key in self.bounds if _is_velocity(key)}
-        if len(still) < len(self.bounds):
+        if len(still) == len(self.bounds):
+            self.device.send_action(still)
+            return
+        try:
             present = self.get_joints()
-            still |= {key: present[key] for key in self.bounds if key in present and key not in still}
+        except Exception:
+            # One silent motor must not leave the others running to their goals; the halt still reports it.
+            age, present = self.latest_joints or (math.inf, {})
+            if age <= HOLD_FRESH_S:
+                self._send_still(still, present)
+            raise
+        self._send_still(still, present)
+        # A bus does not confirm targets; what it answers after them shows that it took them.
+        self.get_joints()
+
+    def _send_still(self, still: dict[str, float], present: Mapping[str, float]) -> None:
+        still |= {key: present[key] for key in self.bounds if key in present and key not in still}
         if still:
             self.device.send_action(still)
+
+    def _release(self) -> None:
+        """Torque off, motor by motor where they have names, so that a silent one keeps none of the others on."""
+        bus = self.device.bus
+        silent = {}
+        for motor in getattr(bus, "motors", None) or (None,):
+            try:
+                bus.disable_torque(motor) if motor is not None else bus.disable_torque()
+            except Exception as exc:  # noqa: BLE001 - a bus may raise anything; the halt reports it
+                silent[motor or "bus"] = f"{type(exc).__name__}: {exc}"
+        if silent:
+            raise ConnectionError(f"torque not confirmed off of {', '.join(silent)} ({next(iter(silent.values()))})")
 
 
 def _is_velocity(key: str) -> bool:

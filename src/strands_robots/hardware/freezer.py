@@ -57,7 +57,7 @@ class Freezer:
     def _pass(self, attempt: _Attempt) -> None:
         with self._body.lock:
             try:
-                if self._body.is_connected:
+                if self._body.is_connected or self._body.lost:
                     self._body.stop()
             except Exception as exc:  # noqa: BLE001 - a device may raise anything; the halt reports it
                 attempt.failure = exc

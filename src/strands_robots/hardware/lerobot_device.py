@@ -1,59 +1,104 @@
-"""LeRobot devices by name.
+"""LeRobot devices by name, followers and leaders, made but not connected.
 
-LeRobot keeps its robots in a registry of configuration classes (``RobotConfig``), filled when the module of each
-robot is imported; ``make_robot_from_config`` then builds the device. Written against LeRobot 0.4; the light parts
-of that interface are exercised by this project, the real package is not installed where it is tested.
+LeRobot keeps its devices in registries of configuration classes (``RobotConfig``, ``TeleoperatorConfig``,
+``CameraConfig``), filled when the module of each device is imported. Written against LeRobot 0.4.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
-import importlib
 import logging
 import pkgutil
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal
 
-from strands_robots.utils import ValidationError, missing_extra, shown
+from strands_robots.hardware._compat import lerobot_module, light
+from strands_robots.hardware.calibration import calibrate_from
+from strands_robots.utils import ValidationError, mapping, missing_extra, shown
 
 logger = logging.getLogger(__name__)
 
-_SUFFIX = "_follower"
+Role = Literal["follower", "leader"]
+
+_ROLES = {
+    "follower": ("lerobot.robots", "RobotConfig", "make_robot_from_config"),
+    "leader": ("lerobot.teleoperators", "TeleoperatorConfig", "make_teleoperator_from_config"),
+}
+_WITHOUT_TORCH = ("so_follower", "so_leader")
+"""Modules that need no torch to be imported; the others are left alone where there is none."""
+
+_CAMERA_MODULES = {"intelrealsense": "realsense"}
 
 
-def make_device(name: str, options: dict[str, Any]) -> Any:
-    """A LeRobot device, not connected yet.
+def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", *, calibrated: bool = True) -> Any:
+    """A LeRobot device, not connected yet, with its calibration.
 
     Args:
-        name: a LeRobot robot type, such as ``so100_follower``; ``so100`` means the same.
-        options: fields of its configuration, such as ``port`` and ``id``.
+        name: a LeRobot type, such as ``so100_follower`` or ``so100_leader``; ``so100`` means the one of ``role``.
+        options: fields of its configuration, such as ``port`` and ``id`` (the name by default); ``cameras`` as
+            dictionaries, each with a ``type`` (opencv where none is named); and ``calibration``, a LeRobot
+            calibration file or its content, in the place of the one LeRobot keeps for that id.
+        role: which registry.
+        calibrated: refuse a device that has a motor bus and no calibration.
 
     Raises:
         MissingExtraError: LeRobot is not installed.
-        ValidationError: an unknown name, with the near ones, or options that its configuration refuses.
+        ValidationError: an unknown name, with the near ones; options that its configuration refuses; no calibration.
     """
+    package, registry, factory = _ROLES[role]
     try:
-        robots = importlib.import_module("lerobot.robots")
+        devices = lerobot_module(package)
     except ModuleNotFoundError as exc:
         raise missing_extra(f"The real robot {shown(name)}", "lerobot") from exc
-    _register_all(robots)
-    known: dict[str, Any] = robots.RobotConfig.get_known_choices()
-    kind = name if name in known else f"{name}{_SUFFIX}"
+    _register_all(devices)
+    known: dict[str, Any] = getattr(devices, registry).get_known_choices()
+    kind = name if name in known else f"{name}_{role}"
     if kind not in known:
         near = difflib.get_close_matches(str(name), known, n=4, cutoff=0.4)
         hint = f"near it: {', '.join(near)}" if near else f"known: {', '.join(sorted(known))}"
-        raise ValidationError(f"name must be a LeRobot robot type, not {shown(name)}; {hint}.")
+        raise ValidationError(f"name must be a LeRobot {role} type, not {shown(name)}; {hint}.")
+    fields = dict(options)
+    calibration = fields.pop("calibration", None)
+    if fields.get("cameras"):
+        fields["cameras"] = _cameras(fields["cameras"])
+    if "id" not in fields and "id" in {each.name for each in dataclasses.fields(known[kind])}:
+        fields["id"] = name
     try:
-        config = known[kind](**options)
+        config = known[kind](**fields)
     except (TypeError, ValueError) as exc:
-        raise ValidationError(f"the options {sorted(options)} do not configure {kind}: {exc}.") from exc
-    return robots.make_robot_from_config(config)
+        raise ValidationError(f"the options {sorted(fields)} do not configure {kind}: {exc}.") from exc
+    device = getattr(devices, factory)(config)
+    if calibrated or calibration is not None:
+        calibrate_from(device, calibration, name=name, role=role)
+    return device
 
 
-def _register_all(robots: Any) -> None:
-    for module in pkgutil.iter_modules(robots.__path__, f"{robots.__name__}."):
-        if not module.ispkg:
+def _register_all(devices: Any) -> None:
+    bare = light()
+    for module in pkgutil.iter_modules(devices.__path__, f"{devices.__name__}."):
+        if not module.ispkg or (bare and module.name.rpartition(".")[2] not in _WITHOUT_TORCH):
             continue
         try:
-            importlib.import_module(module.name)
+            lerobot_module(module.name)
         except ImportError as exc:
             logger.debug("%s is not available: %s", module.name, exc)
+
+
+def _cameras(given: object) -> dict[str, Any]:
+    made = {}
+    for name, camera in mapping("cameras", given).items():
+        if not isinstance(camera, Mapping):
+            made[name] = camera
+            continue
+        fields = dict(camera)
+        kind = str(fields.pop("type", "opencv"))
+        try:
+            lerobot_module(f"lerobot.cameras.{_CAMERA_MODULES.get(kind, kind)}")
+        except ImportError as exc:
+            raise ValidationError(f"cameras[{name!r}] is of the type {kind!r}, which is not available: {exc}.") from exc
+        try:
+            made[name] = lerobot_module("lerobot.cameras").CameraConfig.get_choice_class(kind)(**fields)
+        except (TypeError, ValueError, KeyError) as exc:
+            raise ValidationError(f"cameras[{name!r}] cannot be made with {sorted(fields)}: {exc}.") from exc
+    return made

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -56,14 +55,11 @@ class HardwareRobot(Tasks):
         self._sends: set[Permit] = set()
 
     def connect(self) -> None:
-        """Connect the device; a LeRobot device without asking for calibration. Raises what the device raises."""
-        if self._body.is_connected and hasattr(self.device, "is_connected"):
-            return
-        with self._body.lock:
-            if "calibrate" in inspect.signature(self.device.connect).parameters:
-                self.device.connect(calibrate=False)
-            else:
-                self.device.connect()
+        """Connect the device, without asking for calibration, and again after its port was gone.
+
+        Raises what the device raises.
+        """
+        self._body.connect()
 
     def get_features(self) -> Envelope:
         """``observation_features`` and ``action_features`` as data (``float``, or an image's shape), with ranges."""
@@ -154,6 +150,8 @@ class HardwareRobot(Tasks):
     def _refresh(self, within_s: float) -> str:
         if joint_read_source(self) is None or not self._body.is_connected:
             return "The device is not connected."
+        if self._body.lost:
+            return "The device's port is gone; these are the joints of the last read."
         if not self._body.lock.acquire(timeout=within_s):
             return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
         try:

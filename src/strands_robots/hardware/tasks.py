@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from typing import Any
@@ -16,6 +17,8 @@ from strands_robots.rollout import Observers, Rollout
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
+
+logger = logging.getLogger(__name__)
 
 DURATION_MAX_S = 86_400.0
 """Longest task: a day."""
@@ -139,6 +142,7 @@ class Tasks(TeleopMixin):
         with self.starting:
             permit = self.gate.permit("start_task")
             self._free()
+            self._reconnect()
             if not self._body.is_connected:
                 raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
             rollout = Rollout(
@@ -154,6 +158,18 @@ class Tasks(TeleopMixin):
             self._task = rollout
             rollout.start()
             return rollout
+
+    def _reconnect(self) -> None:
+        """Whoever asks for a motion after the cable was out gets the robot back, if the port is."""
+        if not self._body.lost:
+            return
+        try:
+            self._body.connect()
+        except Exception as exc:
+            raise ValidationError(
+                f"{self.tool_name_str} lost its port and could not be connected again: {type(exc).__name__}: {exc}."
+            ) from exc
+        logger.warning("%s lost its port and is connected again.", self.tool_name_str)
 
     def _free(self) -> None:
         leader = self.teleoperated_by(self.tool_name_str)

@@ -105,7 +105,7 @@ def test_a_servo_moves_to_its_goal_only_with_torque(line: Line, bus: FeetechBus)
     assert line.read(1, "present_position") == 2048
     line.write(1, "torque_enable", 1)
     eventually(lambda: abs(line.read(1, "present_position") - 2600) <= 1, what="arrival")
-    assert abs(bus.shafts()[1] - 2700) <= 1, "the shaft is the homing offset further"
+    assert abs(bus.shafts()[1] - 2700) <= 2, "the shaft is the homing offset further"
 
 
 def test_a_goal_outside_the_limits_is_held_to_them(line: Line) -> None:

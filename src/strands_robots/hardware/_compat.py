@@ -1,0 +1,103 @@
+"""LeRobot as it is, and what of it is used beyond its documented interface. Written for LeRobot 0.4.4.
+
+LeRobot's motor drivers need no torch, but importing them loads helpers that do: ``lerobot.utils.utils`` imports torch,
+accelerate and datasets at its top, and ``lerobot.processor``, of which the drivers use two type aliases, all of torch
+besides. Where torch is not installed, empty modules stand in their place for as long as a driver is being imported,
+and no longer. Where it is installed nothing stands in for anything.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+_STANDINS: Mapping[str, tuple[str, ...]] = {
+    "torch": ("device", "dtype", "Tensor"),
+    "accelerate": ("Accelerator",),
+    "datasets": (),
+    "datasets.utils": (),
+    "datasets.utils.logging": ("disable_progress_bar", "enable_progress_bar"),
+    "lerobot.processor": ("RobotAction", "RobotObservation"),
+}
+"""Names that LeRobot's drivers import, by module. None of them is called by a driver."""
+
+_importing = threading.Lock()
+
+
+def light() -> bool:
+    """Whether LeRobot has to do without torch."""
+    return importlib.util.find_spec("torch") is None
+
+
+def lerobot_module(name: str) -> ModuleType:
+    """A module of LeRobot's, such as ``lerobot.robots``; its drivers also where torch is not installed.
+
+    Raises:
+        ModuleNotFoundError: LeRobot, or something the module really needs, is not installed.
+    """
+    with _importing:
+        if not light():
+            return importlib.import_module(name)
+        with _standing_in():
+            return importlib.import_module(name)
+
+
+@contextmanager
+def _standing_in() -> Iterator[None]:
+    put = {name: _standin(name, words) for name, words in _STANDINS.items() if name not in sys.modules}
+    sys.modules.update(put)
+    try:
+        yield
+    finally:
+        for name, module in put.items():
+            if sys.modules.get(name) is module:
+                del sys.modules[name]
+
+
+def _standin(name: str, words: tuple[str, ...]) -> ModuleType:
+    module = ModuleType(name, "Stands in while a LeRobot driver is imported without torch.")
+    module.__spec__ = ModuleSpec(name, None)
+    module.__path__ = []
+    for word in words:
+        setattr(module, word, type(word, (), {}))
+    return module
+
+
+def unplugged(device: Any) -> bool:
+    """Whether the serial port that a LeRobot device has open is gone from the machine.
+
+    LeRobot calls a bus connected for as long as its port object is open, also when the cable is out. The node of a
+    removed port has no name left, so the open file has no links.
+    """
+    serial = getattr(getattr(getattr(device, "bus", None), "port_handler", None), "ser", None)
+    if serial is None or not getattr(serial, "is_open", False):
+        return False
+    try:
+        return os.fstat(serial.fileno()).st_nlink == 0
+    except OSError:
+        return True
+
+
+def drop(device: Any) -> None:
+    """Close what a LeRobot device has open on a port that is gone or did not answer, so that it can be tried again.
+
+    LeRobot leaves the port open when its handshake fails, and an exchange that broke off leaves the SDK's port marked
+    as in use, so that every later one would be refused. Nothing for a device without such a port.
+    """
+    handler = getattr(getattr(device, "bus", None), "port_handler", None)
+    if handler is None:
+        return
+    handler.is_using = False
+    if handler.is_open:
+        handler.closePort()
+    for camera in getattr(device, "cameras", {}).values():
+        if camera.is_connected:
+            camera.disconnect()

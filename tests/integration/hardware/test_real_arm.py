@@ -1,0 +1,209 @@
+"""LeRobot's own SO follower on an emulated servo bus: connected, driven, halted, and what its bus does wrong."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.feetech_bus import MOTORS, FeetechBus, arm_calibration, arm_servos
+from fixtures.waiting import eventually
+
+from strands_robots.hardware import _compat
+from strands_robots.utils import ValidationError
+
+pytestmark = pytest.mark.system
+
+Arm = Callable[..., Any]
+
+KEYS = tuple(f"{motor}.pos" for motor in MOTORS)
+
+
+def test_the_stand_ins_are_gone_once_the_driver_is_imported() -> None:
+    robots = _compat.lerobot_module("lerobot.robots")
+    follower = _compat.lerobot_module("lerobot.robots.so_follower")
+    assert follower.SO101Follower.__module__ == "lerobot.robots.so_follower.so_follower"
+    assert robots.RobotConfig.get_known_choices()["so101_follower"] is follower.SO101FollowerConfig
+    assert _compat.light()
+    for name in ("torch", "accelerate", "datasets", "lerobot.processor"):
+        assert name not in sys.modules
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("torch")
+
+
+def test_it_connects_with_a_given_calibration_and_reads_its_joints(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm()
+    assert all(servo.torque for servo in bus.servos.values())
+    state = robot.get_state()
+    assert set(state["joints"]) == set(KEYS)
+    assert all(abs(state["joints"][key]) < 1 for key in KEYS[:5])
+    features = robot.get_features()
+    assert features["ranges"]["gripper.pos"] == [0.0, 100.0]
+    assert features["ranges"]["shoulder_pan.pos"] == pytest.approx([-109.9, 109.9], abs=0.1)
+
+
+def test_a_calibration_of_lerobots_own_file_is_read(arm: Arm, bus: FeetechBus, tmp_path: Path) -> None:
+    folder = tmp_path / "lerobot"
+    folder.mkdir()
+    (folder / "left.json").write_text(json.dumps(arm_calibration()), encoding="utf-8")
+    robot = arm(calibration=None, id="left")
+    assert robot.device.is_calibrated
+    assert not [write for write in bus.writes if write.is_for("homing_offset")], "nothing differed"
+
+
+def test_a_missing_calibration_is_one_sentence_with_the_command(arm: Arm, bus: FeetechBus) -> None:
+    with pytest.raises(
+        ValidationError, match=r"run strands-robots calibrate so101 --port \S+ --id left, or"
+    ) as refused:
+        arm(calibration=None, id="left")
+    assert "\n" not in str(refused.value)
+    assert bus.writes == []
+
+
+def test_factory_servos_are_given_the_calibration_with_their_torque_off(tmp_path: Path, arm: Arm) -> None:
+    with FeetechBus(arm_servos(calibrated=False), link=tmp_path / "fresh") as fresh:
+        for servo in fresh.servos.values():
+            servo.put("torque_enable", 1)
+        robot = arm(port=fresh.port)
+        assert robot.device.is_calibrated
+        writes = fresh.writes
+        offset = next(index for index, write in enumerate(writes) if write.is_for("homing_offset"))
+        released = [each.servo for each in writes[:offset] if each.is_for("torque_enable") and each.data == b"\0"]
+        assert sorted(released) == [1, 2, 3, 4, 5, 6]
+        robot.cleanup()
+
+
+@pytest.mark.parametrize(
+    ("motor", "change", "words"),
+    [
+        ("gripper", {"range_max": 5000}, "range_max"),
+        ("gripper", {"range_min": 3300}, "range_max"),
+        ("wrist_flex", {"homing_offset": True}, "homing_offset"),
+        ("elbow_flex", {"id": 2}, "id must be"),
+    ],
+)
+def test_a_calibration_outside_its_domain_is_refused(arm: Arm, motor: str, change: dict[str, int], words: str) -> None:
+    content = arm_calibration()
+    content[motor] |= change
+    with pytest.raises(ValidationError, match=words):
+        arm(calibration=content)
+
+
+def test_a_port_that_is_not_there_is_told(arm: Arm) -> None:
+    with pytest.raises(ConnectionError, match="no-such-port"):
+        arm(port="/dev/no-such-port")
+
+
+def test_a_first_connection_that_failed_can_be_tried_again(arm: Arm, bus: FeetechBus) -> None:
+    bus.servos[3].dead = True
+    with pytest.raises(RuntimeError, match="Missing motor IDs"):
+        arm()
+    bus.servos[3].dead = False
+    assert arm().get_state()["joints"]
+
+
+def test_it_takes_one_action_and_goes_there(arm: Arm) -> None:
+    robot = arm()
+    answer = robot.send_action({"shoulder_pan.pos": 30.0})
+    assert answer["sent"] == {"shoulder_pan.pos": 30.0}
+    eventually(lambda: abs(robot.get_state()["joints"]["shoulder_pan.pos"] - 30) < 0.2, what="arrival")
+
+
+def test_a_rollout_keeps_its_rate_while_the_state_is_read(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm()
+    before = time.monotonic()
+    assert robot.start_task("wave", duration=3.0)["status"] == "success"
+    while robot.get_task_status()["task_status"] == "running":
+        assert "joints_error" not in robot.get_state()
+        time.sleep(0.1)
+    status = robot.get_task_status()
+    assert status["task_status"] == "completed", status
+    assert status["step_count"] >= 100
+    for servo in range(1, 7):
+        assert len([write for write in bus.written_after(before) if write.servo == servo]) >= status["step_count"]
+
+
+@pytest.mark.parametrize(("level", "torque"), [("hold", True), ("release", False)])
+def test_nothing_is_written_after_a_halt_and_torque_is_as_configured(
+    arm: Arm, bus: FeetechBus, level: str, torque: bool
+) -> None:
+    robot = arm(stop_level=level)
+    robot.start_task("wave", duration=30.0)
+    eventually(lambda: robot.get_task_status()["step_count"] > 25)
+    verdict = robot.halt("test")
+    at = time.monotonic()
+    assert verdict.stopped is True, verdict
+    time.sleep(0.1)
+    still = bus.shafts()
+    time.sleep(0.1)
+    assert [write for write in bus.writes if write.at > at] == []
+    assert bus.shafts() == pytest.approx(still, abs=1.0)
+    assert [servo.torque for servo in bus.servos.values()] == [torque] * 6
+
+
+def test_a_dead_servo_ends_the_rollout_and_is_never_called_stopped(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm()
+    robot.start_task("wave", duration=30.0)
+    eventually(lambda: robot.get_task_status()["step_count"] > 10)
+    bus.servos[3].dead = True
+    eventually(lambda: robot.get_task_status()["task_status"] == "error")
+    assert "no status packet" in robot.get_task_status()["error"]
+    assert robot.halt().stopped is not True
+    bus.servos[3].dead = False
+    assert robot.halt().stopped is True
+    assert robot.start_task("wave", duration=0.2)["status"] == "success"
+
+
+def test_a_servo_that_dies_in_motion_leaves_the_others_held(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm()
+    robot.send_action({"shoulder_pan.pos": 90.0, "wrist_flex.pos": 80.0})
+    time.sleep(0.1)
+    robot.get_state()
+    bus.servos[3].dead = True
+    before = bus.shafts()
+    assert robot.halt().stopped is not True
+    time.sleep(0.5)
+    assert abs(bus.shafts()[1] - before[1]) < 500, "held near where it was last seen, far from its goal"
+
+
+def test_a_release_lets_go_of_every_motor_that_answers(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm(stop_level="release")
+    bus.servos[3].dead = True
+    verdict = robot.halt()
+    assert verdict.stopped is not True
+    assert "elbow_flex" in str(verdict)
+    assert [number for number, servo in bus.servos.items() if servo.torque] == [3]
+
+
+def test_an_unplugged_arm_is_told_and_comes_back_when_a_motion_is_asked_for(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm()
+    robot.start_task("wave", duration=30.0)
+    eventually(lambda: robot.get_task_status()["step_count"] > 10)
+    bus.unplug()
+    eventually(lambda: robot.get_task_status()["task_status"] == "error")
+    assert "port is gone" in robot.get_state()["joints_error"]
+    verdict = robot.halt()
+    assert verdict.stopped is None
+    assert "port is gone" in str(verdict)
+    refused = robot.start_task("wave", duration=1.0)
+    assert "lost its port" in refused["reason"]
+    assert robot.halt().stopped is None, "a try that failed does not make it stopped"
+    bus.plug()
+    assert robot.start_task("wave", duration=0.3)["status"] == "success"
+    eventually(lambda: robot.get_task_status()["task_status"] == "completed")
+    assert robot.halt().stopped is True
+
+
+def test_some_dropped_replies_do_not_make_a_state_wrong(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm()
+    bus.drop_share = 0.1
+    for _ in range(10):
+        state = robot.get_state()
+        assert set(state["joints"]) <= set(KEYS)
+        assert all(abs(value) < 1 for key, value in state["joints"].items() if key != "gripper.pos")
+    bus.drop_share = 0.0
