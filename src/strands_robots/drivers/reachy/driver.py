@@ -133,7 +133,7 @@ class ReachyDriver:
 
     def disconnect(self) -> None:
         """Halt what we started, then let go. The robot holds its pose."""
-        if self.connection.alive:
+        if self.connection.connects:
             self.motions.halt("disconnect")
         self.gate.revoke()
         self.connection.close()

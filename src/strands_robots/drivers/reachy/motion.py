@@ -175,9 +175,8 @@ class Motions:
         with self._turn:
             motion = self._begin(name, limp=True)
             try:
-                with self._write:
-                    motion.still_permitted()
-                    change()
+                motion.still_permitted()
+                change()
             except Exception as exc:
                 self._end(motion, "error", str(exc))
                 raise
@@ -218,15 +217,19 @@ class Motions:
         self._replace(name)
         motion = self._current = Motion(name, permit, of_daemon)
         try:
-            motion.still_permitted()
-        except MotionRefused:
-            self._end(motion, "stopped")
+            self._ready(motion)
+        except (MotionRefused, DaemonUnreachable) as exc:
+            self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
             raise
+        return motion
+
+    def _ready(self, motion: Motion) -> None:
+        """What a new connection has to be told before its first motion."""
+        motion.still_permitted()
         if self._told_yaw_on != self._connection.connects:
             with self._write:
                 self._connection.link().send_automatic_body_yaw(self._automatic_body_yaw)
             self._told_yaw_on = self._connection.connects
-        return motion
 
     def _replace(self, name: str) -> None:
         """Stop what runs: our own motion, and the moves that somebody else had the daemon play."""
@@ -303,19 +306,23 @@ class Motions:
         threading.Thread(target=self._run, args=(motion, second, frames), name="reachy-frames", daemon=True).start()
 
     def _run(self, motion: Motion, target: Target | None, frames: Frames) -> None:
+        try:
+            self._stream_frames(motion, target, frames)
+        except MotionRefused:
+            self._end(motion, "stopped")
+        except DaemonUnreachable as exc:
+            logger.warning("%s: %s ended early: %s", self._robot, motion.name, exc)
+        finally:
+            self._end(motion, "error", "its frames ended with a fault; the log has it")
+
+    def _stream_frames(self, motion: Motion, target: Target | None, frames: Frames) -> None:
         due = time.monotonic()
         while target is not None:
             due += FRAME_S
             if motion.cancelled.wait(max(0.0, due - time.monotonic())):
                 self._end(motion, "stopped")
                 return
-            try:
-                self._send(motion, target)
-            except MotionRefused:
-                return
-            except DaemonUnreachable as exc:
-                logger.warning("%s: %s ended early: %s", self._robot, motion.name, exc)
-                return
+            self._send(motion, target)
             # A thread that was held up goes on from now: a burst of late frames would be a jump.
             due = max(due, time.monotonic() - FRAME_S)
             target = next(frames, None)
