@@ -1,0 +1,106 @@
+"""Real arms on Device Connect: driven by a caller, stopped in motion, and named where they cannot be stopped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.feetech_bus import FeetechBus, arm_servos, write_calibration
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.device_connect.safety_controller import safety_controller
+from strands_robots.robot import Robot
+from strands_robots.safety.lane import lane
+
+pytestmark = pytest.mark.system
+
+MOVE = {"instruction": "wave", "duration": 20.0}
+
+
+class Bench:
+    """Two emulated arms on the network, a caller that may move them, and a controller that stops them."""
+
+    def __init__(self, folder: Path, stop_level: str) -> None:
+        self.stop_level = stop_level
+        link = loopback_config(free_port())
+        calibration = write_calibration(folder / "calibration.json")
+        self.buses = [FeetechBus(arm_servos(), link=folder / f"arm{number}") for number in (1, 2)]
+        self.robots: list[Any] = []
+        self.runtimes: list[Any] = []
+        for number, bus in enumerate(self.buses, start=1):
+            bus.plug()
+            options = {"port": bus.port, "calibration": calibration, "calibration_dir": folder}
+            robot = Robot("so101", mode="real", tool_name=f"arm-{number}", stop_level=stop_level, **options)
+            self.robots.append(robot)
+            self.runtimes.append(init_device_connect_sync(robot, peer_id=f"arm-{number}", link=link))
+        self.fleet = FleetClient(link, "tester").__enter__()
+        self.controller = safety_controller("safety-1", link)
+        assert self.controller.wait_link(10)
+        eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
+
+    def move(self) -> None:
+        for name in ("arm-1", "arm-2"):
+            answer = self.fleet.call(name, "execute", MOVE)
+            assert answer["status"] == "success", answer
+        eventually(lambda: all(robot.get_task_status()["step_count"] > 10 for robot in self.robots))
+
+    def close(self) -> None:
+        self.controller.close()
+        self.fleet.close()
+        for runtime in self.runtimes:
+            stop_device_connect(runtime)
+        for robot, bus in zip(self.robots, self.buses, strict=True):
+            robot.cleanup()
+            bus.unplug()
+
+
+@pytest.fixture(params=["hold", "release"])
+def bench(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
+    monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "execute")
+    made = Bench(tmp_path, request.param)
+    yield made
+    made.close()
+
+
+def test_an_emergency_stop_in_motion_stops_the_bytes_and_locks_the_arms(bench: Bench) -> None:
+    bench.move()
+    report = bench.controller.stop(["arm-1", "arm-2"], "test")
+    at = time.monotonic()
+    assert report.ok, report
+    time.sleep(0.2)
+    for bus in bench.buses:
+        assert [write for write in bus.writes if write.at > at] == []
+        assert [servo.torque for servo in bus.servos.values()] == [bench.stop_level == "hold"] * 6
+    refused = bench.fleet.call("arm-1", "execute", MOVE)
+    assert refused["status"] == "error"
+    assert report.estop_id in refused["reason"]
+    state = bench.fleet.call("arm-1", "getState")
+    assert state["status"] == "success"
+    assert len(state["joints"]) == 6
+
+
+def test_a_wedged_bus_is_named_and_the_other_arm_stops(bench: Bench) -> None:
+    bench.move()
+    bench.buses[0].wedge(30)
+    report = bench.controller.stop(["arm-1", "arm-2"], "test")
+    assert set(report.not_stopped) | set(report.silent) == {"arm-1"}
+    assert set(report.stopped) == {"arm-2"}
+    at = time.monotonic()
+    time.sleep(0.2)
+    assert bench.buses[1].written_after(at) == []
+    bench.buses[0].release()
+
+
+def test_a_plain_stop_halts_and_leaves_it_free(bench: Bench) -> None:
+    bench.move()
+    assert bench.fleet.stop("arm-1")["status"] == "success"
+    at = time.monotonic()
+    time.sleep(0.1)
+    assert bench.buses[0].written_after(at) == []
+    assert bench.robots[1].get_task_status()["task_status"] == "running"
+    assert bench.fleet.call("arm-1", "execute", {"instruction": "on", "duration": 0.2})["status"] == "success"
