@@ -296,8 +296,4 @@ def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[A
 def sources() -> dict[str, Callable[..., Any] | Coroutine[Any, Any, Any]]:
     """The framework's functions named in ``LEANED_ON``, for the test that watches them."""
     owners = {"DeviceRuntime": DeviceRuntime, "DeviceDriver": DeviceDriver, "decorators": decorators}
-    return {
-        f"{owner}.{name}": getattr(owners[owner], name)
-        for owner, names in LEANED_ON.items()
-        for name in names
-    }
+    return {f"{owner}.{name}": getattr(owners[owner], name) for owner, names in LEANED_ON.items() for name in names}

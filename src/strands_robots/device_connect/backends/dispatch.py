@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from . import jsonrpc
+from . import eager, jsonrpc
 
 logger = logging.getLogger(__name__)
 
@@ -130,7 +130,7 @@ class CommandDesk:
         if isinstance(found, jsonrpc.Command):
             room = MAX_COMMANDS + (RESERVED_COMMANDS if never_behind_motion(found.method) else 0)
             if len(self._tasks) < room:
-                _track(self._serve(data, reply, found), self._tasks)
+                _track(eager.start(self._serve(data, reply, found)), self._tasks)
                 return
             found = jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {len(self._tasks)} commands are running", found.id)
         self.refuse(found, reply)
@@ -141,7 +141,7 @@ class CommandDesk:
         if reply is not None:
             sending = self._answer(reply, refusal.encoded())
             if sending is not None:
-                _track(sending, self._refusals)
+                _track(asyncio.ensure_future(sending), self._refusals)
 
     async def close(self) -> None:
         """Cancel what runs and wait for it."""
@@ -167,10 +167,7 @@ class CommandDesk:
 def serving(serve: Serve) -> Relay:
     """A relay to somebody who gives the reply."""
 
-    async def relay(_data: bytes, _reply: Any, command: jsonrpc.Command) -> bytes:
-        return await serve(command)
-
-    return relay
+    return lambda _data, _reply, command: serve(command)
 
 
 def relaying(handler: Handler, keep: Callable[[Any], str], owed: Callable[[str], bool]) -> Relay:
@@ -199,8 +196,7 @@ def relaying(handler: Handler, keep: Callable[[Any], str], owed: Callable[[str],
     return relay
 
 
-def _track(work: Awaitable[None], among: set[asyncio.Future[None]]) -> None:
-    task = asyncio.ensure_future(work)
+def _track(task: asyncio.Future[None], among: set[asyncio.Future[None]]) -> None:
     among.add(task)
     task.add_done_callback(among.discard)
 
