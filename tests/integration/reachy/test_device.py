@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.reachy_daemon.process import Daemon
 from fixtures.waiting import eventually, free_port
 
@@ -19,7 +20,11 @@ from strands_robots.device_connect import (
     stop_device_connect,
 )
 from strands_robots.device_connect.client import Event
+from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.drivers.reachy import ReachyDriver
+from strands_robots.safety import ed25519
+from strands_robots.safety.lane import lane
+from strands_robots.safety.resume import sign
 
 Call = Callable[..., dict[str, Any]]
 MOTIONS = ("look", "antennas", "body", "nod", "shake", "happy", "wakeUp", "sleep", "enableMotors", "disableMotors")
@@ -175,6 +180,32 @@ def test_an_emergency_stop_of_its_own_halts_it(call: Call, device: ReachyMiniDri
     assert motion.facts()["state"] == "stopped"
     if daemon.kind.simulation != "mujoco":
         assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
+
+
+@pytest.mark.usefixtures("allowed")
+def test_the_stop_lane_halts_and_locks_a_head_and_a_signed_resume_frees_it(
+    call: Call, device: ReachyMiniDriver, daemon: Daemon, fleet: FleetClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operator = Ed25519PrivateKey.generate()
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", ed25519.encode(ed25519.public_half(operator)))
+    controller = safety_controller("safety-1", fleet.link)
+    try:
+        eventually(lambda: controller.link_up and all(seat.link.up for seat in lane().seats), 15.0, "the lane")
+        call("wakeUp")
+        report = controller.stop(["head-1"], "test")
+        assert report.ok, report
+        assert daemon.request("GET", "/api/move/running").json() == []
+        sent = device.reachy.motions.frames_sent
+        for function in MOTIONS:
+            assert report.estop_id in call(function)["reason"], function
+        assert call("getJoints")["status"] == "success"
+        assert call("getStatus")["locked"] is True
+        (assertion,) = sign(operator, report.estop_id, ["head-1"])
+        assert call("resume", assertion=assertion)["locked"] is False
+        assert device.reachy.motions.frames_sent == sent
+        assert call("nod")["status"] == "success"
+    finally:
+        controller.close()
 
 
 def test_a_daemon_that_is_away_does_not_kill_the_device(fleet: FleetClient) -> None:
