@@ -1,7 +1,7 @@
 """Leaders: what a follower is teleoperated by, made to look like a policy, and a scripted one for machines without.
 
 A leader is any object with ``get_action() -> dict`` of targets by action key (a LeRobot teleoperator, a gamepad). It
-may have ``is_connected`` and ``get_teleop_events()``.
+may have ``is_connected`` and ``get_teleop_events()``, and raises :class:`LeaderDone` when it has led to the end.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ UNBOUNDED_PER_S = 1440.0
 
 MAGNITUDE_MAX = 720.0
 """Largest target of a joint without a range, in its unit."""
+
+
+class LeaderDone(Exception):  # noqa: N818 - an end, not a fault
+    """A leader has no more to say: raised by its ``get_action``, it completes the teleoperation."""
 
 
 class InputSink(Protocol):
@@ -121,11 +125,13 @@ class LeaderPolicy:
         self._last = {}
         self._good_at = self._now()
 
-    def act(self, observation: Mapping[str, Any]) -> Action | list[Action]:
+    def act(self, observation: Mapping[str, Any]) -> Action | list[Action] | None:
         now = self._now()
         try:
             frame = mapping("leader action", self._leader.get_action())
             target = checked_action({self._keys.get(key, key): value for key, value in frame.items()}, self._ranges)
+        except LeaderDone:
+            return None
         except Exception as exc:
             self.errors += 1
             self.last_error = f"{type(exc).__name__}: {exc}"

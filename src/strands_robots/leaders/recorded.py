@@ -1,0 +1,126 @@
+"""A recording as a leader: frames of a file, played at the times they were recorded at.
+
+A ``.csv`` file has a first line of names: ``t`` (seconds, rising) and action keys, in the follower's units. An empty
+cell leaves its joint where it was.
+"""
+
+from __future__ import annotations
+
+import bisect
+import csv
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from strands_robots.policies.base import Action
+from strands_robots.teleop import LeaderDone
+from strands_robots.utils import ValidationError, number, shown
+
+Frame = tuple[float, Action]
+"""Seconds since the start, and targets by action key."""
+
+_TIME = "t"
+
+
+class RecordedLeader:
+    """Plays ``frames`` from its first ``get_action``, in between on a straight line.
+
+    Args:
+        frames: at least one, in the order of their times.
+        speed: times as fast, above 0 and at most 10.
+        now: monotonic seconds.
+
+    Raises:
+        ValidationError: no frame, times that do not rise, or ``speed`` outside its domain.
+    """
+
+    def __init__(self, frames: Sequence[Frame], speed: float = 1.0, now: Callable[[], float] = time.monotonic) -> None:
+        if not frames:
+            raise ValidationError("frames must hold at least one frame.")
+        self._times = [seconds - frames[0][0] for seconds, _ in frames]
+        if any(after <= before for before, after in zip(self._times, self._times[1:], strict=False)):
+            raise ValidationError("frames must be in the order of their times, each later than the one before.")
+        filled: Action = {}
+        self._actions = [filled := {**filled, **action} for _, action in frames]
+        self._speed = number("speed", speed, above=0, high=10)
+        self._now = now
+        self._began: float | None = None
+        self.is_connected = True
+
+    @property
+    def duration(self) -> float:
+        """How many seconds it plays."""
+        return self._times[-1] / self._speed
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The action keys it leads."""
+        return tuple(self._actions[-1])
+
+    @property
+    def position(self) -> float:
+        """How many of its seconds are played."""
+        return 0.0 if self._began is None else min((self._now() - self._began), self.duration)
+
+    def get_action(self) -> Action:
+        """The targets of this moment.
+
+        Raises:
+            LeaderDone: the recording is over.
+        """
+        self._began = self._now() if self._began is None else self._began
+        seconds = (self._now() - self._began) * self._speed
+        if seconds > self._times[-1]:
+            raise LeaderDone("the recording is over")
+        at = bisect.bisect_right(self._times, seconds) - 1
+        before = self._actions[at]
+        if at + 1 == len(self._times):
+            return dict(before)
+        share = (seconds - self._times[at]) / (self._times[at + 1] - self._times[at])
+        after = self._actions[at + 1]
+        return {key: value + share * (after[key] - value) for key, value in before.items()}
+
+
+def read_frames(path: Path) -> list[Frame]:
+    """The frames of a ``.csv`` file.
+
+    Raises:
+        ValidationError: no such file, another kind of file, or a line that is none; the sentence names the line.
+    """
+    if path.suffix != ".csv":
+        raise ValidationError(f"a recording must be a .csv file, not {shown(str(path))}.")
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.reader(file)
+            names = next(rows, [])
+            if _TIME not in names or len(set(names)) != len(names) or len(names) < 2:
+                raise ValidationError(f"the first line of {path.name} must name t and action keys, each once.")
+            return [_frame(names, row, f"line {line} of {path.name}") for line, row in enumerate(rows, start=2) if row]
+    except OSError as exc:
+        raise ValidationError(f"the recording {shown(str(path))} cannot be read: {exc.strerror}.") from exc
+
+
+def write_csv(path: Path, frames: Iterable[Frame]) -> None:
+    """Write frames as ``.csv``; the columns are the keys of all of them."""
+    kept = list(frames)
+    names = list(dict.fromkeys(key for _, action in kept for key in action))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow([_TIME, *names])
+        rows.writerows([f"{seconds:.6f}", *(action.get(name, "") for name in names)] for seconds, action in kept)
+
+
+def _frame(names: list[str], row: list[str], where: str) -> Frame:
+    if len(row) != len(names):
+        raise ValidationError(f"{where} must have {len(names)} cells, not {len(row)}.")
+    cells = dict(zip(names, row, strict=True))
+    seconds = _cell(f"t in {where}", cells.pop(_TIME))
+    return seconds, {name: _cell(f"{name} in {where}", cell) for name, cell in cells.items() if cell.strip()}
+
+
+def _cell(name: str, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        raise ValidationError(f"{name} must be a number, not {shown(cell)}.") from None
+    return number(name, value)
