@@ -28,6 +28,7 @@ from strands_robots.mesh.stream import Limiter
 from strands_robots.mesh.subscriptions import Subscriptions
 from strands_robots.mesh.teleop import TeleopDesk
 from strands_robots.mesh.transport.base import Sample, Transport
+from strands_robots.mesh.transport.posture import Posture, credentials_from_settings
 from strands_robots.mesh.wire_identity import Identity, from_settings
 from strands_robots.safety.halting import halt_of
 from strands_robots.safety.persistence import simulation_key
@@ -213,9 +214,16 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
 
 
 def identity_of(transport: Transport) -> Identity:
-    """The identity that the environment asks for on this transport: signed where the session has certificates."""
-    posture = getattr(transport, "posture", None)
-    return from_settings(posture.credentials if posture is not None else None)
+    """The identity that the environment asks for on this transport.
+
+    Signed where the session has certificates. MQTT's own certificates are the broker's business, so there it is signed
+    only where that is demanded, with the mesh's.
+    """
+    posture: Posture | None = getattr(transport, "posture", None)
+    if posture is not None:
+        return from_settings(posture.credentials)
+    demanded = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY") == "1"
+    return from_settings(credentials_from_settings() if demanded else None)
 
 
 def _body(robot: Any) -> Any:

@@ -95,6 +95,20 @@ def test_real_hardware_cannot_be_moved_by_a_sender_that_no_session_proves(join: 
 
 
 @pytest.mark.system
+def test_a_signed_command_moves_approved_hardware_over_mqtt(join: Join, folder: Path) -> None:
+    def signed(peer_id: str) -> dict[str, str]:
+        demanded = {"STRANDS_MESH_REQUIRE_SIGNED_IDENTITY": "1", "BYPASS_TOOL_CONSENT": "true"}
+        return {**keys.issue(folder, peer_id).settings(), **demanded}
+
+    arm = join("arm-1", "arm", **signed("arm-1"))
+    console = join("console", "none", **signed("console"))
+    console.sees("arm-1")
+    start = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
+    assert console.ask("send", "arm-1", start, 5)["result"]["status"] == "success"
+    assert arm.ask("moving") is True
+
+
+@pytest.mark.system
 def test_a_late_joiner_locks_on_the_kept_stop_and_not_once_it_was_resumed(join: Join, tmp_path: Path) -> None:
     key = str(tmp_path / "operator.pem")
     trusted = {"STRANDS_MESH_RESUME_PUBLIC_KEY": keygen(key, PASSPHRASE)}

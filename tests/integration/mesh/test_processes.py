@@ -120,3 +120,24 @@ def test_leaving_and_joining_again_leaves_no_thread(join: Join) -> None:
     assert len(peer.ask("threads")) <= len(before)
     mine = [name for name in before if "sim-1" in name or name.startswith("mesh")]
     assert len(mine) <= 6
+
+
+def test_a_leader_in_another_process_moves_the_follower_until_it_is_stopped(join: Join) -> None:
+    follower = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive@arm-1")
+    leader = join("leader-1", "none")
+    leader.sees("arm-1")
+    follower.sees("leader-1")
+    receive = {"action": "teleop_receive", "source_peer_id": "leader-1"}
+    assert leader.ask("send", "arm-1", receive, 5)["result"]["status"] == "success"
+
+    def lead(first: int, count: int) -> None:
+        for number in range(first, first + count):
+            frame = {"peer_id": "leader-1", "device": "leader", "method": "arm", "t": time.time(), "seq": number}
+            leader.ask("publish", "strands/leader-1/input/leader", {**frame, "action": {"j": number / 10}})
+            time.sleep(0.02)
+
+    lead(0, 20)
+    eventually(lambda: len(follower.ask("actions")) == 20, within=2)
+    assert leader.ask("send", "arm-1", {"action": "stop"}, 5)["result"]["ok"] is True
+    lead(20, 5)
+    assert len(follower.ask("actions")) == 20

@@ -22,7 +22,8 @@ from strands_robots.utils import missing_extra
 logger = logging.getLogger(__name__)
 
 OPEN_S = 5.0
-RESCUE_EVERY_S = 0.2
+RESCUE_EVERY_S = 0.1
+STEADY_LOOKS = 10
 PUBLISHERS_MAX = 256
 
 
@@ -256,9 +257,11 @@ class ZenohTransport:
         if not self._rescuing.acquire(blocking=False):
             return
         try:
-            posture = self._posture
-            while posture is not None and not self._closing.is_set() and not self.linked():
-                if self._relay is None:
+            posture, steady = self._posture, 0
+            # The lost link may still be listed for a moment, so only a link that lasts ends this.
+            while posture is not None and not self._closing.is_set() and steady < STEADY_LOOKS:
+                steady = steady + 1 if self.linked() else 0
+                if steady == 0 and self._relay is None:
                     with contextlib.suppress(TransportError):  # another survivor was quicker
                         self._relay = self._open(zenoh_config.hub(posture))
                         logger.warning("The mesh's hub is gone; this process relays on %s now.", posture.hub)
