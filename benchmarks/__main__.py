@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import platform
 import sys
 import time
@@ -26,6 +27,17 @@ PARTS = {
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",
 }
+
+
+INTRODUCTION = """# Benchmarks
+
+`make bench` measures every claim of speed on your machine and rewrites nothing; `make bench ARGS="--markdown
+docs/benchmarks.md"` wrote this page. Each row sets ours beside the bare part in the same run, in turns, so take the
+ratios: the absolute figures are those of one shared machine with {cores} cores, Python {python}. Loopback only.
+
+The bare framework records a trace span for every message where the OpenTelemetry SDK is installed, as it is in the
+development environment; ours sets tracing up only where an OTLP endpoint is named.
+"""
 
 
 def shown(title: str, rows: list[Row]) -> Table:
@@ -58,7 +70,8 @@ def main() -> int:
         console.print(f"[dim]{time.monotonic() - started:.0f} s, Python {platform.python_version()}[/]\n")
         pages.append(f"## {PARTS[name]}\n\n`make bench ARGS={name}`\n\n{markdown(rows)}\n")
     if options.markdown:
-        options.markdown.write_text("\n".join(pages), encoding="utf-8")
+        introduction = INTRODUCTION.format(cores=os.cpu_count(), python=platform.python_version())
+        options.markdown.write_text("\n".join([introduction, *pages]), encoding="utf-8")
     return 0 if kept else 1
 
 
