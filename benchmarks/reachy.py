@@ -119,8 +119,12 @@ def _look(daemon: Daemon, fleet: FleetClient, calls: int) -> Row:
 
 
 def _first_since(daemon: Daemon, started: float) -> float:
-    """When the first head frame after ``started`` arrived."""
-    return next(at for frame, at in daemon.arrivals(20) if at >= started and frame.get("head"))
+    """When the first head frame after ``started`` arrived, waited for."""
+
+    def found() -> list[float]:
+        return [at for frame, at in daemon.arrivals(20) if at >= started and frame.get("head")]
+
+    return eventually(found, 2.0, "the frame at the daemon")[0]
 
 
 def _stop(daemon: Daemon, fleet: FleetClient, driver: ReachyMiniDriver, stops: int) -> Row:

@@ -32,7 +32,7 @@ stamp=$dir/.installed
 want=$(sha256sum <"$0")
 [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$want" ] && exit 0
 ./scripts/system-packages.sh python3-venv python3-gi gir1.2-glib-2.0 gir1.2-gstreamer-1.0 gir1.2-gst-plugins-base-1.0
-echo "Installing reachy-mini $version into $dir (once; about a minute)..."
+echo "Installing reachy-mini $version into $dir (once; about a minute; what pip misses below is left out on purpose)..."
 rm -rf "$dir"
 /usr/bin/python3 -m venv "$dir"
 pip=("$dir/bin/pip" install --quiet --disable-pip-version-check)
