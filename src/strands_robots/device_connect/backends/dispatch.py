@@ -128,11 +128,13 @@ class CommandDesk:
         """
         found = jsonrpc.check(data)
         if isinstance(found, jsonrpc.Command):
-            room = MAX_COMMANDS + (RESERVED_COMMANDS if never_behind_motion(found.method) else 0)
-            if len(self._tasks) < room:
+            running = len(self._tasks)
+            if running < MAX_COMMANDS or (
+                running < MAX_COMMANDS + RESERVED_COMMANDS and never_behind_motion(found.method)
+            ):
                 _track(eager.start(self._serve(data, reply, found)), self._tasks)
                 return
-            found = jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {len(self._tasks)} commands are running", found.id)
+            found = jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {running} commands are running", found.id)
         self.refuse(found, reply)
 
     def refuse(self, refusal: jsonrpc.Refusal, reply: Any) -> None:

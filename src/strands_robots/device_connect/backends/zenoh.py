@@ -12,7 +12,7 @@ import logging
 import math
 import time
 from collections.abc import Awaitable, Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import zenoh
@@ -43,6 +43,7 @@ _REPLY = "_strands_reply/"
 _EVENT = {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA}
 
 
+@lru_cache(maxsize=1024)
 def key_of(subject: str) -> str:
     """The key expression for a dotted subject; one with a slash in it is a key expression already."""
     if "/" in subject:
@@ -167,17 +168,18 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             NotConnectedError: closed, or a client without its router.
         """
         deadline = time.monotonic() + timeout
-        for left in reversed(range(self._tries if self._link.is_peer else 1)):
-            shared, inbox = self._session(), self._inbox
-            remaining = max(deadline - time.monotonic(), 0.001)
+        key, of_peers, remaining = key_of(subject), self._link.is_peer, max(timeout, 0.001)
+        for left in reversed(range(self._tries if of_peers else 1)):
+            session, inbox = self._session().session, self._inbox
             assert inbox is not None
             try:
-                answer = await ask(shared.session, inbox, key_of(subject), data, remaining, of_peers=self._link.is_peer)
+                answer = await ask(session, inbox, key, data, remaining, of_peers=of_peers)
             except RequestTimeoutError as error:
                 raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
             if answer is not None:
                 return answer
-            if left == 0 or deadline - time.monotonic() <= self._retry_delay:
+            remaining = deadline - time.monotonic() - self._retry_delay
+            if left == 0 or remaining <= 0:
                 break
             # A peer that links at this very moment is not known here yet.
             await asyncio.sleep(self._retry_delay)

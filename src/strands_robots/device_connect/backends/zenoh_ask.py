@@ -29,60 +29,41 @@ _OPTIONS = {
 _OPTIONS_OF_A_PEER = {**_OPTIONS, "target": zenoh.QueryTarget.ALL}
 
 
-class Question:
+class _Question:
     """A query on its way: collects replies on Zenoh's thread and tells the loop what it needs to know, once."""
 
-    __slots__ = ("_answered", "_future", "_inbox", "_token", "failure")
+    __slots__ = ("answered", "failure", "future", "inbox")
 
     def __init__(self, loop: asyncio.AbstractEventLoop, inbox: Inbox) -> None:
         self.failure = ""
-        self._inbox = inbox
-        self._future: asyncio.Future[bytes | None] = loop.create_future()
-        self._answered = False
-        self._token: Any = zenoh.CancellationToken()
+        self.inbox = inbox
+        self.future: asyncio.Future[bytes | None] = loop.create_future()
+        self.answered = False
 
-    async def ask(self, session: Any, key: str, data: bytes, wait_s: float, *, of_peers: bool) -> bytes | None:
-        """The first reply; None when there is none, and then ``failure`` says why unless nobody was asked."""
-        deadline = self._future.get_loop().call_later(wait_s + _GRACE_S, self._on_deadline)
-        get = partial(
-            session.get,
-            key,
-            direct(self._on_reply, self._on_end),
-            payload=data,
-            timeout=wait_s,
-            cancellation_token=self._token,
-            **(_OPTIONS_OF_A_PEER if of_peers else _OPTIONS),
-        )
-        try:
-            if len(data) < LARGE_BYTES:
-                get()
-            else:
-                await on_a_thread(get)
-            return await self._future
-        finally:
-            deadline.cancel()
-            if not self._answered:
-                self._token.cancel()
-
-    def _on_reply(self, reply: Any) -> None:
-        if reply.ok is None:
+    def on_reply(self, reply: Any) -> None:
+        """On Zenoh's thread."""
+        ok = reply.ok
+        if ok is None:
             self.failure = reply.err.payload.to_bytes()[:200].decode(errors="replace")
-        elif not self._answered:
-            self._answered = True
-            self._inbox.put(self._settle, reply.ok.payload.to_bytes())
+        elif not self.answered:
+            self.answered = True
+            self.inbox.put(self.settle, ok.payload.to_bytes())
 
-    def _on_end(self) -> None:
+    def on_end(self) -> None:
+        """On Zenoh's thread."""
         # An answered question has woken the loop already.
-        if not self._answered:
-            self._inbox.put(self._settle, None)
+        if not self.answered:
+            self.inbox.put(self.settle, None)
 
-    def _on_deadline(self) -> None:
+    def on_deadline(self) -> None:
+        """On the loop."""
         self.failure = "Timeout"
-        self._settle(None)
+        self.settle(None)
 
-    def _settle(self, value: bytes | None) -> None:
-        if not self._future.done():
-            self._future.set_result(value)
+    def settle(self, value: bytes | None) -> None:
+        """On the loop."""
+        if not self.future.done():
+            self.future.set_result(value)
 
 
 async def ask(session: Any, inbox: Inbox, key: str, data: bytes, wait_s: float, *, of_peers: bool) -> bytes | None:
@@ -92,11 +73,25 @@ async def ask(session: Any, inbox: Inbox, key: str, data: bytes, wait_s: float, 
         RequestTimeoutError: somebody was asked and gave no reply within ``wait_s`` seconds.
         PublishError: the key is none, or the other side refused.
     """
-    question = Question(asyncio.get_running_loop(), inbox)
+    loop = asyncio.get_running_loop()
+    question = _Question(loop, inbox)
+    token: Any = zenoh.CancellationToken()
+    handler = direct(question.on_reply, question.on_end)
+    options = _OPTIONS_OF_A_PEER if of_peers else _OPTIONS
+    deadline = loop.call_later(wait_s + _GRACE_S, question.on_deadline)
     try:
-        answer = await question.ask(session, key, data, wait_s, of_peers=of_peers)
+        if len(data) < LARGE_BYTES:
+            session.get(key, handler, payload=data, timeout=wait_s, cancellation_token=token, **options)
+        else:
+            get = partial(session.get, key, handler, payload=data, timeout=wait_s, cancellation_token=token, **options)
+            await on_a_thread(get)
+        answer = await question.future
     except zenoh.ZError as error:
         raise PublishError(f"cannot ask {key}: {error}") from error
+    finally:
+        deadline.cancel()
+        if not question.answered:
+            token.cancel()
     if answer is None and question.failure == "Timeout":
         raise RequestTimeoutError(f"no reply on {key} in time")
     if answer is None and question.failure:
