@@ -61,12 +61,15 @@ def Robot(  # the factory reads as the class it stands for
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
         options: ``sim``: what ``Simulation`` takes (``timestep``, ``gravity``, ``realtime``). ``real``:
             ``control_hz``, ``joint_ranges``, ``stop_level``, and every other one goes to the LeRobot
-            configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``. ``reachy_mini``: ``host``
-            (looked for on the local network when there is none) and what ``ReachyDriver`` takes.
+            configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
+            dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
+            ``reachy_mini``: ``host`` (looked for on the local network when there is none) and what
+            ``ReachyDriver`` takes.
 
     Raises:
         ValidationError: an unknown name (the sentence lists the near ones) or an option outside its domain.
         MissingExtraError: the [sim] or [lerobot] extra, or that of the mesh, is not installed.
+        ConnectionError: a real robot could not be connected.
     """
     kind = choice("mode", mode, ("sim", "real"))
     if mesh is not None and not isinstance(mesh, bool):
@@ -171,7 +174,10 @@ def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
 
     ours = {key: options.pop(key) for key in ("control_hz", "joint_ranges", "stop_level") if key in options}
     robot = _made(_hardware_class(), make_device(name, options), tool_name=tool_name or _label(name), **ours)
-    robot.connect()
+    try:
+        robot.connect()
+    except Exception as exc:
+        raise ConnectionError(f"{name} could not be connected: {' '.join(str(exc).split())}") from exc
     return robot
 
 

@@ -65,7 +65,7 @@ def outcome(screen: Screen, body: Callable[[], None]) -> Exit:
     except ValidationError as refused:
         screen.fail(Failure(str(refused), Exit.USAGE))
         return Exit.USAGE
-    except MissingExtraError as missing:
+    except (MissingExtraError, ConnectionError) as missing:
         screen.fail(Failure(str(missing)))
         return Exit.REFUSED
     except KeyboardInterrupt:

@@ -83,16 +83,21 @@ class DeviceBody:
                 drop(self.device)
             elif self.is_connected and hasattr(self.device, "is_connected"):
                 return
-            try:
-                write_to_servos(self.device)
-                if "calibrate" in inspect.signature(self.device.connect).parameters:
-                    self.device.connect(calibrate=False)
-                else:
-                    self.device.connect()
-            except BaseException:
-                drop(self.device)
-                raise
+            self.bring_up(self.device)
             self._lost = False
+
+    @staticmethod
+    def bring_up(device: Any) -> None:
+        """Connect a follower or leader, its calibration first. Raises what it raises, with its port closed."""
+        try:
+            write_to_servos(device)
+            if "calibrate" in inspect.signature(device.connect).parameters:
+                device.connect(calibrate=False)
+            else:
+                device.connect()
+        except BaseException:
+            drop(device)
+            raise
 
     def get_observation(self) -> dict[str, Any]:
         with self.lock:

@@ -21,6 +21,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason="needs LeRobot's driver: make real-arm"))
 
 
+@pytest.fixture(autouse=True, scope="session")
+def lerobot_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """LeRobot keeps calibrations in a directory that it reads from the environment when it is imported."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HF_LEROBOT_HOME", str(tmp_path_factory.mktemp("lerobot-home")))
+        yield
+
+
 @pytest.fixture
 def bus(tmp_path: Path) -> Iterator[FeetechBus]:
     """Six calibrated servos on a port that keeps its name."""

@@ -101,7 +101,7 @@ def test_a_port_that_is_not_there_is_told(arm: Arm) -> None:
 
 def test_a_first_connection_that_failed_can_be_tried_again(arm: Arm, bus: FeetechBus) -> None:
     bus.servos[3].dead = True
-    with pytest.raises(RuntimeError, match="Missing motor IDs"):
+    with pytest.raises(ConnectionError, match="Missing motor IDs"):
         arm()
     bus.servos[3].dead = False
     assert arm().get_state()["joints"]

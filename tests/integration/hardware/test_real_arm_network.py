@@ -33,7 +33,7 @@ class Bench:
         self.runtimes: list[Any] = []
         for number, bus in enumerate(self.buses, start=1):
             bus.plug()
-            options = {"port": bus.port, "calibration": calibration, "calibration_dir": folder}
+            options: dict[str, Any] = {"port": bus.port, "calibration": calibration, "calibration_dir": folder}
             robot = Robot("so101", mode="real", tool_name=f"arm-{number}", stop_level=stop_level, **options)
             self.robots.append(robot)
             self.runtimes.append(init_device_connect_sync(robot, peer_id=f"arm-{number}", link=link))

@@ -1,0 +1,184 @@
+"""``teleop LEADER FOLLOWER``: one leads, the other follows, on this machine. ``calibrate``: an arm's ends, by hand."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from strands_robots.cli.command import command
+from strands_robots.cli.output import Failure, Screen, table
+from strands_robots.envelope import is_error, text_of
+from strands_robots.teleop import FULL_RANGES_PER_S
+from strands_robots.utils import ValidationError
+
+if TYPE_CHECKING:
+    from strands_robots.hardware.calibrating import Reach
+
+_LOOK_S = 0.05
+_NAME = "leader"
+_METHODS = {"keyboard": "keyboard", "gamepad": "gamepad"}
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``teleop`` and ``calibrate`` to the application."""
+    command(app, "teleop")(teleop)
+    command(app, "calibrate")(calibrate)
+
+
+def teleop(
+    screen: Screen,
+    *,
+    leader: Annotated[str, typer.Argument(help="keyboard, gamepad, a recording (.csv), or TYPE@PORT of a leader arm.")],
+    follower: Annotated[str, typer.Argument(help="TYPE@PORT of a real arm, such as so101@/dev/ttyACM0, or a model.")],
+    leader_id: Annotated[str | None, typer.Option("--leader-id", help="Whose calibration the leader has.")] = None,
+    follower_id: Annotated[str | None, typer.Option("--id", help="Whose calibration the follower has.")] = None,
+    leader_calibration: Annotated[
+        Path | None, typer.Option("--leader-calibration", help="A calibration file of the leader.")
+    ] = None,
+    calibration: Annotated[Path | None, typer.Option("--calibration", help="The same of the follower.")] = None,
+    seconds: Annotated[float | None, typer.Option("--for", help="End after that many seconds.")] = None,
+    hz: Annotated[float, typer.Option("--hz", help="Frames a second, 1 to 1000.")] = 50.0,
+    max_speed: Annotated[
+        float, typer.Option("--max-speed", help="Whole joint ranges a second that the follower may cross.")
+    ] = FULL_RANGES_PER_S,
+) -> None:
+    """Let a leader drive a follower until it ends or Ctrl-C, which stops the follower first."""
+    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
+
+    kind, at, port = follower.partition("@")
+    options = _options(port, follower_id, calibration) if at else {}
+    robot = Robot(kind, mode="real" if at else "sim", **options)
+    try:
+        with _led(leader, robot, _options("", leader_id, leader_calibration)) as source:
+            method = _METHODS.get(leader, "arm")
+            for answer in (
+                robot.attach_teleop(source, _NAME, method=method, max_speed=max_speed),
+                robot.teleoperate(_NAME, duration=seconds, hz=hz),
+            ):
+                if is_error(answer):
+                    raise Failure(text_of(answer))
+            screen.say(f"{leader} leads {follower}. Ctrl-C stops the follower.")
+            for name, up, down in getattr(source, "help", []):
+                screen.say(f"  {up} and {down} move {name}")
+            row = _followed(robot)
+    finally:
+        verdict = robot.halt("teleop ended")
+        robot.cleanup()
+    screen.data({"event": "ended", **row, "stopped": verdict.stopped})
+    if row["state"] == "error":
+        raise Failure(f"The teleoperation failed: {row['error']}", **row)
+    screen.say(f"{row['state'].capitalize()} after {row['step']} frames, {row['errors']} of them unusable.", "green")
+    if not verdict.stopped:
+        raise Failure("The follower did not confirm its stop.")
+
+
+def calibrate(
+    screen: Screen,
+    *,
+    arm: Annotated[str, typer.Argument(help="Such as so101.")],
+    port: Annotated[str, typer.Option("--port", help="Its serial port, such as /dev/ttyACM0.")],
+    device: Annotated[str | None, typer.Option("--id", help="Under which the calibration is kept.")] = None,
+    leader: Annotated[bool, typer.Option("--leader", help="It is a leader arm.")] = False,
+) -> None:
+    """Measure an arm's middle and the ends of its joints, moved by hand. Its torque goes off: hold it."""
+    from strands_robots.hardware.calibrating import Calibrating  # noqa: PLC0415 - real arms only
+    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
+
+    made = make_device(arm, _options(port, device, None), "leader" if leader else "follower", calibrated=False)
+    steps = Calibrating(made)
+    try:
+        steps.begin()
+        screen.say("The torque is off. Move every joint to the middle of its motion, then press Enter.")
+        _line()
+        steps.centre()
+        screen.say("Now move every joint from one end to the other, then press Enter.")
+        steps.watch(_enter().is_set, lambda reaches: _show(screen, reaches))
+        path = steps.finish()
+    finally:
+        steps.close()
+    screen.data({"status": "success", "file": str(path)})
+    screen.say(f"Calibrated; kept in {path}.", "green")
+
+
+@contextmanager
+def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
+    """The leader of that name, ready to lead ``robot``."""
+    if leader in _METHODS:
+        from strands_robots.leaders import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
+
+        body = robot.body()
+        present = body.get_joints()
+        start = {key: present[key] for key in body.bounds if key in present}
+        made = KeyboardLeader if leader == "keyboard" else GamepadLeader
+        with made(start, body.bounds) as led:
+            yield led
+        return
+    kind, at, port = leader.partition("@")
+    if not at:
+        from strands_robots.leaders import RecordedLeader, read_frames  # noqa: PLC0415 - as above
+
+        yield RecordedLeader(read_frames(Path(leader)))
+        return
+    from strands_robots.hardware import DeviceBody  # noqa: PLC0415 - real arms only
+    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
+
+    arm = make_device(kind, {**options, "port": port}, "leader")
+    DeviceBody.bring_up(arm)
+    try:
+        yield arm
+    finally:
+        arm.disconnect()
+
+
+def _followed(robot: Any) -> dict[str, Any]:
+    """Wait for the end; the leader's row."""
+    try:
+        while _NAME in robot.teleoperating():
+            time.sleep(_LOOK_S)
+    except KeyboardInterrupt:
+        robot.halt("Ctrl-C")
+    row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
+    return row
+
+
+def _options(port: str, device: str | None, calibration: Path | None) -> dict[str, Any]:
+    given = {"port": port or None, "id": device, "calibration": calibration}
+    return {key: value for key, value in given.items() if value is not None}
+
+
+def _line() -> None:
+    if not sys.stdin.readline():
+        raise ValidationError("calibrate needs somebody at the keyboard; standard input has ended.")
+
+
+def _enter() -> threading.Event:
+    """Set when Enter is pressed."""
+    pressed = threading.Event()
+
+    def read() -> None:
+        sys.stdin.readline()
+        pressed.set()
+
+    threading.Thread(target=read, name="enter", daemon=True).start()
+    return pressed
+
+
+def _show(screen: Screen, reaches: dict[str, Reach]) -> None:
+    if screen.out.is_terminal and not screen.machine:
+        rows = [(motor, each.low, each.present, each.high) for motor, each in reaches.items()]
+        screen.out.control(_home(len(rows)))
+        screen.show(table("", ("joint", "lowest", "now", "highest"), rows))
+    time.sleep(_LOOK_S)
+
+
+def _home(rows: int) -> Any:
+    from rich.control import Control  # noqa: PLC0415 - Rich is loaded when something is shown
+
+    return Control.move(0, -(rows + 3)) if rows else Control()

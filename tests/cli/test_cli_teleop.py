@@ -1,0 +1,38 @@
+"""``teleop`` as a command, on a simulated follower."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tests.cli.conftest import Run
+
+from strands_robots.leaders import write_csv
+
+
+def test_a_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) -> None:
+    frames = [(0.02 * step, {"shoulder_pan": 0.004 * step}) for step in range(25)]
+    write_csv(tmp_path / "run.csv", frames)
+    result = run("teleop", str(tmp_path / "run.csv"), "so100", "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert told["state"] == "completed"
+    assert told["stopped"] is True
+    assert told["frames"] >= 10
+
+
+def test_what_cannot_lead_is_refused_by_name(run: Run, tmp_path: Path) -> None:
+    for leader, words in (("nobody", "recording"), (str(tmp_path / "none.csv"), "cannot be read")):
+        result = run("teleop", leader, "so100", "--json")
+        assert result.exit_code == 2
+        assert words in json.loads(result.stdout)["reason"]
+
+
+def test_without_a_terminal_the_keyboard_is_refused(run: Run) -> None:
+    result = run("teleop", "keyboard", "so100", "--json")
+    assert result.exit_code != 0
+
+
+def test_a_real_follower_without_lerobot_names_the_extra(run: Run) -> None:
+    result = run("teleop", "keyboard", "no-such-arm@/dev/ttyACM0", "--json")
+    assert result.exit_code in (1, 2)

@@ -1,0 +1,130 @@
+"""A real leader arm and a real follower, and a calibration by hand, through LeRobot's driver."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.feetech_bus import MOTORS, FeetechBus, arm_calibration, arm_servos
+from fixtures.waiting import eventually
+from typer.testing import CliRunner
+
+from strands_robots.cli.app import build
+from strands_robots.hardware.calibrating import Calibrating, Reach
+from strands_robots.hardware.lerobot_device import make_device
+from strands_robots.utils import ValidationError
+
+pytestmark = pytest.mark.system
+
+
+def test_a_follower_goes_where_the_leader_is_moved(bus: FeetechBus, calibration: Path, tmp_path: Path) -> None:
+    with FeetechBus(arm_servos(), link=tmp_path / "leader") as leader:
+        pan = leader.servos[1]
+        start = pan.shaft
+
+        def wave() -> None:
+            for step in range(100):
+                pan.shaft = start + 400 * math.sin(step / 100 * math.tau)
+                time.sleep(0.02)
+            pan.shaft = start + 300
+
+        by_hand = threading.Thread(target=wave)
+        by_hand.start()
+        files = ["--calibration", str(calibration), "--leader-calibration", str(calibration)]
+        line = ["teleop", f"so101@{leader.port}", f"so101@{bus.port}", *files, "--for", "3", "--json"]
+        result = CliRunner().invoke(build(), line)
+        by_hand.join()
+        assert result.exit_code == 0, result.output
+        told = json.loads(result.stdout)
+        assert told["state"] == "completed"
+        assert told["stopped"] is True
+        assert told["errors"] == 0
+        assert told["frames"] > 100
+        assert abs(bus.shafts()[1] - pan.shaft) < 20
+        assert not any(servo.torque for servo in leader.servos.values()), "a leader is moved by hand"
+        goals = [int.from_bytes(each.data, "little") for each in bus.writes if each.servo == 1 and each.address == 42]
+        steps = [abs(after - before) for before, after in itertools.pairwise(goals)]
+        assert max(steps) <= 2 * 2500 * 2.0 * 0.02, "the speed bound, of at most two periods"
+
+
+def test_a_follower_whose_port_is_missing_is_one_sentence(calibration: Path) -> None:
+    line = ["teleop", "keyboard", "so101@/dev/no-such-port", "--calibration", str(calibration), "--json"]
+    result = CliRunner().invoke(build(), line)
+    assert result.exit_code == 1
+    assert "so101 could not be connected" in json.loads(result.stdout)["reason"]
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Any:
+    with FeetechBus(arm_servos(calibrated=False), link=tmp_path / "fresh") as fresh:
+        yield fresh
+
+
+def follower(fresh: FeetechBus, tmp_path: Path) -> Any:
+    options = {"port": fresh.port, "id": "new", "calibration_dir": tmp_path / "kept"}
+    return make_device("so101", options, calibrated=False)
+
+
+def test_an_arm_is_calibrated_by_moving_it(fresh: FeetechBus, tmp_path: Path) -> None:
+    steps = Calibrating(follower(fresh, tmp_path))
+    steps.begin()
+    assert not any(servo.torque for servo in fresh.servos.values())
+    for number, servo in fresh.servos.items():
+        servo.shaft = 2000.0 + 10 * number
+    steps.centre()
+    seen: dict[str, Reach] = {}
+    for move in (-900, 800):
+        for servo in fresh.servos.values():
+            servo.shaft += move
+        seen = steps.look()
+        for servo in fresh.servos.values():
+            servo.shaft -= move
+    assert "wrist_roll" not in seen
+    path = steps.finish()
+    steps.close()
+    kept = json.loads(path.read_text(encoding="utf-8"))
+    assert path == tmp_path / "kept" / "new.json"
+    assert list(kept) == list(MOTORS)
+    assert kept["shoulder_pan"] == {
+        "id": 1,
+        "drive_mode": 0,
+        "homing_offset": 2010 - 2047,
+        "range_min": 2047 - 900,
+        "range_max": 2047 + 800,
+    }
+    assert (kept["wrist_roll"]["range_min"], kept["wrist_roll"]["range_max"]) == (0, 4095)
+    again = follower(fresh, tmp_path)
+    again.connect(calibrate=False)
+    assert again.is_calibrated, "LeRobot reads the file and finds the same in the servos"
+    again.disconnect()
+
+
+def test_joints_that_were_not_moved_are_named_and_nothing_is_kept(fresh: FeetechBus, tmp_path: Path) -> None:
+    steps = Calibrating(follower(fresh, tmp_path))
+    steps.begin()
+    steps.centre()
+    fresh.servos[1].shaft += 5
+    steps.look()
+    fresh.servos[1].shaft += 500
+    steps.look()
+    with pytest.raises(ValidationError, match="not moved: shoulder_lift, elbow_flex, wrist_flex, gripper"):
+        steps.finish()
+    steps.close()
+    assert not (tmp_path / "kept" / "new.json").exists()
+
+
+def test_the_command_asks_step_by_step(fresh: FeetechBus) -> None:
+    ended = CliRunner().invoke(build(), ["calibrate", "so101", "--port", fresh.port, "--id", "new"], input="")
+    assert ended.exit_code == 2
+    assert "standard input has ended" in ended.output
+    eventually(lambda: not any(servo.torque for servo in fresh.servos.values()))
+
+
+def test_the_calibration_of_the_fixture_is_lerobots_own_shape() -> None:
+    assert set(arm_calibration()) == set(MOTORS)
