@@ -65,6 +65,12 @@ class Peer:
     events: tuple[str, ...] = ()
     location: str = ""
 
+    @property
+    def stop_verb(self) -> str | None:
+        """The function that stops it: ``stop``, else ``stopMotion``, else None."""
+        names = {str(each.get("name", "")) for each in self.functions}
+        return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
+
     @classmethod
     def of(cls, presence: Mapping[str, Any]) -> Peer:
         """What a presence message says; whatever it lacks is empty."""
@@ -210,7 +216,7 @@ class FleetClient:
 
     def stop_all(self, timeout: float = 5.0) -> dict[str, Envelope]:
         """Stop every device that can be seen, all at once; what each answered, by id."""
-        peers = [peer.id for peer in self.peers() if _stop_verb(peer)]
+        peers = [peer.id for peer in self.peers() if peer.stop_verb]
 
         async def all_of_them() -> dict[str, Envelope]:
             answers = await asyncio.gather(*(self._stop(peer, timeout) for peer in peers))
@@ -331,11 +337,6 @@ class Subscription:
 def _object(presence: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = presence.get(key)
     return value if isinstance(value, Mapping) else {}
-
-
-def _stop_verb(peer: Peer) -> str | None:
-    names = {str(each.get("name", "")) for each in peer.functions}
-    return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
 
 
 def _parts(subject: str) -> list[str]:

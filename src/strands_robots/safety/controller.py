@@ -155,6 +155,14 @@ class SafetyController:
                 del self._stops[run.estop_id]
         return self._report(run)
 
+    def expect(self, estop_id: str, names: Collection[str]) -> None:
+        """Name further robots that must answer the running stop ``estop_id``: for a roll called after it has left."""
+        with self._changed:
+            run = self._stops.get(estop_id)
+            if run is not None:
+                run.expected |= frozenset(names)
+                self._changed.notify_all()
+
     def check_in_every(self, interval_s: float) -> None:
         """Check in with the robots that need a live controller, from now until ``close``."""
         number("interval_s", interval_s, low=0.02, high=60)
@@ -182,7 +190,7 @@ class SafetyController:
             now = time.monotonic()
             late = now - run.started >= UNCONFIRMED_S
             with self._changed:
-                state = hash((len(run.answers), late, self._link.up))
+                state = hash((len(run.answers), len(run.expected), late, self._link.up))
                 finished = run.complete or now - run.started >= deadline_s
             if state != told or finished:
                 told = state
@@ -197,9 +205,9 @@ class SafetyController:
                 next_send = now + pause
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
             with self._changed:
-                seen = (len(run.answers), self._link.up)
+                seen = (len(run.answers), self._link.up, len(run.expected))
                 self._changed.wait_for(
-                    lambda seen=seen: seen != (len(run.answers), self._link.up),  # type: ignore[misc]
+                    lambda seen=seen: seen != (len(run.answers), self._link.up, len(run.expected)),  # type: ignore[misc]
                     max(0.0, min(marks) - time.monotonic()),
                 )
                 if self._link.up and not seen[1]:

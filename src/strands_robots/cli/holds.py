@@ -1,0 +1,81 @@
+"""What holds each robot: asked over the network, and read from this machine's lockout file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.cli.fleet import asked
+from strands_robots.cli.output import Failure
+from strands_robots.safety.lockout import OVERFLOW, Hold, utc
+from strands_robots.safety.persistence import LockoutStore
+
+if TYPE_CHECKING:
+    from strands_robots.device_connect import FleetClient
+
+AT_ONCE = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """One robot as it says it stands, or why it does not say: ``problem`` is empty where it answered."""
+
+    name: str
+    holds: tuple[Hold, ...] = ()
+    problem: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def resumable(self) -> tuple[str, ...]:
+        """The epochs that a signature can clear."""
+        return tuple(hold.epoch for hold in self.holds if hold.epoch != OVERFLOW)
+
+
+def standing(fleet: FleetClient, names: Iterable[str], seconds: float) -> list[Standing]:
+    """What each robot says of itself, asked side by side."""
+    wanted = list(dict.fromkeys(names))
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        return list(pool.map(lambda name: _ask(fleet, name, seconds), wanted))
+
+
+def on_disk() -> dict[str, tuple[Hold, ...]]:
+    """The robots of this machine that the lockout file holds, by key where they have no name.
+
+    Raises:
+        Failure: the file cannot be read.
+    """
+    try:
+        kept = LockoutStore().load_all()
+    except (OSError, ValueError) as exc:
+        raise Failure(f"The lockout file of this machine cannot be read, so its robots come up locked: {exc}") from exc
+    return {each.name or key: each.state.all for key, each in kept.items() if each.state.locked}
+
+
+def _ask(fleet: FleetClient, name: str, seconds: float) -> Standing:
+    try:
+        answer = asked(fleet, name, "getStatus", {}, seconds)
+    except Failure as failure:
+        return Standing(name, problem=failure.reason)
+    if "locked" not in answer:
+        return Standing(name, problem="it says nothing of a lockout", facts=answer)
+    told = answer.get("lockout")
+    holds = tuple(_hold(each) for each in told if isinstance(each, Mapping)) if isinstance(told, list) else ()
+    return Standing(name, holds, facts=answer)
+
+
+def _hold(told: Mapping[str, Any]) -> Hold:
+    since = told.get("since")
+    at = float(since) if isinstance(since, int | float) else 0.0
+    return Hold(str(told.get("epoch", "")), str(told.get("source", "")), str(told.get("reason", "")), at)
+
+
+def rows(name: str, holds: Iterable[Hold], where: str) -> list[tuple[str, ...]]:
+    """Cells for one robot, one row for each hold."""
+    return [(name, hold.source, hold.reason, utc(hold.at), hold.epoch, where) for hold in holds]
+
+
+def fields(hold: Hold) -> dict[str, Any]:
+    """A hold for ``--json``."""
+    return {"epoch": hold.epoch, "source": hold.source, "reason": hold.reason, "since": hold.at}
