@@ -94,7 +94,6 @@ class Assembled:
         context, peer = self.context, self.context.peer_id
         context.transport = transport
         context.identity = self.identity_of(transport)
-        self.lanes.start()
         hear = transport.declare_subscriber
         self.held = [
             # The resumes first: one that the broker kept tells which kept e-stop is over.
@@ -162,7 +161,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     key = simulation_key(peer) if parts.keep and robot is not None else None
     door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
     caller = Caller(context)
-    safety = FleetSafety(context, door, caller, lanes.safety)
+    safety = FleetSafety(context, door, caller, lanes.stop_lane)
     teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, _body(robot), source, device))
     inputs: dict[str, dict[str, Any]] = {}
 

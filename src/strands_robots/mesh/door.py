@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Protocol
 
 from strands_robots.envelope import is_error
@@ -15,6 +16,11 @@ from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
+
+Verdict = Callable[[], StopVerdict | None]
+
+REPORT_S = 2.0
+"""Seconds besides the halt deadline in which the plane reports, its lockout file included."""
 
 
 class SafetyDoor(Protocol):
@@ -29,8 +35,11 @@ class SafetyDoor(Protocol):
     def counts(self, source: str) -> str | None:
         """Why an e-stop of ``source`` does not count, or None."""
 
-    def stop(self, order: StopOrder) -> StopVerdict | None:
-        """Lock under the order's epoch and halt; waits for the verdict. None when the epoch was seen before."""
+    def begin(self, order: StopOrder) -> Verdict | None:
+        """Lock under the order's epoch, set the halt going and return at once; None when the epoch was seen before.
+
+        What is returned waits for the robot's verdict, within the halt deadline; None when there is none.
+        """
 
     def resume(self, assertion: object) -> str | None:
         """Clear one epoch, when the assertion is an operator's and for this robot; else the one rejection."""
@@ -81,13 +90,17 @@ class PlaneDoor:
     def counts(self, source: str) -> str | None:
         return self._decision.source_refusal(source)
 
-    def stop(self, order: StopOrder) -> StopVerdict | None:
-        run = self._plane.begin(order)
+    def begin(self, order: StopOrder) -> Verdict | None:
+        run, entry = self._plane.begin(order), self._entry
         if run is None:
             return None
-        run.wait(run.deadline_s + 2.0)
-        report = self._entry.reports.get(order.epoch) if self._entry is not None else None
-        return report.verdict if report is not None else None
+
+        def verdict() -> StopVerdict | None:
+            run.wait(run.deadline_s + REPORT_S)
+            report = entry.reports.get(order.epoch) if entry is not None else None
+            return report.verdict if report is not None else None
+
+        return verdict
 
     def resume(self, assertion: object) -> str | None:
         entry = self._entry

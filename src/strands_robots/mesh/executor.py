@@ -1,4 +1,4 @@
-"""Bounded work: commands on a few workers, stops on one of their own, fleet stops on another."""
+"""Bounded work: commands on a few workers, stops on one of their own. A fleet stop waits for no worker."""
 
 from __future__ import annotations
 
@@ -30,12 +30,6 @@ class Lane:
         self._open = True
         self._busy = 0
         self.dropped = 0
-
-    def start(self) -> None:
-        """Have one thread ready, where the first job must not wait for a thread to start."""
-        with self._lock:
-            if not self._threads:
-                self._add()
 
     def submit(self, work: Work) -> bool:
         """Queue a job; False when the lane is full or closed."""
@@ -95,10 +89,9 @@ class Lane:
 
 
 class Lanes:
-    """The lanes of one peer: commands (4 workers, 32 waiting), stops, the safety topics, and delivery to its user."""
+    """The lanes of one peer: commands (4 workers, 32 waiting), stops and resumes, and delivery to its user."""
 
     def __init__(self, peer_id: str) -> None:
-        self.safety = Lane(f"{peer_id}-safety", 1, 256)
         self.stop_lane = Lane(f"{peer_id}-stop", 1, 64)
         self.commands = Lane(f"{peer_id}-command", 4, 32)
         self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)
@@ -107,12 +100,9 @@ class Lanes:
         """The lane an action runs on."""
         return self.stop_lane if action == "stop" else self.commands
 
-    def start(self) -> None:
-        self.safety.start()
-
     def stop(self, timeout: float) -> list[str]:
         deadline = time.monotonic() + timeout
         alive: list[str] = []
-        for lane in (self.commands, self.delivery, self.stop_lane, self.safety):
+        for lane in (self.commands, self.delivery, self.stop_lane):
             alive += lane.stop(max(0.0, deadline - time.monotonic()))
         return alive

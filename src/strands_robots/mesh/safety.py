@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import threading
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -39,7 +38,7 @@ class FleetSafety:
     """Issues and receives fleet e-stops and resumes for one peer.
 
     Args:
-        lane: where a received stop is carried out; it carries nothing else.
+        lane: where a relayed resume is checked, off the transport's thread.
     """
 
     def __init__(self, context: Context, door: SafetyDoor, caller: Caller, lane: Lane) -> None:
@@ -60,18 +59,8 @@ class FleetSafety:
         """Stop this robot and every peer; the local answer first, then each attributed reply."""
         context = self._context
         order = StopOrder(new_epoch(), context.peer_id, "emergency stop", "mesh", issued=context.clock())
-        local: list[StopVerdict | None] = []
-        halted = threading.Event()
-
-        def halt() -> None:
-            try:
-                local.append(self._door.stop(order))
-            finally:
-                halted.set()
-
-        # The fleet hears of it while the local robot is being halted, and the other way round.
-        if not self._lane.submit(halt):
-            halt()
+        # The halt is set going, and the fleet hears of it while the local robot stops.
+        local = self._door.begin(order)
         none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
         self._publish_estop(order, none)
         roster = {row["peer_id"] for row in context.registry.all() if row["reachable"]} - {context.peer_id}
@@ -87,8 +76,7 @@ class FleetSafety:
             return absent
 
         replies = self._caller.broadcast({"action": "stop"}, COLLECT_S, missing)
-        halted.wait(COLLECT_S)
-        verdict = local[0] if local and local[0] is not None else StopVerdict(unknown={context.peer_id: "no answer"})
+        verdict = (local() if local is not None else None) or StopVerdict(unknown={context.peer_id: "no answer"})
         own = wire.Reply(
             "response", context.peer_id, order.epoch, dispatch.told(verdict), timestamp=context.clock()
         ).to_wire()
@@ -134,7 +122,7 @@ class FleetSafety:
     # Receiving.
 
     def on_estop(self, sample: Sample) -> None:
-        """A fleet e-stop arrived; it is carried out on the safety lane."""
+        """A fleet e-stop arrived: when this returns every robot of this process is locked and its halt under way."""
         received = time.monotonic()
         context = self._context
         try:
@@ -158,19 +146,14 @@ class FleetSafety:
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch, reason="resumed since")
             return
         order = StopOrder(epoch, notice.peer_id, "fleet e-stop", "mesh", True, notice.t, received)
-        if self._lane.submit(lambda: self._engage(order)):
-            self._recent.append(epoch)
-        else:
-            logger.critical("The safety lane is full; emergency stop %s of %s waits.", epoch, notice.peer_id)
-
-    def _engage(self, order: StopOrder) -> None:
-        # The plane records what it did, when the stop was issued, and a source that issues too many.
-        if self._door.stop(order) is None:
-            self._context.audit("remote_estop_redundant", order.source, estop_id=order.epoch)
+        self._recent.append(epoch)
+        # The plane locks and sets the halts going at once; nothing on this way waits.
+        if self._door.begin(order) is None:
+            context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
             return
-        if order.timing(self._context.clock()) == "ahead":
-            self._context.audit("estop_clock_skew", order.source, estop_id=order.epoch)
-        self._tell("emergency_stop", order.epoch)
+        if order.timing(context.clock()) == "ahead":
+            context.audit("estop_clock_skew", notice.peer_id, estop_id=epoch)
+        self._tell("emergency_stop", epoch)
 
     def _tell(self, event: str, epoch: str) -> None:
         """The redacted event for dashboards: what happened, as a code, and nothing of why."""
