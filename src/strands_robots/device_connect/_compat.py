@@ -16,10 +16,10 @@ from typing import Any
 from device_connect_edge import device as framework
 from device_connect_edge.device import DeviceRuntime
 from device_connect_edge.drivers import DeviceDriver, decorators
-from device_connect_edge.messaging.exceptions import MessagingError, NotConnectedError
+from device_connect_edge.messaging.exceptions import AuthenticationError, MessagingError, NotConnectedError
 
 from .. import settings
-from .backends import LinkConfig, jsonrpc, register
+from .backends import LinkConfig, backend_for, jsonrpc
 
 FRAMEWORK_VERSION = "0.2.5"
 
@@ -36,6 +36,8 @@ LEANED_ON = {
         "_resubscribe_after_reconnect",
         "_notify_conn_state",
         "_build_registration_params",
+        "_register",
+        "_track_task",
         "enqueue_event",
     ),
     "DeviceDriver": ("_get_functions", "_invoke_decorated", "invoke"),
@@ -46,6 +48,12 @@ LEANED_ON = {
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events are kept; a server that restarts is back sooner, and an older event is a
 lie about the present."""
+
+CONNECT_AGAIN_S = 1.0
+"""Seconds between two attempts to reach a router or server that was not there."""
+
+MAX_REFUSALS = 3
+"""Attempts with credentials that the server refuses; then the start ends with its reason."""
 
 _log = logging.getLogger(__name__)
 
@@ -151,14 +159,32 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         return asyncio.run_coroutine_threadsafe(self.enqueue_event(event, payload), self._loop)
 
     async def _connect_messaging(self) -> None:
+        """Connect, however late the other side comes. The stock loop lets up to 30 s pass between two attempts."""
         framework.DeviceConnectTelemetry = _telemetry
-        stock, self._messaging_backend = self._messaging_backend, register(self.link)
-        try:
-            await super()._connect_messaging()
-        finally:
-            self._messaging_backend = stock
+        self.messaging = backend_for(self.link)
+        refusals = 0
+        while True:
+            try:
+                await self.messaging.connect([], reconnect_cb=self._on_link_back, disconnect_cb=self._on_link_lost)
+                break
+            except MessagingError as error:
+                refusals += isinstance(error, AuthenticationError)
+                if refusals == MAX_REFUSALS:
+                    raise
+                _log.warning("%s: %s; trying again in %g s", self.device_id, error, CONNECT_AGAIN_S)
+            await asyncio.sleep(CONNECT_AGAIN_S)
+        await self._notify_conn_state(True)
         if self._before_live is not None and not self._ready.is_set():
             await self._before_live(self.messaging)
+
+    async def _on_link_lost(self) -> None:
+        await self._notify_conn_state(False)
+
+    async def _on_link_back(self) -> None:
+        if not self._d2d_mode:
+            self._track_task(asyncio.create_task(self._register(force=True)))
+        self._track_task(asyncio.create_task(self._resubscribe_after_reconnect()))
+        await self._notify_conn_state(True)
 
     async def _notify_conn_state(self, state: bool) -> None:
         if state:

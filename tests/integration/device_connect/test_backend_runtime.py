@@ -6,9 +6,12 @@ import threading
 
 import pytest
 from device_connect_edge import DeviceRuntime
+from device_connect_edge.messaging.exceptions import AuthenticationError
 from fixtures.bare_caller import Caller
 from fixtures.echo_device import EchoDriver
+from fixtures.nats_server import NatsServer
 from fixtures.waiting import free_port, until
+from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client, register, sessions
@@ -90,6 +93,31 @@ async def test_a_start_that_waits_for_a_router_can_be_ended():
     await runtime.shutdown()
     assert task.done()
     await until(lambda: not sessions.open_links(), 2)
+
+
+async def test_a_router_that_comes_late_is_found_soon():
+    absent = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=0.2)
+    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=absent, allow_insecure=True)
+    task = asyncio.create_task(runtime.run())
+    with pytest.raises(TimeoutError):
+        await runtime.wait_ready(1.5)
+    with ZenohRouter(port=int(absent.connect[0].rpartition(":")[2])):
+        await runtime.wait_ready(5)
+        async with Caller(client=await open_client(absent)) as caller:
+            await caller.sees("arm-1")
+            assert (await caller.call("arm-1", "getStatus"))["result"]
+        await runtime.shutdown()
+    assert task.done()
+
+
+async def test_credentials_that_a_server_refuses_end_the_start_with_its_reason():
+    with NatsServer(accounts="authorization { token: right }") as server:
+        link = LinkConfig("nats", connect=(server.url.replace("//", "//wrong@"),), connect_timeout_s=1)
+        runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
+        task = asyncio.create_task(runtime.run())
+        with pytest.raises(AuthenticationError):
+            await runtime.wait_ready(15)
+    await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_a_link_on_which_nobody_proves_who_he_is_needs_the_opt_in(link):

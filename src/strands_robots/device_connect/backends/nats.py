@@ -207,9 +207,10 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
         self._closing = True
         for subscription in tuple(self._desks):
             await subscription.unsubscribe()
-        if not self._client.is_closed:
-            if self._client.is_connected:
-                await self.flush()
+        if self._client.is_connected:
+            await self.flush()
+        # A client that was never connected has nothing to close, and nats-py trips over it.
+        if self._client.is_connected or self._client.is_reconnecting:
             await self._client.close()
 
     @property
@@ -220,7 +221,7 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
     @property
     def is_closed(self) -> bool:
         """True after ``close``."""
-        return bool(self._client.is_closed)
+        return self._closing or bool(self._client.is_closed)
 
     async def _declare(
         self,
