@@ -142,8 +142,8 @@ def test_a_null_action_an_old_frame_and_a_burst_move_nothing(stream: Stream) -> 
     eventually(lambda: stream.stat("out_of_order")() == 1, within=2)
     for number in range(11, 111):
         stream.leader.put("strands/lead/input/leader", stream.frame(seq=number))
-    eventually(lambda: stream.stat("rate_dropped")() >= 80, within=2)
-    assert len(stream.arm.actions) <= 15
+    eventually(lambda: stream.stat("rate_dropped")() >= 70, within=2)
+    assert len(stream.arm.actions) <= 25
 
 
 def test_a_joint_commanded_too_fast_is_refused(stream: Stream) -> None:

@@ -25,8 +25,8 @@ logger = logging.getLogger(__name__)
 ApplyFn = Callable[[Any, dict[str, float]], Any]
 
 AUDIT_EVERY = 100
-DEPTH = 16
-BURST = 5.0
+DEPTH = 32
+BURST = 10.0
 LOGGED_ERRORS = 5
 REJECTIONS = ("source", "lockout", "expired", "freshness", "invalid")
 UNITS_FULL_SCALE = {"normalized": 1.0, "radians": 6.283185307179586, "degrees": 360.0, "percent": 100.0}
