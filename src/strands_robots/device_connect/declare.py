@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -18,7 +19,13 @@ def rpc(labels: Labels | None = None) -> Callable[[F], F]:
 
 def emit(labels: Labels | None = None) -> Callable[[F], F]:
     """An event: calling the method emits it."""
-    return cast(Callable[[F], F], drivers.emit(labels=labels))
+
+    def declared(method: F) -> F:
+        # The framework asks for the signature at every emission; one that is stated costs nothing to find.
+        vars(method)["__signature__"] = inspect.signature(method)
+        return cast(F, drivers.emit(labels=labels)(method))
+
+    return declared
 
 
 def on(event_name: str) -> Callable[[F], F]:
