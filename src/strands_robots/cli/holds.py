@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -26,11 +27,17 @@ class Standing:
     holds: tuple[Hold, ...] = ()
     problem: str = ""
     facts: Mapping[str, Any] = field(default_factory=dict)
+    round_trip_ms: float = 0.0
 
     @property
     def resumable(self) -> tuple[str, ...]:
         """The epochs that a signature can clear."""
         return tuple(hold.epoch for hold in self.holds if hold.epoch != OVERFLOW)
+
+
+def robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
+    """The devices on the network that can be locked and resumed."""
+    return [peer.id for peer in fleet.peers(seconds) if any(each.get("name") == "resume" for each in peer.functions)]
 
 
 def standing(fleet: FleetClient, names: Iterable[str], seconds: float) -> list[Standing]:
@@ -54,15 +61,17 @@ def on_disk() -> dict[str, tuple[Hold, ...]]:
 
 
 def _ask(fleet: FleetClient, name: str, seconds: float) -> Standing:
+    began = time.monotonic()
     try:
         answer = asked(fleet, name, "getStatus", {}, seconds)
     except Failure as failure:
         return Standing(name, problem=failure.reason)
+    took_ms = (time.monotonic() - began) * 1000
     if "locked" not in answer:
-        return Standing(name, problem="it says nothing of a lockout", facts=answer)
+        return Standing(name, problem="it says nothing of a lockout", facts=answer, round_trip_ms=took_ms)
     told = answer.get("lockout")
     holds = tuple(_hold(each) for each in told if isinstance(each, Mapping)) if isinstance(told, list) else ()
-    return Standing(name, holds, facts=answer)
+    return Standing(name, holds, facts=answer, round_trip_ms=took_ms)
 
 
 def _hold(told: Mapping[str, Any]) -> Hold:

@@ -61,7 +61,7 @@ def resume(
     seconds = number("--timeout", timeout, above=0, high=60)
     signer = signing_key(key, passphrase_file)
     with reached(network) as fleet:
-        found = holds.standing(fleet, wanted or _robots(fleet), seconds)
+        found = holds.standing(fleet, wanted or holds.robots(fleet), seconds)
         if not found:
             raise Failure(f"Nobody answered. {describe(fleet.link)}", Exit.SILENT, devices={})
         outcome = _resumed(fleet, found, signer, seconds)
@@ -81,7 +81,7 @@ def lockout(
     if not local:
         try:
             with reached(network) as fleet:
-                live = holds.standing(fleet, _robots(fleet, seconds), seconds)
+                live = holds.standing(fleet, holds.robots(fleet, seconds), seconds)
             note = "" if live else "Nobody answered on the network. "
         except Failure as failure:
             if failure.code is Exit.USAGE:
@@ -131,10 +131,6 @@ def _locally(screen: Screen, wanted: list[str]) -> None:
         raise Failure(f"Nothing was cleared: {exc}") from exc
     outcome = {name: (said.startswith("cleared"), said) for name, said in cleared.items()}
     _report(screen, outcome, f"Recorded in the audit as cleared by {operator()}.")
-
-
-def _robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
-    return [peer.id for peer in fleet.peers(seconds) if any(each.get("name") == "resume" for each in peer.functions)]
 
 
 def _resumed(fleet: FleetClient, found: list[Standing], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.terminal import on_a_terminal
 from fixtures.waiting import eventually, free_port
 
 from strands_robots import settings
@@ -91,7 +92,7 @@ def arms(site: Site) -> Iterator[tuple[str, str]]:
 def test_an_emergency_stop_latches_until_the_operators_key_frees_it(site: Site, arms: tuple[str, str]) -> None:
     for arm in arms:
         assert site.wave(arm)[0] == 0
-        eventually(lambda arm=arm: site.moving(arm), within=10.0)
+        eventually(partial(site.moving, arm), within=10.0)
     code, told = site.json("estop", "--reason", "a hand in the cell", "--as", "desk-1")
     assert (code, set(told["stopped"]), told["silent"]) == (0, set(arms), [])
     assert not any(site.moving(arm) for arm in arms)
@@ -150,3 +151,35 @@ def test_nobody_there_is_exit_3(site: Site) -> None:
     code, said = site.json("estop", "--deadline", "0.3", "--tenant", "elsewhere", "--port", str(free_port()))
     assert code == 3
     assert said["stopped"] == {}
+
+
+def test_the_space_bar_stops_every_robot(site: Site, arms: tuple[str, str]) -> None:
+    for arm in arms:
+        assert site.wave(arm)[0] == 0
+    words = site.words("safety-controller", "--id", "desk-2", "--check-in", "0.5")
+    with on_a_terminal(words, site.environment) as terminal:
+        before = terminal.modes()
+        eventually(lambda: all(arm in terminal.drawn for arm in arms), within=WITHIN_S)
+        assert "the stop link is up; checks in every 0.5 s" in terminal.drawn
+        assert "LOCKED" not in terminal.drawn
+        terminal.press(" ")
+        eventually(lambda: "2 stopped, in" in terminal.drawn and "LOCKED" in terminal.drawn, within=10.0)
+        known = site.json("lockout")[1]["live"]
+        assert {name: [hold["source"] for hold in each["holds"]] for name, each in known.items()} == {
+            "arm-1": ["desk-2"],
+            "arm-2": ["desk-2"],
+        }
+        assert not any(site.moving(arm) for arm in arms)
+        terminal.press("   ")
+        eventually(lambda: terminal.drawn.count("stopped in") > 4, within=10.0)
+        terminal.press("q")
+        assert terminal.process.wait(WITHIN_S) == 0
+        assert terminal.modes() == before
+    assert "Traceback" not in terminal.drawn
+    assert site.signed()[0] == 0
+
+
+def test_a_controller_without_a_terminal_is_refused(site: Site) -> None:
+    result = site.run("safety-controller")
+    assert result.returncode == 2
+    assert "needs a terminal" in result.stderr
