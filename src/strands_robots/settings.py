@@ -82,6 +82,12 @@ _declare(
         "",
         "Motion verbs the operator approves on real hardware: 'verb' or 'verb@peer'.",
     ),
+    Setting(
+        "STRANDS_ROS2_COMMAND_ALLOW",
+        "list",
+        "",
+        "ROS commands the operator approves: a surface such as cmd_vel, or a glob over names such as /turtle1/*.",
+    ),
     Setting("BYPASS_TOOL_CONSENT", "boolean", "false", "Approve every motion verb on real hardware."),
     Setting("STRANDS_DC_PORT", "integer", "7447", "Loopback port where local robots meet.", 1, 65535),
     Setting("STRANDS_DC_STATE_HZ", "number", "1", "stateUpdate events a second while idle.", 0.01, 100),

@@ -1,0 +1,102 @@
+"""What a base's odometry says of its motion, from the moment somebody asks."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from strands_robots.ros.link import Message, RosLink, Unwatch
+
+STILL_LINEAR = 0.01
+"""m/s below which a base counts as still."""
+
+STILL_ANGULAR = 0.02
+"""rad/s below which a base counts as still."""
+
+STILL_SAMPLES = 2
+"""Samples in a row that must say so, because one may be a turn of direction."""
+
+FRESH_S = 1.0
+"""Seconds after which a sample says nothing about now."""
+
+
+def speeds(message: Message) -> tuple[float, float] | None:
+    """Linear (m/s) and angular (rad/s) speed of a ``nav_msgs/Odometry``, a ``TwistStamped`` or a ``turtlesim/Pose``.
+
+    None where the message carries no velocity or one that is no number.
+    """
+    if "linear_velocity" in message and "theta" in message:
+        linear, angular = _norm(message["linear_velocity"]), _norm(message.get("angular_velocity"))
+    else:
+        twist: Any = message.get("twist")
+        if isinstance(twist, Mapping) and isinstance(twist.get("twist"), Mapping):
+            twist = twist["twist"]
+        if not isinstance(twist, Mapping):
+            return None
+        linear, angular = _norm(twist.get("linear")), _norm(twist.get("angular"))
+    return None if linear is None or angular is None else (linear, angular)
+
+
+class Odometry:
+    """Watches an odometry topic once :meth:`start` was called; without a topic it knows nothing."""
+
+    def __init__(self, link: RosLink, topic: str | None, kind: str | None) -> None:
+        self._link = link
+        self.topic = topic
+        self._kind = kind
+        self._lock = threading.Lock()
+        self._unwatch: Unwatch | None = None
+        self._speeds: tuple[float, float] | None = None
+        self._at = -math.inf
+        self._still_in_a_row = 0
+
+    def start(self) -> None:
+        """Watch from now on. Raises what the link raises; a second call does nothing."""
+        with self._lock:
+            if self.topic is not None and self._unwatch is None:
+                self._unwatch = self._link.watch(self.topic, self._kind, self._heard)
+
+    def close(self) -> None:
+        """Watch no more."""
+        with self._lock:
+            unwatch, self._unwatch = self._unwatch, None
+        if unwatch is not None:
+            unwatch()
+
+    def expect_stillness(self) -> None:
+        """Forget the samples so far: only what arrives from now on says that the base stands."""
+        self._still_in_a_row = 0
+        self._at = -math.inf
+
+    @property
+    def still(self) -> bool | None:
+        """True: it stands. False: it moves. None: nothing fresh is known."""
+        if time.monotonic() - self._at > FRESH_S or self._speeds is None:
+            return None
+        return self._still_in_a_row >= STILL_SAMPLES
+
+    @property
+    def last_speeds(self) -> tuple[float, float] | None:
+        """Linear (m/s) and angular (rad/s) speed of the last usable sample."""
+        return self._speeds
+
+    def _heard(self, message: Message) -> None:
+        found = speeds(message)
+        if found is None:
+            return
+        still = found[0] <= STILL_LINEAR and found[1] <= STILL_ANGULAR
+        self._still_in_a_row = self._still_in_a_row + 1 if still else 0
+        self._speeds = found
+        self._at = time.monotonic()
+
+
+def _norm(part: object) -> float | None:
+    parts = list(part.values()) if isinstance(part, Mapping) else [part]
+    values = [v for v in parts if isinstance(v, int | float) and not isinstance(v, bool)]
+    if len(values) != len(parts):
+        return None
+    norm = math.hypot(*values)
+    return norm if math.isfinite(norm) else None

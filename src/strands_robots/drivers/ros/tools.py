@@ -1,0 +1,71 @@
+"""A base's capabilities as Strands agent tools, each named by its robot."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.utils import missing_extra
+
+try:
+    from strands import ToolContext, tool
+except ModuleNotFoundError as exc:
+    if (exc.name or "").partition(".")[0] != "strands":
+        raise
+    raise missing_extra("the tools of a robot", "agent") from exc
+
+if TYPE_CHECKING:
+    from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+
+
+def tools_of(robot: MobileBaseRobot) -> list[Any]:
+    """``drive_<name>``, ``stop_<name>``, ``status_<name>`` and the reads that the robot's topics allow.
+
+    The tool's ``drive`` needs a duration, starts and returns, so that an agent can stop what it began.
+    """
+    name = robot.node_name.replace(".", "_")
+
+    @tool(
+        name=f"drive_{name}",
+        description=f"Drive {robot.node_name} for some seconds; returns once it has begun. {robot.motion_note()}",
+        context=True,
+    )
+    def drive(linear: float, angular: float, duration: float, tool_context: ToolContext) -> dict[str, Any]:
+        """Drive.
+
+        Args:
+            linear: Speed forwards in m/s; negative reverses.
+            angular: Turning rate in rad/s; positive turns left.
+            duration: Seconds until the robot is stopped again, above 0.
+        """
+        return robot.start_drive(linear, angular, duration, tool_context)
+
+    @tool(name=f"stop_{name}", description=f"Stop {robot.node_name} now; says whether it stands.")
+    def stop() -> dict[str, Any]:
+        """Stop."""
+        return robot.stop()
+
+    @tool(name=f"status_{name}", description=f"Whether {robot.node_name} is driving, and how its last drive ended.")
+    def status() -> dict[str, Any]:
+        """Tell the state."""
+        return robot.get_task_status()
+
+    @tool(name=f"get_pose_{name}", description=f"Read where {robot.node_name} is and how it moves.")
+    def get_pose(timeout: float = 5.0) -> dict[str, Any]:
+        """Read the pose.
+
+        Args:
+            timeout: Seconds to wait for a sample, above 0.
+        """
+        return robot.get_pose(timeout)
+
+    @tool(name=f"get_scan_{name}", description=f"Read one laser scan of {robot.node_name}.")
+    def get_scan(timeout: float = 5.0) -> dict[str, Any]:
+        """Read a scan.
+
+        Args:
+            timeout: Seconds to wait for a sample, above 0.
+        """
+        return robot.get_scan(timeout)
+
+    reads = {"get_pose": get_pose, "get_scan": get_scan}
+    return [drive, stop, status, *(reads[verb] for verb in robot.reads)]

@@ -1,0 +1,121 @@
+"""A base's own velocity topic: the one place that writes to it, and the zeros that hold it still."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from strands_robots.ros.link import RosLink
+from strands_robots.safety.gate import Permit, PermitVoidError
+
+logger = logging.getLogger(__name__)
+
+BLIND_HOLD_S = 5.0
+"""Seconds of zeros for a base whose odometry says nothing."""
+
+
+class VelocityWire:
+    """Writes commands under a permit, and zeros without one: a stop is never refused for lack of leave to move."""
+
+    def __init__(self, link: RosLink, topic: str, kind: str, zero: Mapping[str, Any]) -> None:
+        self.link = link
+        self.topic = topic
+        self.kind = kind
+        self._zero = dict(zero)
+        self._lock = threading.Lock()
+
+    def send(self, fields: Mapping[str, Any], permit: Permit) -> None:
+        """One command. Raises :class:`PermitVoidError` when a stop came first, else what the link raises."""
+        with self._lock:
+            if not permit.valid:
+                raise PermitVoidError("the drive was stopped")
+            self.link.publish(self.topic, self.kind, fields)
+
+    def zero(self) -> None:
+        """One zero, behind the write that may be in flight. Raises what the link raises."""
+        with self._lock:
+            self.link.publish(self.topic, self.kind, self._zero)
+
+
+class Hold:
+    """Zeros at the base's publish rate on a thread of their own, the first at once, until the base is still.
+
+    ``still`` answers True, False or, where no odometry speaks, None; the last ends the hold after
+    :data:`BLIND_HOLD_S`. A zero that fails is tried again at the next turn.
+    """
+
+    def __init__(self, wire: VelocityWire, rate_hz: float, still: Callable[[], bool | None], name: str) -> None:
+        self._wire = wire
+        self._period_s = 1 / rate_hz
+        self._still = still
+        self._cancelled = threading.Event()
+        self.tried = threading.Event()
+        self.sent = threading.Event()
+        self.problem = ""
+        self._thread = threading.Thread(target=self._run, name=f"hold-{name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        """Zeros still go out."""
+        return self._thread.is_alive()
+
+    def cancel(self) -> None:
+        """No more zeros: a new motion was allowed."""
+        self._cancelled.set()
+
+    def join(self, within_s: float) -> None:
+        """Wait for the thread's end."""
+        self._thread.join(within_s)
+
+    def _run(self) -> None:
+        began = time.monotonic()
+        while True:
+            try:
+                self._wire.zero()
+                self.problem = ""
+                self.sent.set()
+            except Exception as exc:  # noqa: BLE001 - whatever the link raises, the next zero is tried and the verdict says so
+                self.problem = str(exc) or type(exc).__name__
+                logger.warning("A zero on %s failed: %s", self._wire.topic, self.problem)
+            self.tried.set()
+            still = self._still() if self.sent.is_set() else None
+            if still or (still is None and time.monotonic() - began >= BLIND_HOLD_S):
+                return
+            if self._cancelled.wait(self._period_s):
+                return
+
+
+class Holds:
+    """The one hold of a base: begun by every stop, ended by a motion that was allowed after it."""
+
+    def __init__(self, start: Callable[[], Hold]) -> None:
+        self._start = start
+        self._lock = threading.Lock()
+        self._current: Hold | None = None
+
+    def begin(self) -> Hold:
+        """A fresh hold, whose first zero goes out at once."""
+        with self._lock:
+            if self._current is not None:
+                self._current.cancel()
+            self._current = self._start()
+            return self._current
+
+    def end_for(self, permit: Permit) -> None:
+        """End the hold for a motion, unless a newer stop has voided the motion's permit."""
+        with self._lock:
+            if permit.valid and self._current is not None:
+                self._current.cancel()
+                self._current = None
+
+    def close(self, within_s: float = 1.0) -> None:
+        """End the hold and wait for its thread."""
+        with self._lock:
+            current, self._current = self._current, None
+        if current is not None:
+            current.cancel()
+            current.join(within_s)

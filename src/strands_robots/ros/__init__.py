@@ -1,0 +1,1 @@
+"""ROS graphs: names, the command gate, and the roads to them."""

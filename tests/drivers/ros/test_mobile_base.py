@@ -1,0 +1,379 @@
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from strands_robots.contract import TaskRobot
+from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.envelope import Envelope, error
+from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.link import MemoryLink, RosError
+from strands_robots.utils import ValidationError
+
+TOPIC = "/cmd_vel"
+OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
+SHUT = CommandGate(lambda _: (), lambda: False)
+Made = Callable[..., MobileBaseRobot]
+
+
+class FaultyLink(MemoryLink):
+    """Fails the publishes whose number, counted from 1, is in ``faults``; blocks all while ``blocked`` is set."""
+
+    def __init__(self, faults: tuple[int, ...] = ()) -> None:
+        super().__init__()
+        self.faults = faults
+        self.tries = 0
+        self.free = threading.Event()
+        self.free.set()
+
+    def publish(self, topic: str, kind: str, fields: Mapping[str, Any]) -> None:
+        self.tries += 1
+        self.free.wait()
+        if self.tries in self.faults:
+            raise RosError(f"message {self.tries} was lost")
+        super().publish(topic, kind, fields)
+
+
+class Lock:
+    """A lockout."""
+
+    def refusal(self, verb: str) -> Envelope | None:
+        return error(f"{verb} is locked")
+
+
+@pytest.fixture
+def made() -> Iterator[Made]:
+    robots: list[MobileBaseRobot] = []
+
+    def make(link: MemoryLink | None = None, **options: Any) -> MobileBaseRobot:
+        options = {"publish_rate": 1000.0, "command_gate": OPEN, **options}
+        robots.append(MobileBaseRobot("rover", link or MemoryLink(), TOPIC, **options))
+        return robots[-1]
+
+    yield make
+    for robot in robots:
+        robot.disconnect()
+
+
+def velocities(link: MemoryLink) -> list[tuple[float, float]]:
+    return [(m["linear"]["x"], m["angular"]["z"]) for topic, m in list(link.sent) if topic == TOPIC]
+
+
+def memory(robot: MobileBaseRobot) -> MemoryLink:
+    assert isinstance(robot.link, MemoryLink)
+    return robot.link
+
+
+speed = st.floats(min_value=-5, max_value=5)
+
+
+@hypothesis_settings(max_examples=60, deadline=None)
+@given(linear=speed, angular=speed, duration=st.floats(min_value=1e-6, max_value=0.012))
+def test_a_timed_drive_sends_its_count_and_one_zero(linear: float, angular: float, duration: float) -> None:
+    link = MemoryLink()
+    robot = MobileBaseRobot("rover", link, TOPIC, publish_rate=1000.0, command_gate=OPEN)
+    assert robot.drive(linear, angular, duration=duration)["status"] == "success"
+    sent = velocities(link)
+    messages = max(1, round(duration * 1000))
+    assert sent[:messages] == [(linear, angular)] * messages
+    assert sent[messages:] == ([] if linear == angular == 0 else [(0.0, 0.0)])
+
+
+@hypothesis_settings(max_examples=60, deadline=None)
+@given(
+    faults=st.sets(st.integers(min_value=1, max_value=6), max_size=6),
+    count=st.integers(min_value=1, max_value=5),
+    linear=st.floats(min_value=0.1, max_value=3),
+)
+def test_whatever_fails_a_repeated_drive_tries_its_zero_and_tells_the_truth(
+    faults: set[int], count: int, linear: float
+) -> None:
+    link = FaultyLink(tuple(faults))
+    robot = MobileBaseRobot("rover", link, TOPIC, publish_rate=2000.0, command_gate=OPEN)
+    answer = robot.drive(linear, count=count)
+    delivered = next((n - 1 for n in range(1, count + 1) if n in faults), count)
+    tried = min(delivered + 1, count) + (count > 1)
+    assert link.tries == tried
+    zero_failed = count > 1 and tried in faults
+    assert (answer["status"] == "success") == (delivered == count and not zero_failed)
+    if zero_failed:
+        assert "may still move" in answer["reason"]
+    elif count > 1:
+        assert velocities(link)[-1] == (0.0, 0.0)
+
+
+@hypothesis_settings(max_examples=80, deadline=None)
+@given(linear=speed, angular=speed, max_linear=st.floats(0.01, 5), max_angular=st.floats(0.01, 5))
+def test_what_is_sent_never_exceeds_the_limits(
+    linear: float, angular: float, max_linear: float, max_angular: float
+) -> None:
+    link = MemoryLink()
+    robot = MobileBaseRobot("rover", link, TOPIC, max_linear=max_linear, max_angular=max_angular, command_gate=OPEN)
+    answer = robot.drive(linear, angular)
+    ((sent_linear, sent_angular),) = velocities(link)
+    assert abs(sent_linear) <= max_linear
+    assert abs(sent_angular) <= max_angular
+    assert (answer["linear"], answer["angular"]) == (sent_linear, sent_angular)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), True, "1", None, 10**400])
+@pytest.mark.parametrize("argument", ["linear", "angular"])
+def test_a_velocity_that_is_no_number_is_refused_first(made: Made, argument: str, bad: object) -> None:
+    robot = made()
+    answer = robot.drive(**{argument: bad}, duration=-1)  # type: ignore[arg-type]
+    assert argument in answer["reason"]
+    assert memory(robot).sent == []
+
+
+@pytest.mark.parametrize("bad", [0, -1.0, float("nan"), float("inf"), True, "2"])
+def test_a_duration_outside_its_domain_sends_nothing(made: Made, bad: Any) -> None:
+    robot = made()
+    for answer in (robot.drive(0.1, duration=bad, count=0), robot.start_drive(0.1, 0.0, bad)):
+        assert "duration" in answer["reason"]
+    assert memory(robot).sent == []
+
+
+@pytest.mark.parametrize("bad", [0, -3, 1.0, True, "2", None])
+def test_a_count_outside_its_domain_sends_nothing(made: Made, bad: Any) -> None:
+    robot = made()
+    assert "count" in robot.drive(0.1, count=bad)["reason"]
+    assert memory(robot).sent == []
+
+
+def test_a_drive_longer_than_the_platform_allows_is_refused_not_cut(made: Made) -> None:
+    robot = made(max_duration=0.5, publish_rate=10.0)
+    assert "0.5" in robot.drive(0.1, duration=0.6)["reason"]
+    assert "count must be at most 5" in robot.drive(0.1, count=6)["reason"]
+    assert memory(robot).sent == []
+
+
+def test_duration_takes_precedence_over_count(made: Made) -> None:
+    robot = made()
+    assert robot.drive(0.1, duration=0.003, count=500)["messages"] == 3
+
+
+def test_a_bare_single_drive_latches_and_stop_ends_it(made: Made) -> None:
+    robot = made()
+    assert "until it is stopped" in robot.drive(0.2)["content"][0]["text"]
+    assert velocities(memory(robot)) == [(0.2, 0.0)]
+    answer = robot.stop()
+    assert (answer["status"], answer["halted"]) == ("success", ["drive"])
+    assert velocities(memory(robot))[1] == (0.0, 0.0)
+
+
+def test_a_drive_that_nobody_approved_neither_sends_nor_arms(made: Made) -> None:
+    robot = made(command_gate=SHUT)
+    robot.handshake = lambda *_: pytest.fail("armed")  # type: ignore[method-assign]
+    assert "needs operator approval" in robot.drive(0.1)["reason"]
+    assert "needs operator approval" in robot.drive(0.0)["reason"], "a raw zero is a command like any other"
+    assert memory(robot).sent == []
+
+
+def test_stop_needs_no_approval(made: Made) -> None:
+    robot = made(command_gate=SHUT)
+    assert robot.stop()["status"] == "success"
+    assert velocities(memory(robot))[0] == (0.0, 0.0)
+
+
+def test_a_failed_handshake_aborts_the_drive(made: Made) -> None:
+    robot = made()
+    robot.handshake = lambda *_: error("the vehicle refuses")  # type: ignore[method-assign]
+    assert robot.drive(0.1)["reason"] == "the vehicle refuses"
+    assert memory(robot).sent == []
+    robot.handshake = lambda *_: None  # type: ignore[method-assign]
+    assert robot.drive(0.1)["status"] == "success"
+
+
+def test_a_halt_inside_the_handshake_lets_nothing_but_zeros_out(made: Made) -> None:
+    robot = made()
+
+    def shake(*_: object) -> None:
+        robot.halt("in between")
+
+    robot.handshake = shake  # type: ignore[method-assign]
+    answer = robot.drive(0.5, duration=0.01)
+    assert "A stop ended the drive after 0" in answer["reason"]
+    assert set(velocities(memory(robot))) == {(0.0, 0.0)}
+
+
+def test_a_stop_ends_a_running_drive_and_nothing_but_zeros_follows(made: Made) -> None:
+    robot = made(publish_rate=100.0)
+    events: list[tuple[str, str]] = []
+    robot.subscribe(lambda event: events.append((event.kind, event.state)))
+    assert robot.start_drive(0.5, 0.1, 30.0)["status"] == "success"
+    eventually(lambda: velocities(memory(robot)))
+    assert robot.get_task_status()["task_status"] == "running"
+    assert "being driven" in robot.drive(0.1)["reason"]
+    answer = robot.stop()
+    after = len(memory(robot).sent)
+    assert (answer["stopped"], answer["halted"]) == (True, ["drive"])
+    eventually(lambda: len(memory(robot).sent) > after + 3, what="the hold's zeros")
+    assert set(velocities(memory(robot))[after:]) == {(0.0, 0.0)}
+    eventually(lambda: events == [("started", "running"), ("finished", "stopped")])
+    assert robot.get_task_status()["task_status"] == "stopped"
+
+
+def test_a_new_drive_ends_the_zeros_of_the_stop_before_it(made: Made) -> None:
+    robot = made(publish_rate=200.0)
+    robot.stop()
+    assert robot.drive(0.3, duration=0.05)["status"] == "success"
+    sent = velocities(memory(robot))
+    first = sent.index((0.3, 0.0))
+    assert sent[first : first + 10] == [(0.3, 0.0)] * 10
+    assert sent[first + 10 :] == [(0.0, 0.0)]
+
+
+def test_a_locked_base_refuses_to_drive_and_still_sends_zeros(made: Made) -> None:
+    robot = made(publish_rate=100.0)
+    robot.gate.attach(Lock())
+    assert robot.drive(0.1)["reason"] == "drive is locked"
+    assert memory(robot).sent == []
+    assert robot.halt("lockout").stopped is True
+    eventually(lambda: len(memory(robot).sent) > 3)
+    assert set(velocities(memory(robot))) == {(0.0, 0.0)}
+
+
+def test_a_blind_base_is_told_zeros_for_its_time_and_no_longer(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.2)
+    robot = made(publish_rate=50.0)
+    robot.halt()
+    eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()), within=2)
+    assert 8 <= len(memory(robot).sent) <= 12
+
+
+def test_a_halt_on_a_link_that_blocks_answers_in_time_that_it_did_not_stop(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    link = FaultyLink()
+    robot = made(link)
+    link.free.clear()
+    began = time.monotonic()
+    verdict = robot.halt()
+    took = time.monotonic() - began
+    link.free.set()
+    assert verdict.stopped is False
+    assert "in time" in verdict.not_stopped["velocity"]
+    assert took < 0.5
+
+
+def test_a_halt_that_the_link_refuses_names_why_and_tries_again(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.3")
+    robot = made(FaultyLink(tuple(range(1, 10_000))))
+    verdict = robot.halt()
+    assert verdict.stopped is False
+    assert "was lost" in verdict.not_stopped["velocity"]
+    retried = made(FaultyLink((1, 2)))
+    assert retried.halt().stopped is True
+
+
+class Wheels:
+    """Tells odometry at 100 Hz: slows down by ``brake`` m/s a sample once it gets a zero."""
+
+    def __init__(self, link: MemoryLink, speed: float, brake: float) -> None:
+        self.speed, self._brake, self._link = speed, brake, link
+        self._zeroed = threading.Event()
+        self._done = threading.Event()
+        link.watch(TOPIC, None, lambda m: None if m["linear"]["x"] else self._zeroed.set())
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._done.wait(0.01):
+            if self._zeroed.is_set():
+                self.speed = max(0.0, self.speed - self._brake)
+            still = {"x": 0.0, "y": 0.0, "z": 0.0}
+            twist = {"linear": {**still, "x": self.speed}, "angular": still}
+            self._link.publish("/odom", "nav_msgs/msg/Odometry", {"twist": {"twist": twist}})
+
+
+def test_with_odometry_a_stop_waits_until_the_base_is_still(made: Made) -> None:
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom", publish_rate=50.0)
+    wheels = Wheels(link, 1.0, 0.05)
+    try:
+        verdict = robot.halt()
+        assert verdict.stopped is True
+        assert wheels.speed <= 0.01
+        assert verdict.elapsed_ms > 150
+        eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()), within=2)
+        sent = len(velocities(link))
+        time.sleep(0.1)
+        assert len(velocities(link)) == sent, "a base that is still gets no more zeros"
+    finally:
+        wheels.close()
+
+
+def test_a_base_that_rolls_on_did_not_stop_and_one_that_says_nothing_is_unknown(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.3")
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom", publish_rate=50.0)
+    wheels = Wheels(link, 1.0, 0.0)
+    try:
+        verdict = robot.halt()
+        assert verdict.stopped is False
+        assert "1.00 m/s" in verdict.not_stopped["velocity"]
+    finally:
+        wheels.close()
+    assert made(odom_topic="/odom").halt().stopped is None
+
+
+def test_reads_answer_a_sample_or_why_not(made: Made) -> None:
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom")
+    assert "timeout" in robot.get_pose(0)["reason"]
+    assert "Nothing arrived" in robot.get_pose(0.01)["reason"]
+    assert "scan_topic" in robot.get_scan()["reason"]
+    timer = threading.Timer(0.05, lambda: link.publish("/odom", "nav_msgs/msg/Odometry", {"pose": 1}))
+    timer.start()
+    assert robot.get_pose(2.0)["message"] == {"pose": 1}
+    timer.join()
+
+
+def test_a_base_fits_the_robot_contract_and_runs_no_policies(made: Made) -> None:
+    robot = made()
+    assert isinstance(robot, TaskRobot)
+    assert "runs no policies" in robot.start_task("roll")["reason"]
+    assert robot.get_task_status()["task_status"] == "idle"
+    assert robot.cleanup()["stopped"] is True
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("publish_rate", 0),
+        ("publish_rate", float("inf")),
+        ("max_linear", 0),
+        ("max_angular", -1),
+        ("max_duration", "3"),
+    ],
+)
+def test_a_limit_that_cannot_be_kept_is_refused_at_construction(made: Made, option: str, value: object) -> None:
+    with pytest.raises(ValidationError, match=option):
+        made(**{option: value})
+
+
+def test_the_tools_are_named_by_the_robot_and_describe_every_parameter(made: Made) -> None:
+    robot = made(odom_topic="/odom")
+    specs = {tool.tool_name: tool.tool_spec for tool in robot.tools}
+    assert set(specs) == {"drive_rover", "stop_rover", "status_rover", "get_pose_rover"}
+    drive = specs["drive_rover"]["inputSchema"]["json"]
+    assert drive["required"] == ["linear", "angular", "duration"]
+    for spec in specs.values():
+        for name, parameter in spec["inputSchema"]["json"]["properties"].items():
+            assert len(parameter["description"]) > 10, name
+            assert not parameter["description"].startswith("Parameter")
