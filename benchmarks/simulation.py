@@ -27,6 +27,9 @@ STEPS = 10_000
 FLEET = 32
 PUBLISH_HZ = 10
 
+ANNOUNCED_S = 12.0
+"""The framework announces every device twice a second for its first ten seconds; the measurement comes after that."""
+
 
 def run(*, quick: bool = False) -> list[Row]:
     """Every row of this part."""
@@ -74,12 +77,13 @@ def fleet(seconds: float) -> Row:
             world.add_robot("so100")
             runtimes.append(init_device_connect_sync(world, peer_id=world.tool_name_str, link=loopback_config(port)))
         for i, world in enumerate(worlds):
-            world.start_policy("so100", f"wave {i}", duration=seconds + 60)
+            world.start_policy("so100", f"wave {i}", duration=seconds + 120)
         command = [sys.executable, "-m", "benchmarks.simulation", str(port), str(seconds)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as listener:
             assert listener.stdin is not None
             assert listener.stdout is not None
             listener.stdout.readline()
+            time.sleep(ANNOUNCED_S)
             before = [moment(world) for world in worlds]
             began, cpu = time.monotonic(), process.cpu_times()
             listener.stdin.write("go\n")
