@@ -24,6 +24,9 @@ A client without a device (command line, tools)::
     answer = await client.request("device-connect.default.arm-1.cmd", payload, timeout=5.0)
     await client.close()
 
+Commands that are answered by returning: ``await client.serve(subject, serve)``, where ``serve(command)`` gives the
+encoded reply (``jsonrpc.result`` or ``jsonrpc.error``); the framework's ``subscribe`` on a ``.cmd`` subject works, too.
+
 Which link: ``loopback_config()`` needs nothing and stays on this machine; ``link_from_environment()`` reads the
 framework's own variables (``ZENOH_CONNECT``, ``NATS_URL``, ``MESSAGING_TLS_*`` ...) as the framework does;
 ``LinkConfig(...)`` says everything. ``link.authenticated`` tells whether the far side is checked.
