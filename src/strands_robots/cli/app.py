@@ -4,7 +4,21 @@ from __future__ import annotations
 
 import typer
 
-from strands_robots.cli import demo, doctor, estop, fleet, grant, mesh, resume, safety_controller, serve, teleop, watch
+from strands_robots.cli import (
+    audit,
+    demo,
+    doctor,
+    estop,
+    fleet,
+    grant,
+    keys,
+    mesh,
+    resume,
+    safety_controller,
+    serve,
+    teleop,
+    watch,
+)
 
 HELP = """Robots on Device Connect: serve one, find them, drive them, and always stop them.
 
@@ -22,6 +36,20 @@ def build() -> typer.Typer:
         # A traceback with local variables could print keys.
         pretty_exceptions_enable=False,
     )
-    for module in (serve, fleet, estop, safety_controller, resume, watch, teleop, grant, mesh, doctor, demo):
+    for module in (
+        serve,
+        fleet,
+        estop,
+        safety_controller,
+        resume,
+        watch,
+        teleop,
+        grant,
+        audit,
+        keys,
+        mesh,
+        doctor,
+        demo,
+    ):
         module.register(app)
     return app
