@@ -86,6 +86,13 @@ def unplugged(device: Any) -> bool:
         return True
 
 
+def forget_input(device: Any) -> None:
+    """Throw away what has come in on the serial port of a LeRobot device and was not read."""
+    serial = getattr(getattr(getattr(device, "bus", None), "port_handler", None), "ser", None)
+    if serial is not None and serial.is_open and not unplugged(device):
+        serial.reset_input_buffer()
+
+
 def drop(device: Any) -> None:
     """Close what a LeRobot device has open on a port that is gone or did not answer, so that it can be tried again.
 

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal
 
 from strands_robots.bus_access import action_ranges, bus_lock, read_joints
-from strands_robots.hardware._compat import drop, unplugged
+from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
 from strands_robots.policies.base import Action
 from strands_robots.safety.gate import Permit, PermitVoidError
@@ -18,6 +18,12 @@ from strands_robots.utils import ValidationError, number, shown
 
 StopLevel = Literal["hold", "release"]
 STOP_LEVELS = ("hold", "release")
+
+READ_TRIES = 3
+"""How often joints are asked for before a motor counts as silent; LeRobot waits 50 ms for each answer."""
+
+CONNECT_TRIES = 3
+"""How often connecting is tried: it takes some two hundred exchanges, and LeRobot gives up at the first lost one."""
 
 HOLD_FRESH_S = 0.25
 """How old the last joint read may be to be held at when a new one fails."""
@@ -89,23 +95,28 @@ class DeviceBody:
     @staticmethod
     def bring_up(device: Any) -> None:
         """Connect a follower or leader, its calibration first. Raises what it raises, with its port closed."""
-        try:
-            write_to_servos(device)
-            if "calibrate" in inspect.signature(device.connect).parameters:
-                device.connect(calibrate=False)
-            else:
-                device.connect()
-        except BaseException:
-            drop(device)
-            raise
+        for left in reversed(range(CONNECT_TRIES)):
+            try:
+                write_to_servos(device)
+                if "calibrate" in inspect.signature(device.connect).parameters:
+                    device.connect(calibrate=False)
+                else:
+                    device.connect()
+            except BaseException as exc:
+                drop(device)
+                if left and isinstance(exc, ConnectionError) and not isinstance(exc.__cause__, OSError):
+                    continue
+                raise
+            return
 
     def get_observation(self) -> dict[str, Any]:
         with self.lock:
             return dict(self.device.get_observation())
 
-    def get_joints(self) -> dict[str, float]:
+    def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
+        """The joints now. An answer that is lost is asked for again. Raises what the device raises."""
         with self.lock:
-            joints = read_joints(self.device)
+            joints = self._read(tries)
             self._latest = (time.monotonic(), joints)
             return dict(joints)
 
@@ -139,6 +150,17 @@ class DeviceBody:
     def running(self) -> AbstractContextManager[None]:
         return nullcontext()
 
+    def _read(self, tries: int) -> dict[str, float]:
+        for left in reversed(range(tries)):
+            # An answer that came late would be taken for this one's, and every read after it be old.
+            forget_input(self.device)
+            try:
+                return read_joints(self.device)
+            except ConnectionError:
+                if not left:
+                    raise
+        raise AssertionError  # the last try returns or raises
+
     def _hold(self) -> None:
         """The device's own ``hold()``, else the present position as the target and every velocity zero."""
         own = getattr(self.device, "hold", None)
@@ -149,14 +171,14 @@ class DeviceBody:
         if len(still) == len(self.bounds):
             self.device.send_action(still)
             return
+        age, known = self.latest_joints or (math.inf, {})
         try:
-            present = self.get_joints()
-        except Exception:
-            # One silent motor must not leave the others running to their goals; the halt still reports it.
-            age, present = self.latest_joints or (math.inf, {})
+            present = self.get_joints(1)
+        except ConnectionError:
+            # One silent motor must not leave the others running to their goals while it is asked again.
             if age <= HOLD_FRESH_S:
-                self._send_still(still, present)
-            raise
+                self._send_still(dict(still), known)
+            present = self.get_joints()
         self._send_still(still, present)
         # A bus does not confirm targets; what it answers after them shows that it took them.
         self.get_joints()

@@ -11,6 +11,7 @@ import difflib
 import logging
 import pkgutil
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from strands_robots.hardware._compat import lerobot_module, light
@@ -62,6 +63,8 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
     calibration = fields.pop("calibration", None)
     if fields.get("cameras"):
         fields["cameras"] = _cameras(fields["cameras"])
+    if isinstance(fields.get("calibration_dir"), str):
+        fields["calibration_dir"] = Path(fields["calibration_dir"]).expanduser()
     if "id" not in fields and "id" in {each.name for each in dataclasses.fields(known[kind])}:
         fields["id"] = name
     try:

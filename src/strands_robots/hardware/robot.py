@@ -17,6 +17,7 @@ from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks, ended
 from strands_robots.policies.actions import checked_action
 from strands_robots.safety.gate import MotionRefused, Permit, PermitVoidError
 from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.safety.stopping import stop_level as configured_level
 from strands_robots.utils import ValidationError, choice, number, text
 
 logger = logging.getLogger(__name__)
@@ -32,7 +33,8 @@ class HardwareRobot(Tasks):
         control_hz: control rate, 1 to 2000; ``STRANDS_CONTROL_HZ`` by default.
         joint_ranges: lowest and highest target by action key, in the device's unit; what is not named is asked of
             the device, and unbounded where it does not know.
-        stop_level: what a halt leaves: ``hold`` (frozen, torque on) or ``release`` (torque off: an arm falls).
+        stop_level: what a halt leaves: ``hold`` (frozen, torque on) or ``release`` (torque off: an arm falls); by
+            default as ``STRANDS_ESTOP_TORQUE`` says.
 
     Raises:
         ValidationError: an argument outside its domain, or a device that lacks a part of the interface.
@@ -45,11 +47,12 @@ class HardwareRobot(Tasks):
         control_hz: float | None = None,
         *,
         joint_ranges: Mapping[str, tuple[float, float]] | None = None,
-        stop_level: StopLevel = "hold",
+        stop_level: StopLevel | None = None,
     ) -> None:
         name = text("tool_name", tool_name, longest=128)
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
-        level = cast(StopLevel, choice("stop_level", stop_level, STOP_LEVELS))
+        asked = ("release" if configured_level() == "limp" else "hold") if stop_level is None else stop_level
+        level = cast(StopLevel, choice("stop_level", asked, STOP_LEVELS))
         super().__init__(DeviceBody(name, device, joint_ranges, level), number("control_hz", rate, low=1, high=2000))
         self.device = device
         self._sends: set[Permit] = set()

@@ -10,7 +10,11 @@ from typing import Any
 import pytest
 from fixtures.feetech_bus import FeetechBus, arm_servos, write_calibration
 
+from strands_robots.hardware._compat import lerobot_module
+
 Arm = Callable[..., Any]
+
+ANSWER_MS = 150.0
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -27,6 +31,19 @@ def lerobot_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HF_LEROBOT_HOME", str(tmp_path_factory.mktemp("lerobot-home")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot waits 50 ms for a servo; a busy machine may hold the emulated ones up for longer."""
+    if importlib.util.find_spec("lerobot") is None:
+        return
+    feetech = lerobot_module("lerobot.motors.feetech.feetech")
+
+    def patient(handler: Any, length: int) -> None:
+        handler.setPacketTimeoutMillis(ANSWER_MS)
+
+    monkeypatch.setattr(feetech, "patch_setPacketTimeout", patient)
 
 
 @pytest.fixture

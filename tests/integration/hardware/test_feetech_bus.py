@@ -173,7 +173,7 @@ def test_an_unplugged_port_vanishes_and_comes_back_under_the_same_name(tmp_path:
         bus.unplug()
         assert not Path(bus.port).exists()
         with pytest.raises(OSError):
-            line.ask(Packet(1, PING))
+            eventually(lambda: line.ask(Packet(1, PING), within=0.1), what="an input and output error")
         line.close()
         bus.plug()
         again = Line(bus.port)

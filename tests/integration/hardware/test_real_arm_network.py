@@ -11,7 +11,13 @@ import pytest
 from fixtures.feetech_bus import FeetechBus, arm_servos, write_calibration
 from fixtures.waiting import eventually, free_port
 
-from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.device_connect import (
+    FleetClient,
+    LinkConfig,
+    init_device_connect_sync,
+    loopback_config,
+    stop_device_connect,
+)
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.robot import Robot
 from strands_robots.safety.lane import lane
@@ -31,14 +37,21 @@ class Bench:
         self.buses = [FeetechBus(arm_servos(), link=folder / f"arm{number}") for number in (1, 2)]
         self.robots: list[Any] = []
         self.runtimes: list[Any] = []
+        self.fleet = FleetClient(link, "tester").__enter__()
+        self.controller = safety_controller("safety-1", link)
+        try:
+            self._serve(folder, calibration, link)
+        except BaseException:
+            self.close()
+            raise
+
+    def _serve(self, folder: Path, calibration: Path, link: LinkConfig) -> None:
         for number, bus in enumerate(self.buses, start=1):
             bus.plug()
             options: dict[str, Any] = {"port": bus.port, "calibration": calibration, "calibration_dir": folder}
-            robot = Robot("so101", mode="real", tool_name=f"arm-{number}", stop_level=stop_level, **options)
+            robot = Robot("so101", mode="real", tool_name=f"arm-{number}", stop_level=self.stop_level, **options)
             self.robots.append(robot)
             self.runtimes.append(init_device_connect_sync(robot, peer_id=f"arm-{number}", link=link))
-        self.fleet = FleetClient(link, "tester").__enter__()
-        self.controller = safety_controller("safety-1", link)
         assert self.controller.wait_link(10)
         eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
 
@@ -53,8 +66,9 @@ class Bench:
         self.fleet.close()
         for runtime in self.runtimes:
             stop_device_connect(runtime)
-        for robot, bus in zip(self.robots, self.buses, strict=True):
+        for robot in self.robots:
             robot.cleanup()
+        for bus in self.buses:
             bus.unplug()
 
 
