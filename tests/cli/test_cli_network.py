@@ -6,6 +6,7 @@ import pytest
 
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Exit, Failure
+from strands_robots.utils import MissingExtraError
 
 
 def test_without_flags_everything_stays_on_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,6 +49,12 @@ def test_insecure_and_certificates_are_ways_out(tmp_path: Path, monkeypatch: pyt
     assert Network(connect=["tls/192.0.2.1:7447"], **files).link().authenticated
     monkeypatch.setenv("DEVICE_CONNECT_ALLOW_INSECURE", "yes")
     assert Network(listen=["tcp/0.0.0.0:7447"]).link().is_peer
+
+
+def test_without_the_extra_one_sentence_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("strands_robots.cli.network.find_spec", lambda _: None)
+    with pytest.raises(MissingExtraError, match=r"strands-robots\[device-connect\]"):
+        Network().link()
 
 
 def test_a_broker_on_this_machine_needs_no_proof() -> None:

@@ -154,3 +154,8 @@ def test_the_environment_is_the_default(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert Approval().claim("execute", "arm-1") is None
     Grants(tmp_path / "grants").grant("execute", "arm-1")
     assert Approval().claim("execute", "arm-1") is not None
+
+
+def test_the_folder_around_the_grants_is_closed_to_others_too(tmp_path: Path, clock: Clock) -> None:
+    Grants(tmp_path / "state" / "grants", clock).grant("execute", "arm-1")
+    assert (tmp_path / "state").stat().st_mode & 0o077 == 0

@@ -31,6 +31,9 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "remote": ("websockets", "msgpack"),
     "agent": ("strands-agents", "fastmcp"),
     "lerobot": ("lerobot",),
+    "reachy": ("httpx", "websockets", "zeroconf"),
+    "mesh": ("eclipse-zenoh", "cryptography"),
+    "iot": ("awsiotsdk",),
 }
 _REQUIRED = ("device-connect",)
 _RENDER_S = 20.0

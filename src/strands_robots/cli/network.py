@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -111,12 +112,11 @@ def describe(link: LinkConfig) -> str:
 
 
 def _backends() -> Any:
-    try:
-        from strands_robots.device_connect import backends  # noqa: PLC0415 - loaded when a network is used
-    except ModuleNotFoundError as exc:
-        if (exc.name or "").startswith("strands_robots"):
-            raise
-        raise missing_extra("Device Connect", "device-connect") from exc
+    # Looked for and not imported: a command that refuses its flags need not load the framework for it.
+    if find_spec("device_connect_edge") is None:
+        raise missing_extra("Device Connect", "device-connect")
+    from strands_robots.device_connect import backends  # noqa: PLC0415 - loaded when a network is used
+
     return backends
 
 

@@ -18,7 +18,7 @@ from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Failure, Screen, label, plain, table
 from strands_robots.cli.words import assignments
 from strands_robots.envelope import text_of
-from strands_robots.utils import device_id
+from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -67,7 +67,7 @@ def serve(
         "DEVICE_CONNECT_ESTOP_ALLOW": estop_allow,
         "STRANDS_MESH_POLICY_TYPE_ALLOW": policy_allow,
         "STRANDS_ROBOT_COMMAND_ALLOW": command_allow,
-        "STRANDS_DC_STATE_HZ": None if state_hz is None else str(state_hz),
+        "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
     }
     for name, value in flags.items():
         if value is not None:
@@ -103,15 +103,15 @@ def _serve(screen: Screen, network: Network, link: LinkConfig, body: Any, *, wan
             raise Failure(f"The robot is not on the network: {exc}") from exc
         try:
             _announce(screen, str(runtime.device_id), link, driver, network)
-            number = _wait(asked, piped)
+            heard = _wait(asked, piped)
         finally:
             still = _halt(screen, body)
             device_connect.stop_device_connect(runtime)
     screen.say("Off the network.")
-    screen.data({"event": "departed", "peer_id": str(runtime.device_id), "signal": number})
+    screen.data({"event": "departed", "peer_id": str(runtime.device_id), "signal": heard})
     if not still:
         raise Failure("The robot was left moving: it did not confirm its stop.")
-    if number == signal.SIGINT:
+    if heard == signal.SIGINT:
         raise KeyboardInterrupt
 
 
@@ -195,7 +195,7 @@ def _wait(asked: Any, piped: bool) -> int | None:
     if piped:
         threading.Thread(target=read, name="stdin", daemon=True).start()
     while not closed.is_set():
-        number: int | None = asked.wait(_WATCH_S)
-        if number is not None:
-            return number
+        heard: int | None = asked.wait(_WATCH_S)
+        if heard is not None:
+            return heard
     return None

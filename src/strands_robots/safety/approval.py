@@ -79,7 +79,9 @@ class Grants:
         """
         name = f"{identifier('verb', verb)}@{identifier('peer', peer)}"
         lasts = number("seconds", seconds, above=0, high=GRANT_MAX_S)
-        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # The audit, which others must not read, is kept beside this folder; a mode does not reach parents by itself.
+        self.folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.folder.mkdir(mode=0o700, exist_ok=True)
         path = self.folder / f"{name}+{secrets.token_hex(8)}"
         writing = path.with_name(f".{path.name}")
         with os.fdopen(os.open(writing, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:

@@ -139,7 +139,7 @@ class Simulation(Rollouts):
         }
         objects = [o.name for o in stage.plan.objects]
         return success(
-            f"{len(robots)} robots.",
+            f"{len(robots)} robot{'' if len(robots) == 1 else 's'}.",
             robots=robots,
             cameras=camera_names(stage),
             objects=objects,

@@ -94,6 +94,21 @@ def test_a_missing_credentials_file_is_named(environment, tmp_path):
         link_from_environment()
 
 
+@pytest.mark.parametrize("content", [b"# a page of prose", b"\xff\xfe\x00", b"[]", b'{"nats": 3}'])
+def test_a_file_that_holds_no_credentials_is_named(environment, tmp_path, content):
+    file = tmp_path / "page.md"
+    file.write_bytes(content)
+    environment.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
+    with pytest.raises(ValidationError, match=r"page\.md"):
+        link_from_environment()
+
+
+@pytest.mark.parametrize("tenant", ["*", "**", "a.b", "a b", ""])
+def test_a_tenant_that_would_reach_others_is_refused(tenant):
+    with pytest.raises(ValidationError, match="tenant must be"):
+        LinkConfig(tenant=tenant)
+
+
 def test_a_loopback_link_stays_on_this_machine(environment):
     environment.setenv("STRANDS_DC_PORT", "7555")
     link = loopback_config()

@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import urlparse
 
 from ... import settings
-from ...utils import ValidationError, choice, port
+from ...utils import ValidationError, choice, device_id, port
 
 LOOPBACK = "127.0.0.1"
 
@@ -68,6 +68,8 @@ class LinkConfig:
     def __post_init__(self) -> None:
         choice("transport", self.transport, ("zenoh", "nats"))
         choice("mode", self.mode, ("auto", "peer", "client"))
+        # A wildcard here would make one link of every tenant.
+        device_id("tenant", self.tenant)
         if self.meet_port is not None:
             port("meet_port", self.meet_port)
         if bool(self.cert) != bool(self.key):
@@ -292,15 +294,23 @@ def _credentials_file() -> dict[str, Any]:
     if not name:
         return {}
     try:
-        text = Path(name).read_text()
+        text = Path(name).read_text(encoding="utf-8")
     except OSError as error:
         raise ValidationError(f"MESSAGING_CREDENTIALS_FILE={name!r} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValidationError(f"MESSAGING_CREDENTIALS_FILE={name!r} holds no text") from error
     try:
         content = json.loads(text)
     except ValueError:
-        return {"nats": _armoured(text)}
-    if not isinstance(content, dict):
-        raise ValidationError(f"MESSAGING_CREDENTIALS_FILE={name!r} holds no JSON object")
+        content = {"nats": _armoured(text)}
+        if content["nats"].keys() < {"jwt", "nkey_seed"}:
+            raise ValidationError(
+                f"MESSAGING_CREDENTIALS_FILE={name!r} is neither JSON nor a NATS credentials file"
+            ) from None
+    if not isinstance(content, dict) or not all(isinstance(content.get(k, {}), dict) for k in ("nats", "zenoh")):
+        raise ValidationError(
+            f"MESSAGING_CREDENTIALS_FILE={name!r} holds no JSON object with objects for nats and zenoh"
+        )
     return content
 
 
