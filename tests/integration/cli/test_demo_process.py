@@ -53,11 +53,15 @@ def test_the_demo_happens_and_leaves_its_pictures(tmp_path: Path) -> None:
     report = json.loads(told)
     assert report["status"] == "success"
     steps = {step["step"]: step for step in report["steps"]}
-    assert list(steps) == ["serve", "discover", "execute", "stop", "leave", "pictures"]
+    ending = ["emergency stop", "refusal", "resume", "execute again"]
+    assert list(steps) == ["serve", "discover", "execute", "stop", *ending, "leave", "pictures"]
     assert all(step["ok"] for step in steps.values())
     assert {"execute", "stop", "getStatus", "getFeatures"} <= set(steps["discover"]["functions"])
     assert steps["execute"]["steps"] > 0
     assert steps["stop"]["drift_rad"] <= 0.005
+    assert steps["emergency stop"]["estop_id"] in steps["refusal"]["reason"]
+    assert steps["execute again"]["steps"] > 0
+    assert not (tmp_path / "state").exists(), "the demo's lockout and audit are its own"
     assert (tmp_path / "demo-output" / "arm-path.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "demo-output" / "demo.gif").read_bytes().startswith(b"GIF89a")
     assert all(Path(tmp_path / file).stat().st_size < 1_000_000 for file in report["files"])

@@ -1,4 +1,4 @@
-"""``demo``: two processes on loopback, an arm that is found, driven and stopped by an agent."""
+"""``demo``: two processes on loopback, an arm that an agent finds, drives and stops, and that a stop holds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import signal
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -34,7 +34,8 @@ def demo(
     output: Annotated[Path, typer.Option("--output", help="Folder for the pictures.")] = Path("demo-output"),
     record: Annotated[Path | None, typer.Option("--record", help="Write what was shown as SVG.")] = None,
 ) -> None:
-    """A simulated arm, found, driven and stopped by an agent in another process; nothing leaves this machine.
+    """A simulated arm, found, driven and stopped by an agent in another process, then locked by an emergency stop
+    until an operator's key frees it; nothing leaves this machine.
 
     Exits with 1 when any step did not happen.
     """
@@ -62,17 +63,23 @@ def demo(
 def _tell(show: Show, report: Report, output: Path) -> None:
     from strands_robots.cli.demo.agent import TENANT, connected  # noqa: PLC0415 - as above
     from strands_robots.cli.demo.child import serving  # noqa: PLC0415
+    from strands_robots.cli.demo.ending import CONTROLLER, Ending, operator  # noqa: PLC0415
     from strands_robots.cli.demo.story import Story  # noqa: PLC0415
+    from strands_robots.device_connect.backends import loopback_config  # noqa: PLC0415
+    from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415
 
     port = free_port()
     show.head(f"Another process serves a simulated {ROBOT}; this one is the agent")
     with ExitStack() as stack:
+        key = stack.enter_context(operator())
         with report.step("serve"):
             child = stack.enter_context(serving(ROBOT, PEER, port, TENANT))
         show.done(f"{PEER} is on the network at 127.0.0.1:{port}, in process {child.process.pid}")
+        controller = stack.enter_context(closing(safety_controller(CONTROLLER, loopback_config(port, TENANT))))
         with connected(port) as agent:
             story = Story(show, agent, child, PEER, report)
-            for step in (story.discover, story.drive, story.stop):
+            ending = Ending(show, agent, story, peer_id=PEER, controller=controller, key=key)
+            for step in (story.discover, story.drive, story.stop, *ending.steps):
                 step()
         show.head("The robot leaves")
         with report.step("leave"):

@@ -57,14 +57,23 @@ class Agent:
         Raises:
             Failure: no answer, an error of the framework, or an envelope that says error.
         """
+        result = self.ask(device_id, function, **params)
+        if result.get("status") == "error":
+            raise Failure(f"{function} was refused: {result.get('reason')}")
+        return result
+
+    def ask(self, device_id: str, function: str, **params: Any) -> dict[str, Any]:
+        """The same, where a refusal is an answer.
+
+        Raises:
+            Failure: no answer, or an error of the framework.
+        """
         answer = self._quiet("invoke_device", device_id, function, params)
         if not answer.get("success"):
             raise Failure(f"{function} was not answered: {answer.get('error')}")
         result = answer.get("result")
         if not isinstance(result, dict):
             raise Failure(f"{function} answered with {type(result).__name__}, not with an envelope.")
-        if result.get("status") == "error":
-            raise Failure(f"{function} was refused: {result.get('reason')}")
         return result
 
     @contextmanager

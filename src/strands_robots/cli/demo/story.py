@@ -97,16 +97,7 @@ class Story:
         self._show.head("It starts a motion and follows it by events")
         with self.report.step("execute") as row, self._agent.events(self._peer) as stream:
             self._limits = ranges(self._agent.call(self._peer, "getFeatures"))
-            wanted = {"instruction": "wave hello", "policy_provider": "mock", "duration": MOTION_S}
-            self._agent.call(self._peer, "execute", **wanted)
-            ended = self._follow(stream, "wave hello", MOTION_S + 6.0, lambda event: event.name == "policyComplete")
-            if ended is None:
-                raise Failure("The motion did not report its end.")
-            state = ended.payload.get("state")
-            if state != "completed":
-                raise Failure(f"The motion ended as {state}: {ended.payload.get('error', '')}")
-            row["steps"] = ended.payload.get("steps")
-            row["travelled_rad"] = self._travelled(self.report.path)
+            row["steps"], row["travelled_rad"] = self.to_the_end(stream, "wave hello", MOTION_S)
         travelled = row["travelled_rad"]
         self._show.done(f"execute ran to its end: {row['steps']} steps, the joints travelled up to {travelled:.2f} rad")
 
@@ -114,25 +105,45 @@ class Story:
         """A stop in mid-motion, its latency, and whether the arm stands still afterwards."""
         self._show.head("It starts another one and stops it in mid-motion")
         with self.report.step("stop") as row, self._agent.events(self._peer) as stream:
-            before = len(self.report.path)
-            wanted = {"instruction": "keep waving", "policy_provider": "mock", "duration": 60.0}
-            self._agent.call(self._peer, "execute", **wanted)
-            self._follow(stream, "keep waving", 2.0, lambda event: False, total=60.0)
-            self._travelled(self.report.path[before:])
+            self.set_off(stream, "keep waving", 2.0)
             started = time.perf_counter()
             verdict = self._agent.call(self._peer, "stop")
             self.report.stop_ms = row["latency_ms"] = round((time.perf_counter() - started) * 1000, 2)
             row["stopped"] = verdict.get("stopped")
             if not verdict.get("stopped") or verdict.get("not_stopped"):
                 raise Failure(f"stop was answered, but nothing says that the arm stopped: {verdict}")
-            row["braking_rad"], row["drift_rad"] = self._rest(stream)
+            row["braking_rad"], row["drift_rad"] = self.rest(stream)
         self._show.done(
             f"stop answered in {row['latency_ms']:.1f} ms; the arm came to rest within "
             f"{row['braking_rad']:.3f} rad and then stood still: {row['drift_rad']:.4f} rad in {WATCH_S:g} s"
         )
 
+    def to_the_end(self, stream: Stream, title: str, seconds: float) -> tuple[int, float]:
+        """A motion that completes; its steps, and how far the busiest joint travelled (rad).
+
+        Raises:
+            Failure: it was refused, did not end, ended otherwise, or nothing moved.
+        """
+        before = len(self.report.path)
+        self._agent.call(self._peer, "execute", instruction=title, policy_provider="mock", duration=seconds)
+        until = seconds + 6.0
+        ended = self._follow(stream, title, until, lambda event: event.name == "policyComplete", total=seconds)
+        if ended is None:
+            raise Failure("The motion did not report its end.")
+        state = ended.payload.get("state")
+        if state != "completed":
+            raise Failure(f"The motion ended as {state}: {ended.payload.get('error', '')}")
+        return int(ended.payload.get("steps") or 0), self._travelled(self.report.path[before:])
+
+    def set_off(self, stream: Stream, title: str, seconds: float) -> None:
+        """A motion of a minute, left in the middle after ``seconds``. Raises :class:`Failure` when nothing moved."""
+        before = len(self.report.path)
+        self._agent.call(self._peer, "execute", instruction=title, policy_provider="mock", duration=60.0)
+        self._follow(stream, title, seconds, lambda event: False, total=60.0)
+        self._travelled(self.report.path[before:])
+
     def _follow(
-        self, stream: Stream, title: str, within: float, until: Callable[[Event], bool], total: float = MOTION_S
+        self, stream: Stream, title: str, within: float, until: Callable[[Event], bool], total: float
     ) -> Event | None:
         """Draw what happens until ``until`` or for ``within`` seconds; joints go into the report's path."""
         started = time.monotonic()
@@ -156,7 +167,7 @@ class Story:
             raise Failure(f"The arm did not move: its busiest joint travelled {most:.3f} rad.")
         return round(most, 4)
 
-    def _rest(self, stream: Stream) -> tuple[float, float]:
+    def rest(self, stream: Stream) -> tuple[float, float]:
         """How far the arm went while braking, and how far it moved afterwards, in rad of its busiest joint.
 
         Raises:
