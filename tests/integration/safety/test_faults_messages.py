@@ -64,17 +64,14 @@ def test_the_allowlist_takes_globs_ignores_blanks_and_minds_the_case(stage: Stag
     stop_as(link, robots, "Guard")
     robots.ask("clear")
     robots.ask("move")
-    strangers = ("SAFETY-7", "Safety-7", "guard", "safety", "asafety-7", " ")
-    sent = [
-        link.publish(source, ESTOP, notification(ESTOP, {"estop_id": new_epoch()}))
-        for source in strangers
-        if source.strip()
-    ]
-    assert all(sent)
-    told = eventually(
-        lambda: {each["source"] for each in events(robots, "estop_refused")} >= set(strangers) - {" "}, 10
-    )
-    assert told
+    strangers = {"SAFETY-7", "Safety-7", "guard", "safety", "asafety-7"}
+
+    def all_refused() -> bool:
+        for source in strangers:
+            link.publish(source, ESTOP, notification(ESTOP, {"estop_id": new_epoch()}))
+        return strangers <= {each["source"] for each in events(robots, "estop_refused")}
+
+    eventually(all_refused, 15)
     # What was sent after all of them has arrived, and holds alone.
     assert robots.ask("facts")["arm-1"]["moving"]
     last = stop_as(link, robots, "safety-8")
@@ -116,13 +113,13 @@ def test_a_signed_stop_comes_through_ten_thousand_forged_ones_a_second(stage: St
     robots.ask("clear")
     robots.ask("move")
     before = robots.ask("facts")["arm-1"]
-    forger.ask("forge", ["forger", "safety-9", "safety-1"], 10_000.0, 4.0)
+    forger.ask("forge", ["forger", "safety-9", "safety-1"], 10_000.0, 3.0)
     eventually(lambda: {"forger", "safety-9"} <= {each["source"] for each in events(robots, "estop_refused")}, 10)
     during = robots.ask("facts")["arm-1"]
     assert during["moving"]
     assert during["halts"] == before["halts"]
     epoch = new_epoch()
-    assert hand.ask("stop", ["arm-1"], 3.0, epoch)["ok"]
+    assert hand.ask("stop", ["arm-1"], 10.0, epoch)["ok"]
     assert held(robots) == [epoch]
     # Told of once in a while, not each time.
     assert len(events(robots, "estop_refused")) < 20
@@ -141,17 +138,21 @@ def test_a_signature_does_not_pass_from_one_source_or_stop_to_another(stage: Sta
 
     true = signed("safety-1")
 
-    def holds() -> bool:
+    def all_refused() -> bool:
         link.publish("safety-2", ESTOP, true)
         link.publish("safety-3", ESTOP, signed("safety-3", estop_id=new_epoch()))
         link.publish("safety-4", ESTOP, signed("safety-4", t=time.time() + 1))
+        return {"safety-2", "safety-3", "safety-4"} == {each["source"] for each in events(robots, "estop_refused")}
+
+    eventually(all_refused, 15)
+    assert held(robots) == []
+
+    def holds() -> bool:
         link.publish("safety-1", ESTOP, true)
         return bool(held(robots))
 
     eventually(holds, 10, "the true one")
     assert len(held(robots)) == 1
-    names = {"safety-2", "safety-3", "safety-4"}
-    eventually(lambda: {each["source"] for each in events(robots, "estop_refused")} == names)
 
 
 def test_wrong_resumes_free_nobody_and_five_of_them_close_the_desk(stage: Stage) -> None:

@@ -73,7 +73,7 @@ def engaged(robots: Child, epoch: str) -> bool:
     return any(each["event"] == "remote_estop_engaged" and each["payload"]["estop_id"] == epoch for each in records)
 
 
-@pytest.mark.parametrize("parted_s", [0.5, 5.5], ids=["briefly", "beyond the lease"])
+@pytest.mark.parametrize("parted_s", [0.5, 4.5], ids=["briefly", "beyond the lease"])
 def test_a_partition_is_told_and_the_stop_arrives_when_it_heals(far: Stage, lab: NetworkLab, parted_s: float) -> None:
     robots, hand = moving(far)
     lab.weather.parted = True
