@@ -23,6 +23,8 @@ EXTRA_MEANINGS = {
     "mesh": "the native Zenoh mesh, for robots without Device Connect",
     "iot": "the mesh over AWS IoT Core (MQTT 5)",
     "reachy": "Reachy Mini",
+    "rosbridge": "ROS 1 and ROS 2 robots behind a rosbridge server",
+    "ros2": "ROS 2 robots over bare DDS, without a ROS 2 installation",
     "lerobot": "real arms through LeRobot, and its checkpoints (brings torch; not in `all`)",
     "all": "everything but `lerobot`",
 }

@@ -21,7 +21,7 @@ from strands_robots.ros.link import RosError, RosLink
 from strands_robots.ros.names import graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import ValidationError, identifier, number, whole
+from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +29,7 @@ TWIST = "geometry_msgs/msg/Twist"
 ANSWER_SHARE = 0.9
 """Part of the halt deadline that a halt waits for stillness; the rest is for its verdict to arrive in time."""
 
+UNREACHABLE = (RosError, MissingExtraError)
 NO_POLICIES = "{} is a mobile base and runs no policies; use drive."
 
 
@@ -258,7 +259,7 @@ class MobileBaseRobot:
         self._holds.close()
         try:
             self._odometry.close()
-        except RosError as gone:
+        except UNREACHABLE as gone:
             logger.info("%s: %s", self.tool_name_str, gone)
         self.link.close()
 
@@ -323,7 +324,7 @@ class MobileBaseRobot:
     def _watch_odometry(self) -> None:
         try:
             self._odometry.start()
-        except RosError as exc:
+        except UNREACHABLE as exc:
             logger.warning("%s drives without its odometry: %s", self.tool_name_str, exc)
 
     def _still_now(self) -> bool | None:
@@ -355,7 +356,7 @@ class MobileBaseRobot:
             if source[0] is None:
                 return error(f"{verb} needs {argument}, and {self.tool_name_str} was made without one.")
             message = self.link.read(source[0], source[1], seconds)
-        except (ValidationError, RosError) as exc:
+        except (ValidationError, *UNREACHABLE) as exc:
             return error(str(exc))
         return success(f"One message of {source[0]}.", topic=source[0], message=message)
 

@@ -1,0 +1,88 @@
+"""A mobile base behind a rosbridge server: ROS 1 or ROS 2 on its side, nothing on ours but a WebSocket."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.link import RosLink
+from strands_robots.ros.rosbridge import RosbridgeLink
+
+ROS1_TWIST = "geometry_msgs/Twist"
+CURIOSITY = "/curiosity_mars_rover"
+
+
+class RosbridgeRobot(MobileBaseRobot):
+    """A base that is driven through rosbridge; its limits are this class's unless others are given.
+
+    Nothing is dialled before the first verb. The connection proves nothing and is not encrypted: a server elsewhere
+    is reached through a tunnel.
+
+    Args:
+        node_name: what the robot and its tools are called.
+        cmd_vel_topic: the velocity topic, a ``geometry_msgs/Twist`` unless ``cmd_vel_type`` says otherwise.
+        odom_topic: odometry or pose; with it a stop waits to see the base still. The server finds the types of
+            this topic and of ``scan_topic`` where they are not given.
+        host: bare hostname or IP address of the server. ``port``: 1 to 65535.
+        max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds.
+        publish_rate: Hz of a drive that is held.
+        link: another road in place of the connection to ``host`` and ``port``.
+        command_gate: asks the operator's leave; that of the settings by default.
+
+    Raises:
+        ValidationError: an argument outside its domain.
+    """
+
+    def __init__(
+        self,
+        node_name: str,
+        cmd_vel_topic: str,
+        odom_topic: str,
+        scan_topic: str | None = None,
+        *,
+        host: str = "localhost",
+        port: int = 9090,
+        cmd_vel_type: str = ROS1_TWIST,
+        odom_type: str | None = None,
+        scan_type: str | None = None,
+        max_linear: float = 2.0,
+        max_angular: float = 1.0,
+        max_duration: float = 30.0,
+        publish_rate: float = 10.0,
+        link: RosLink | None = None,
+        command_gate: CommandGate | None = None,
+    ) -> None:
+        road = RosbridgeLink(host, port)
+        super().__init__(
+            node_name,
+            link or road,
+            cmd_vel_topic,
+            cmd_vel_type,
+            odom_topic=odom_topic,
+            odom_type=odom_type,
+            scan_topic=scan_topic,
+            scan_type=scan_type,
+            publish_rate=publish_rate,
+            max_linear=max_linear,
+            max_angular=max_angular,
+            max_duration=max_duration,
+            command_gate=command_gate,
+        )
+        self.safety_key = f"rosbridge:{road.url}{cmd_vel_topic}"
+
+    @classmethod
+    def from_curiosity(
+        cls, node_name: str = "curiosity", host: str = "localhost", port: int = 9090, **overrides: Any
+    ) -> RosbridgeRobot:
+        """The Curiosity rover of the Gazebo simulation for ROS 1 Noetic, whose controller takes a Twist as it is."""
+        wiring: dict[str, Any] = {
+            "cmd_vel_topic": f"{CURIOSITY}/ackermann_drive_controller/cmd_vel",
+            "odom_topic": f"{CURIOSITY}/odom",
+            "host": host,
+            "port": port,
+        }
+        return cls(node_name, **(wiring | overrides))
+
+    def motion_note(self) -> str:
+        return f"At most {self.max_linear:g} m/s, {self.max_angular:g} rad/s and {self.max_duration:g} s."

@@ -1,0 +1,290 @@
+"""A ROS 1 or ROS 2 graph behind a rosbridge server, without ROS on this side."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
+
+from strands_robots.ros.link import Heard, Message, RosError, Unwatch
+from strands_robots.ros.rosbridge_session import Session
+from strands_robots.ros.rosbridge_wire import Fragments, decoded, encoded, with_bytes
+from strands_robots.utils import number, shown
+
+logger = logging.getLogger(__name__)
+
+SUCCEEDED = 4
+"""``action_msgs/GoalStatus`` of a goal that was reached."""
+
+
+@dataclass(slots=True)
+class _Asked:
+    """A request whose answer is awaited."""
+
+    done: threading.Event = field(default_factory=threading.Event)
+    answer: dict[str, Any] | None = None
+    problem: str = ""
+    feedback: Heard | None = None
+
+
+@dataclass(slots=True)
+class _Watched:
+    """A subscription: one on the wire for all who watch the topic."""
+
+    id: str
+    kind: str | None
+    heard: list[Heard]
+    failed: list[Callable[[str], None]]
+
+
+class RosbridgeLink:
+    """A :class:`~strands_robots.ros.link.RosLink` over one connection, opened by the first use and kept until closed.
+
+    A lost connection is reopened, its subscriptions restored and its topics advertised anew; what is sent meanwhile
+    is refused, not queued: a velocity that arrives late is worse than one that does not. A ``status`` error of the
+    server fails the request that it names, or the next publish on the topic that it names, and is logged.
+
+    Args:
+        host: bare hostname or IP literal of the server.
+        port: its TCP port, 1 to 65535.
+        connect_s: how long one attempt to connect may take, above 0 and at most 60 s.
+
+    Raises:
+        ValidationError: an argument outside its domain.
+    """
+
+    def __init__(self, host: str = "localhost", port: int = 9090, *, connect_s: float = 5.0) -> None:
+        self._session = Session(
+            host,
+            port,
+            connect_s=number("connect_s", connect_s, above=0, high=60),
+            opened=self._restore,
+            received=self._received,
+            lost=self._lost,
+        )
+        self._numbers = count(1)
+        self._lock = threading.RLock()
+        self._advertised: dict[str, str] = {}
+        self._watched: dict[str, _Watched] = {}
+        self._asked: dict[str, _Asked] = {}
+        self._complaints: dict[str, str] = {}
+        self._fragments = Fragments()
+
+    @property
+    def url(self) -> str:
+        """Where the server is."""
+        return self._session.url
+
+    def publish(self, topic: str, kind: str, fields: Message) -> None:
+        complaint = self._complaints.pop(topic, None)
+        if complaint is not None:
+            self._advertised.pop(topic, None)
+            raise RosError(complaint)
+        frame = encoded("publish", id=self._id("publish", topic), topic=topic, type=kind, msg=fields)
+        if self._advertised.get(topic) != kind or not self._session.up:
+            self._session.send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))
+            self._advertised[topic] = kind
+        self._session.send(frame)
+
+    def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
+        asked = _Asked()
+
+        def keep(message: Message) -> None:
+            if asked.answer is None:
+                asked.answer = dict(message)
+                asked.done.set()
+
+        def fail(problem: str) -> None:
+            asked.problem = problem
+            asked.done.set()
+
+        unwatch = self._watch(topic, kind, keep, fail)
+        try:
+            return self._awaited(asked, f"Nothing arrived on {topic}", within_s)
+        finally:
+            unwatch()
+
+    def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
+        key = self._id("call_service", service)
+        # The type is not in the protocol's example, but servers over ROS 2 cannot do without it.
+        frame = encoded("call_service", id=key, service=service, type=kind, args=fields, timeout=within_s)
+        answer = self._request(key, frame, f"{service} did not answer", within_s)
+        values = answer.get("values")
+        if answer.get("result") is False:
+            raise RosError(f"{service} failed: {shown(values)}")
+        return values if isinstance(values, dict) else {}
+
+    def send_goal(
+        self, action: str, kind: str, goal: Message, within_s: float, feedback: Heard | None = None
+    ) -> dict[str, Any]:
+        """Send an action goal and wait for its end; ``status`` (4 is reached) and ``values``.
+
+        The goal is cancelled when ``within_s`` is over, or whatever else ends the wait.
+
+        Raises:
+            RosError: the goal was refused, failed, or did not end in time.
+        """
+        key = self._id("send_action_goal", action)
+        frame = encoded("send_action_goal", id=key, action=action, action_type=kind, args=goal, feedback=True)
+        try:
+            answer = self._request(key, frame, f"{action} did not end", within_s, feedback)
+        except BaseException:
+            self._cancel(key, action)
+            raise
+        if answer.get("result") is False:
+            raise RosError(f"{action} failed with status {answer.get('status')}: {shown(answer.get('values'))}")
+        return {"status": answer.get("status"), "values": answer.get("values")}
+
+    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+        return self._watch(topic, kind, heard, lambda problem: logger.warning("%s: %s", topic, problem))
+
+    def close(self) -> None:
+        self._session.close()
+        with self._lock:
+            self._watched.clear()
+
+    def _watch(self, topic: str, kind: str | None, heard: Heard, failed: Callable[[str], None]) -> Unwatch:
+        self._session.open()
+        with self._lock:
+            watched = self._watched.get(topic)
+            if watched is None:
+                watched = self._watched[topic] = _Watched(self._id("subscribe", topic), kind, [], [])
+                frame = self._subscription(topic, watched)
+            else:
+                frame = ""
+            watched.heard.append(heard)
+            watched.failed.append(failed)
+
+        def unwatch() -> None:
+            with self._lock:
+                if heard not in watched.heard:
+                    return
+                watched.heard.remove(heard)
+                watched.failed.remove(failed)
+                last = not watched.heard and self._watched.get(topic) is watched
+                if last:
+                    del self._watched[topic]
+            if last and self._session.up:
+                self._session.send(encoded("unsubscribe", id=watched.id, topic=topic))
+
+        if frame:
+            try:
+                self._session.send(frame)
+            except Exception:
+                with self._lock:
+                    self._watched.pop(topic, None)
+                raise
+        return unwatch
+
+    def _subscription(self, topic: str, watched: _Watched) -> str:
+        kind = {} if watched.kind is None else {"type": watched.kind}
+        # A queue of one: a robot's state is worth something only while it is the latest.
+        return encoded("subscribe", id=watched.id, topic=topic, queue_length=1, compression="none", **kind)
+
+    def _request(
+        self, key: str, frame: str, what: str, within_s: float, feedback: Heard | None = None
+    ) -> dict[str, Any]:
+        asked = self._asked[key] = _Asked(feedback=feedback)
+        try:
+            self._session.send(frame)
+            return self._awaited(asked, what, within_s)
+        finally:
+            del self._asked[key]
+
+    def _awaited(self, asked: _Asked, what: str, within_s: float) -> dict[str, Any]:
+        if not asked.done.wait(within_s):
+            raise RosError(f"{what} within {within_s:g} s.")
+        if asked.answer is None:
+            raise RosError(asked.problem)
+        return asked.answer
+
+    def _cancel(self, key: str, action: str) -> None:
+        if self._session.up:
+            try:
+                self._session.send(encoded("cancel_action_goal", id=key, action=action))
+            except RosError as exc:
+                logger.warning("The goal of %s could not be cancelled: %s", action, exc)
+
+    def _id(self, op: str, name: str) -> str:
+        return f"{op}:{name}:{next(self._numbers)}"
+
+    # On the session's thread.
+
+    def _restore(self, send: Callable[[str], None]) -> None:
+        with self._lock:
+            self._fragments = Fragments()
+            self._advertised.clear()
+            for topic, watched in self._watched.items():
+                send(self._subscription(topic, watched))
+
+    def _lost(self, why: str) -> None:
+        for asked in list(self._asked.values()):
+            asked.problem = f"The connection to rosbridge at {self.url} was lost: {why}."
+            asked.done.set()
+
+    def _received(self, frame: str | bytes) -> None:
+        try:
+            message: dict[str, Any] | None = decoded(frame)
+            if message is not None and message["op"] == "fragment":
+                message = self._fragments.add(message)
+            if message is not None:
+                self._dispatch(message)
+        except RosError as exc:
+            logger.warning("%s sent what cannot be used: %s", self.url, exc)
+
+    def _dispatch(self, message: dict[str, Any]) -> None:
+        op, key = message["op"], message.get("id")
+        if op == "publish":
+            self._published(message)
+        elif op in ("service_response", "action_result"):
+            asked = self._asked.get(key) if isinstance(key, str) else None
+            if asked is not None:
+                asked.answer = message
+                asked.done.set()
+        elif op == "action_feedback":
+            asked = self._asked.get(key) if isinstance(key, str) else None
+            values = message.get("values")
+            if asked is not None and asked.feedback is not None and isinstance(values, dict):
+                asked.feedback(values)
+        elif op == "status":
+            self._status(message)
+
+    def _published(self, message: dict[str, Any]) -> None:
+        topic, body = message.get("topic"), message.get("msg")
+        with self._lock:
+            watched = self._watched.get(topic) if isinstance(topic, str) else None
+            heard = list(watched.heard) if watched is not None else []
+        if watched is None or not isinstance(body, dict):
+            return
+        whole = with_bytes(watched.kind, body)
+        for each in heard:
+            try:
+                each(whole)
+            except Exception:
+                logger.exception("A watcher of %s failed.", topic)
+
+    def _status(self, message: dict[str, Any]) -> None:
+        said = f"rosbridge says: {shown(message.get('msg'))}"
+        if message.get("level") != "error":
+            logger.info("%s", said)
+            return
+        logger.warning("%s (%s)", said, message.get("id"))
+        key = str(message.get("id") or "")
+        asked = self._asked.get(key)
+        if asked is not None:
+            asked.problem = said
+            asked.done.set()
+            return
+        op, _, rest = key.partition(":")
+        topic = rest.rpartition(":")[0]
+        if op in ("publish", "advertise"):
+            self._complaints[topic] = said
+        elif op == "subscribe":
+            with self._lock:
+                watched = self._watched.get(topic)
+                failed = list(watched.failed) if watched is not None else []
+            for each in failed:
+                each(said)

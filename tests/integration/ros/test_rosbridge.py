@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pytest
+from fixtures.rosbridge_server import RosbridgeServer
+from fixtures.waiting import eventually, free_port
+
+from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
+from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.link import RosError
+from strands_robots.ros.rosbridge import RosbridgeLink
+from strands_robots.utils import ValidationError
+
+OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
+TWIST = "geometry_msgs/Twist"
+
+
+def refused(request: Mapping[str, Any]) -> dict[str, Any]:
+    raise ValueError(f"will not {request['verb']}")
+
+
+@pytest.fixture
+def server() -> Iterator[RosbridgeServer]:
+    served = RosbridgeServer({"/add": lambda r: {"sum": r["a"] + r["b"]}, "/refuse": refused})
+    served.start()
+    yield served
+    served.stop()
+
+
+@pytest.fixture
+def link(server: RosbridgeServer) -> Iterator[RosbridgeLink]:
+    made = RosbridgeLink("127.0.0.1", server.port)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def rover(server: RosbridgeServer) -> Iterator[RosbridgeRobot]:
+    robot = RosbridgeRobot(
+        "rover", "/cmd_vel", "/odom", "/scan", host="127.0.0.1", port=server.port, publish_rate=50, command_gate=OPEN
+    )
+    yield robot
+    robot.disconnect()
+
+
+def test_a_topic_is_advertised_once_and_then_published_on(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    for n in range(3):
+        link.publish("/count", "std_msgs/Int32", {"data": n})
+    eventually(lambda: server.published == [("/count", {"data": n}) for n in range(3)])
+    assert [op["type"] for op in server.seen("advertise")] == ["std_msgs/Int32"]
+
+
+def test_a_service_answers_and_its_failure_is_an_error(link: RosbridgeLink) -> None:
+    assert link.call("/add", "pkg/Add", {"a": 2, "b": 3}, 2.0) == {"sum": 5}
+    with pytest.raises(RosError, match="will not jump"):
+        link.call("/refuse", "pkg/Refuse", {"verb": "jump"}, 2.0)
+
+
+def test_a_status_error_ends_the_request_it_names_at_once(link: RosbridgeLink) -> None:
+    began = time.monotonic()
+    with pytest.raises(RosError, match="no service /nobody"):
+        link.call("/nobody", "pkg/Nobody", {}, 10.0)
+    with pytest.raises(RosError, match="unknown topic type"):
+        link.read("/unknown", None, 10.0)
+    assert time.monotonic() - began < 5
+
+
+def test_a_status_error_of_a_publish_fails_the_next_one(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    link.publish("/forbidden", TWIST, {})
+
+    def fails() -> bool:
+        try:
+            link.publish("/forbidden", TWIST, {})
+        except RosError as exc:
+            return "is not yours" in str(exc)
+        return False
+
+    eventually(fails)
+
+
+def test_a_message_is_read_with_its_bytes_decoded(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    done = threading.Event()
+
+    def talk() -> None:
+        while not done.wait(0.02):
+            server.tell("/image", {"width": 2, "data": base64.b64encode(b"\x00\xff").decode()})
+
+    talker = threading.Thread(target=talk)
+    talker.start()
+    try:
+        assert link.read("/image", "sensor_msgs/msg/Image", 5.0) == {"width": 2, "data": b"\x00\xff"}
+    finally:
+        done.set()
+        talker.join()
+    eventually(lambda: server.seen("unsubscribe"), what="a read leaves no subscription behind")
+
+
+def test_bytes_go_out_as_base64_and_a_nan_not_at_all(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    link.publish("/image", "sensor_msgs/Image", {"data": b"\x01\x02"})
+    eventually(lambda: server.published == [("/image", {"data": "AQI="})])
+    with pytest.raises(RosError, match="JSON"):
+        link.publish("/number", "std_msgs/Float32", {"data": float("nan")})
+
+
+def test_fragments_are_put_together_in_any_order(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    heard: list[Mapping[str, Any]] = []
+    link.watch("/long", "std_msgs/String", heard.append)
+    eventually(lambda: server.seen("subscribe"))
+    whole = json.dumps({"op": "publish", "topic": "/long", "msg": {"data": "word " * 50}})
+    for number, part in ((1, whole[40:]), (0, whole[:40])):
+        server.send({"op": "fragment", "id": "7", "num": number, "total": 2, "data": part})
+    eventually(lambda: heard == [{"data": "word " * 50}])
+
+
+@pytest.mark.parametrize(
+    "frame",
+    ["{", "[]", '{"no": "op"}', '{"op": "publish"}', '{"op": "fragment", "id": "1", "num": 2, "total": 1}',
+     '{"op": "service_response", "id": []}', '{"op": "publish", "topic": "/t", "msg": 3}', "[" * 5000],
+)  # fmt: skip
+def test_a_frame_that_makes_no_sense_is_survived(server: RosbridgeServer, link: RosbridgeLink, frame: str) -> None:
+    heard: list[Mapping[str, Any]] = []
+    link.watch("/t", None, heard.append)
+    eventually(lambda: server.seen("subscribe"))
+    server.send(frame)
+    server.tell("/t", {"data": 1})
+    eventually(lambda: heard == [{"data": 1}])
+
+
+def test_a_lost_server_refuses_at_once_and_is_found_again_with_its_subscriptions(
+    server: RosbridgeServer, link: RosbridgeLink
+) -> None:
+    heard: list[Mapping[str, Any]] = []
+    link.watch("/odom", "nav_msgs/Odometry", heard.append)
+    link.publish("/cmd_vel", TWIST, {})
+    eventually(lambda: server.tell("/odom", {"n": 1}) and heard)
+    server.stop()
+
+    def refuses() -> bool:
+        try:
+            link.publish("/cmd_vel", TWIST, {})
+        except RosError:
+            return True
+        return False
+
+    eventually(refuses)
+    server.ops.clear()
+    heard.clear()
+    server.start()
+    eventually(lambda: server.tell("/odom", {"n": 2}) and heard, within=10)
+    link.publish("/cmd_vel", TWIST, {"back": 1})
+    eventually(lambda: ("/cmd_vel", {"back": 1}) in server.published)
+    assert [op["topic"] for op in server.seen("advertise")] == ["/cmd_vel"]
+
+
+def test_a_server_that_is_not_there_is_told_and_can_be_dialled_later() -> None:
+    port = free_port()
+    link = RosbridgeLink("127.0.0.1", port, connect_s=1.0)
+    with pytest.raises(RosError, match=f"127.0.0.1:{port}"):
+        link.publish("/cmd_vel", TWIST, {})
+    server = RosbridgeServer()
+    server.port = port
+    server.start()
+    try:
+        link.publish("/cmd_vel", TWIST, {})
+        eventually(lambda: server.published)
+    finally:
+        link.close()
+        server.stop()
+    assert not [t for t in threading.enumerate() if t.name == "rosbridge"]
+
+
+@pytest.mark.parametrize(
+    "where", [{"host": "ws://robot"}, {"host": "a b"}, {"host": ""}, {"port": 0}, {"port": 70000}, {"port": True}]
+)
+def test_a_host_or_port_that_cannot_be_dialled_is_refused_before_anything(where: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(where))):
+        RosbridgeRobot("rover", "/cmd_vel", "/odom", **where)
+
+
+def test_an_action_goal_reports_feedback_and_its_end(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    server.on_goal = lambda goal: [
+        {"op": "action_feedback", "values": {"left": goal["args"]["metres"]}},
+        {"op": "action_result", "values": {"ok": 1}, "status": 4, "result": True},
+    ]
+    told: list[Mapping[str, Any]] = []
+    assert link.send_goal("/go", "pkg/action/Go", {"metres": 2}, 2.0, told.append) == {"status": 4, "values": {"ok": 1}}
+    assert told == [{"left": 2}]
+
+
+def test_an_action_goal_that_does_not_end_is_cancelled(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    with pytest.raises(RosError, match="did not end within"):
+        link.send_goal("/go", "pkg/action/Go", {}, 0.2)
+    cancelled = eventually(lambda: server.seen("cancel_action_goal"))
+    assert cancelled[0]["id"] == server.seen("send_action_goal")[0]["id"]
+
+
+def standing(server: RosbridgeServer) -> None:
+    """Let the far end be a base that does at once what it is told, and says so."""
+
+    def obey(topic: str, message: dict[str, Any]) -> None:
+        if topic == "/cmd_vel":
+            server.tell("/odom", {"twist": {"twist": {"linear": message["linear"], "angular": message["angular"]}}})
+
+    server.on_publish = obey
+
+
+def test_a_rover_is_driven_stopped_and_known_to_stand(server: RosbridgeServer, rover: RosbridgeRobot) -> None:
+    standing(server)
+    answer = rover.drive(9.0, -9.0, duration=0.1)
+    assert (answer["status"], answer["linear"], answer["angular"]) == ("success", 2.0, -1.0)
+    eventually(lambda: len(server.published) == 6)
+    assert [m["linear"]["x"] for _, m in server.published] == [2.0] * 5 + [0.0]
+    rover.start_drive(0.5, 0.0, 20.0)
+    eventually(lambda: server.published[-1][1]["linear"]["x"] == 0.5)
+    verdict = rover.stop()
+    assert (verdict["stopped"], verdict["halted"]) == (True, ["drive"])
+    assert server.published[-1][1]["linear"]["x"] == 0.0
+
+
+def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still_move(
+    server: RosbridgeServer, rover: RosbridgeRobot
+) -> None:
+    answers: list[dict[str, Any]] = []
+    driving = threading.Thread(target=lambda: answers.append(rover.drive(0.5, duration=20.0)))
+    driving.start()
+    eventually(lambda: server.published)
+    server.stop()
+    driving.join(5)
+    assert "may still move" in answers[0]["reason"]
+    assert rover.halt().stopped is False
+    server.published.clear()
+    server.start()
+    eventually(lambda: server.published, within=4, what="the hold's zero on the new connection")
+    assert server.published[0][1]["linear"]["x"] == 0.0
+
+
+def test_curiosity_is_wired_to_its_simulation() -> None:
+    rover = RosbridgeRobot.from_curiosity(max_linear=0.5)
+    assert (rover.node_name, rover.max_linear, rover.max_angular, rover.max_duration) == ("curiosity", 0.5, 1.0, 30.0)
+    assert rover.reads == ("get_pose",)
