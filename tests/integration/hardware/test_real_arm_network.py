@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -118,3 +121,16 @@ def test_a_plain_stop_halts_and_leaves_it_free(bench: Bench) -> None:
     assert bench.buses[0].written_after(at) == []
     assert bench.robots[1].get_task_status()["task_status"] == "running"
     assert bench.fleet.call("arm-1", "execute", {"instruction": "on", "duration": 0.2})["status"] == "success"
+
+
+def test_the_example_drives_the_whole_way_and_draws_it(tmp_path: Path) -> None:
+    picture = tmp_path / "path.png"
+    ours = {"STRANDS_DC_PORT": str(free_port()), "STRANDS_STATE_DIR": str(tmp_path), "PICTURE": str(picture)}
+    root = Path(__file__).resolve().parents[3]
+    line = [sys.executable, "-m", "examples.real_arm_on_a_pty"]
+    done = subprocess.run(
+        line, cwd=root, env={**os.environ, **ours}, capture_output=True, text=True, timeout=100, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "0 after the agent's stop" in done.stdout
+    assert picture.stat().st_size > 10_000
