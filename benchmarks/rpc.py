@@ -27,6 +27,7 @@ from strands_robots.device_connect.backends import LinkConfig, open_client
 IN_FLIGHT = 32
 EVENT_HZ = 10_000.0
 STRETCH = 20
+CROWD_STRETCH = 8 * IN_FLIGHT
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +104,9 @@ async def _in_flight(name: str, pair: Pair, effort: Effort) -> list[Row]:
         ("one bare caller", pair.ours, pair.bare),
     ):
         ours, bare = [], []
-        for _ in range(effort.turns):
-            bare.append(await _rate(to_bare, pair.device_bare, effort.calls))
-            ours.append(await _rate(to_ours, pair.device_ours, effort.calls))
+        for _ in range(effort.turns * effort.calls // CROWD_STRETCH):
+            bare.append(await _rate(to_bare, pair.device_bare, CROWD_STRETCH))
+            ours.append(await _rate(to_ours, pair.device_ours, CROWD_STRETCH))
         fast, slow = statistics.median(ours), statistics.median(bare)
         ratio = fast / slow
         decides = to_ours is pair.ours_both
