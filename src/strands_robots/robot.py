@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import sys
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -117,17 +118,26 @@ def run(
         network["link"] = usual_link(network.get("tenant"))
     body = robot if callable(getattr(robot, "halt", None)) else adapt(robot)
     verdict = StopVerdict()
+    # Who waits for Ctrl-C sits at a terminal and is told there, whatever the program does about logging.
+    tell: Callable[[str], None] = _say if until is None else logger.info
     with _signals(until) as asked:
         runtime = device_connect.init_device_connect_sync(robot, peer_id=peer_id, **network)
-        logger.info("Serving %s; Ctrl-C stops the robot first.", runtime.device_id)
+        tell(f"Serving {runtime.device_id}; Ctrl-C stops the robot first.")
         try:
             asked.wait()
         finally:
             verdict = body.halt("run ended")
-            still = verdict.stopped is True
-            logger.log(logging.INFO if still else logging.CRITICAL, "%s", text_of(verdict.envelope()))
+            told = text_of(verdict.envelope())
+            if verdict.stopped is True:
+                tell(told)
+            else:
+                logger.critical("%s", told)
             device_connect.stop_device_connect(runtime)
     return verdict
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 class _Until:
