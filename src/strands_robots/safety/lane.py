@@ -14,6 +14,7 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 from strands_robots.audit import log_safety_event
+from strands_robots.safety.budget import Budget
 from strands_robots.safety.decision import Decision, Refused, params_of
 from strands_robots.safety.intake import Heard, Intake
 from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, StopLink, notification
@@ -61,6 +62,7 @@ class StopLane:
         self._joining = threading.Lock()
         self._seats: tuple[Seat, ...] = ()
         self._refusals = Refusals()
+        self._budget = Budget()
         self._decision = Decision(allow=(), keys=())
         self._checked_in: dict[str, float] = {}
         self._answered: dict[tuple[str, str], float] = {}
@@ -106,9 +108,15 @@ class StopLane:
             thread.join(2.0)
 
     def hear_params(self, source: str, params: Mapping[str, Any], road: str) -> None:
-        """Act on an emergency stop that another road has parsed; returns at once, whichever road was first."""
+        """Act on an emergency stop that another road has parsed; returns at once, whichever road was first.
+
+        A source whose signatures keep failing is not checked again here for up to a second: the lane hears it too.
+        """
+        if self._decision.signed and not self._budget.left(source, time.monotonic()):
+            return
         order = self._decision.order(source, params, road)
         if isinstance(order, Refused):
+            self._budget.spend(source, time.monotonic())
             self._refusals.tell(order, ESTOP)
         else:
             self._plane.begin(order, self._answer)
