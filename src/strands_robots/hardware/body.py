@@ -58,7 +58,9 @@ class DeviceBody:
         if missing:
             raise ValidationError(f"device must have LeRobot's robot interface; {shown(device)} lacks {missing}.")
         if stop_level == "release" and not callable(getattr(getattr(device, "bus", None), "disable_torque", None)):
-            raise ValidationError(f"stop_level must be hold: {shown(device)} has no bus.disable_torque().")
+            raise ValidationError(
+                f"stop_level (or STRANDS_ESTOP_TORQUE) must be hold: {shown(device)} has no bus.disable_torque()."
+            )
         self.stop_level = stop_level
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}

@@ -13,9 +13,11 @@ from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import STOP_LEVELS, DeviceBody, StopLevel
+from strands_robots.hardware.identity import kind, stable_id
 from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks, ended
 from strands_robots.policies.actions import checked_action
 from strands_robots.safety.gate import MotionRefused, Permit, PermitVoidError
+from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.safety.stopping import stop_level as configured_level
 from strands_robots.utils import ValidationError, choice, number, text
@@ -57,6 +59,12 @@ class HardwareRobot(Tasks):
         self.device = device
         self._sends: set[Permit] = set()
 
+    @property
+    def safety_key(self) -> str:
+        """Under what its lockout is kept: the hardware's own id, whatever it is called; empty where it has none."""
+        own = stable_id(self.device)
+        return "" if own is None else hardware_key(kind(self.device), own)
+
     def connect(self) -> None:
         """Connect the device, without asking for calibration, and again after its port was gone.
 
@@ -68,8 +76,8 @@ class HardwareRobot(Tasks):
         """``observation_features`` and ``action_features`` as data (``float``, or an image's shape), with ranges."""
         return success(
             f"{len(self._body.bounds)} action keys.",
-            observation_features={key: _kind(kind) for key, kind in self.device.observation_features.items()},
-            action_features={key: _kind(kind) for key, kind in self.device.action_features.items()},
+            observation_features={key: _kind(feature) for key, feature in self.device.observation_features.items()},
+            action_features={key: _kind(feature) for key, feature in self.device.action_features.items()},
             ranges={key: [low, high] for key, (low, high) in self._body.bounds.items() if high - low < float("inf")},
         )
 
@@ -172,5 +180,6 @@ def _unfrozen(problem: str, moving: tuple[str, ...]) -> StopVerdict:
     return StopVerdict(not_stopped=dict.fromkeys(moving, problem), unknown={} if moving else {"bus": problem})
 
 
-def _kind(kind: Any) -> Any:
-    return getattr(kind, "__name__", None) or (list(kind) if isinstance(kind, tuple | list) else str(kind))
+def _kind(feature: Any) -> Any:
+    shape = list(feature) if isinstance(feature, tuple | list) else str(feature)
+    return getattr(feature, "__name__", None) or shape
