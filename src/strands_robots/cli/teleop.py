@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,7 +35,9 @@ def register(app: typer.Typer) -> None:
 def teleop(
     screen: Screen,
     *,
-    leader: Annotated[str, typer.Argument(help="keyboard, gamepad, a recording (.csv), or TYPE@PORT of a leader arm.")],
+    leader: Annotated[
+        str, typer.Argument(help="keyboard, gamepad, a recording (.csv, .mcap), or TYPE@PORT of a leader arm.")
+    ],
     follower: Annotated[str, typer.Argument(help="TYPE@PORT of a real arm, such as so101@/dev/ttyACM0, or a model.")],
     leader_id: Annotated[str | None, typer.Option("--leader-id", help="Whose calibration the leader has.")] = None,
     follower_id: Annotated[str | None, typer.Option("--id", help="Whose calibration the follower has.")] = None,
@@ -50,14 +52,42 @@ def teleop(
     ] = FULL_RANGES_PER_S,
 ) -> None:
     """Let a leader drive a follower until it ends or Ctrl-C, which stops the follower first."""
-    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
+    drive(
+        screen,
+        leader,
+        follower,
+        lambda robot: _led(leader, robot, arm_options("", leader_id, leader_calibration)),
+        options=arm_options("", follower_id, calibration),
+        method=_METHODS.get(leader, "arm"),
+        seconds=seconds,
+        hz=hz,
+        max_speed=max_speed,
+    )
+
+
+def drive(
+    screen: Screen,
+    leader: str,
+    follower: str,
+    led: Callable[[Any], AbstractContextManager[Any]],
+    *,
+    options: dict[str, Any],
+    method: str = "arm",
+    seconds: float | None = None,
+    hz: float = 50.0,
+    max_speed: float = FULL_RANGES_PER_S,
+) -> None:
+    """Make the follower, let the leader that ``led`` gives for it drive it to the end, and stop it whatever happens.
+
+    Raises:
+        Failure: it was refused, it failed, or the follower did not confirm its stop.
+    """
+    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
-    options = _options(port, follower_id, calibration) if at else {}
-    robot = Robot(kind, mode="real" if at else "sim", **options)
+    robot = Robot(kind, mode="real" if at else "sim", **({**options, "port": port} if at else {}))
     try:
-        with _led(leader, robot, _options("", leader_id, leader_calibration)) as source:
-            method = _METHODS.get(leader, "arm")
+        with led(robot) as source:
             for answer in (
                 robot.attach_teleop(source, _NAME, method=method, max_speed=max_speed),
                 robot.teleoperate(_NAME, duration=seconds, hz=hz),
@@ -67,7 +97,7 @@ def teleop(
             screen.say(f"{leader} leads {follower}. Ctrl-C stops the follower.")
             for name, up, down in getattr(source, "help", []):
                 screen.say(f"  {up} and {down} move {name}")
-            row = _followed(robot)
+            row = _followed(screen, robot, source)
     finally:
         verdict = robot.halt("teleop ended")
         robot.cleanup()
@@ -91,7 +121,7 @@ def calibrate(
     from strands_robots.hardware.calibrating import Calibrating  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
 
-    made = make_device(arm, _options(port, device, None), "leader" if leader else "follower", calibrated=False)
+    made = make_device(arm, arm_options(port, device, None), "leader" if leader else "follower", calibrated=False)
     steps = Calibrating(made)
     try:
         steps.begin()
@@ -122,9 +152,7 @@ def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
         return
     kind, at, port = leader.partition("@")
     if not at:
-        from strands_robots.leaders import RecordedLeader, read_frames  # noqa: PLC0415 - as above
-
-        yield RecordedLeader(read_frames(Path(leader)))
+        yield recorded(Path(leader))
         return
     from strands_robots.hardware import DeviceBody  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
@@ -137,18 +165,48 @@ def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
         arm.disconnect()
 
 
-def _followed(robot: Any) -> dict[str, Any]:
-    """Wait for the end; the leader's row."""
-    try:
-        while _NAME in robot.teleoperating():
-            time.sleep(_LOOK_S)
-    except KeyboardInterrupt:
-        robot.halt("Ctrl-C")
+def recorded(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
+    """A recording as a leader: ``.csv``, or ``.mcap`` of one device.
+
+    Raises:
+        ValidationError: it cannot be read, or it has no actions of that device.
+    """
+    from strands_robots.leaders import RecordedLeader, read_frames  # noqa: PLC0415 - as above
+    from strands_robots.recording import recorded_actions  # noqa: PLC0415
+
+    frames = recorded_actions(path, device) if path.suffix == ".mcap" else read_frames(path)
+    return RecordedLeader(frames, speed)
+
+
+def _followed(screen: Screen, robot: Any, source: Any) -> dict[str, Any]:
+    """Wait for the end, with a bar where the leader knows how long it leads; the leader's row."""
+    duration = getattr(source, "duration", None)
+    with following(screen, None if duration is None else float(duration)) as moved:
+        try:
+            while _NAME in robot.teleoperating():
+                moved(getattr(source, "position", 0.0))
+                time.sleep(_LOOK_S)
+        except KeyboardInterrupt:
+            robot.halt("Ctrl-C")
     row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
     return row
 
 
-def _options(port: str, device: str | None, calibration: Path | None) -> dict[str, Any]:
+@contextmanager
+def following(screen: Screen, seconds: float | None) -> Iterator[Callable[[float], None]]:
+    """A bar over so many seconds, where somebody looks; moved by the seconds that are over."""
+    if seconds is None or screen.machine or not screen.out.is_terminal:
+        yield lambda _: None
+        return
+    from rich.progress import Progress  # noqa: PLC0415 - Rich is loaded when something is shown
+
+    with Progress(console=screen.out, transient=True) as progress:
+        task = progress.add_task("playing", total=seconds)
+        yield lambda done: progress.update(task, completed=done)
+
+
+def arm_options(port: str, device: str | None, calibration: Path | None) -> dict[str, Any]:
+    """What was given of a real arm's options."""
     given = {"port": port or None, "id": device, "calibration": calibration}
     return {key: value for key, value in given.items() if value is not None}
 

@@ -1,0 +1,66 @@
+"""Recordings: every event kept in its order, a cut file read to the cut, actions as frames that lead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from strands_robots.recording import CHUNK_BYTES, Recorder, read_entries, recorded_actions
+from strands_robots.utils import ValidationError
+
+pytest.importorskip("mcap")
+
+
+def recorded(path: Path, count: int, *devices: str) -> Path:
+    with Recorder(path) as recorder:
+        for step in range(count):
+            for device in devices:
+                recorder.take(
+                    device, "streamStep", {"step": step, "action": {"pan.pos": float(step)}, "note": "x" * 50}
+                )
+    assert recorder.lost == 0
+    return path
+
+
+def test_every_event_is_kept_in_its_order(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", 2000, "arm-1", "arm-2")
+    entries = list(read_entries(path))
+    assert [entry.payload["step"] for entry in entries if entry.device == "arm-1"] == list(range(2000))
+    assert {(entry.device, entry.event) for entry in entries} == {("arm-1", "streamStep"), ("arm-2", "streamStep")}
+    assert [entry.at for entry in entries] == sorted(entry.at for entry in entries)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_file_that_was_cut_off_is_read_to_the_cut(tmp_path: Path, share: float) -> None:
+    path = recorded(tmp_path / "run.mcap", 3000, "arm-1")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    steps = [entry.payload["step"] for entry in read_entries(path)]
+    assert steps == list(range(len(steps)))
+    assert len(steps) > 3000 * share - 2 * CHUNK_BYTES / 100 - 600
+    assert recorded_actions(path)
+
+
+def test_actions_lead_and_a_device_is_named_where_there_are_several(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", 10, "arm-1", "arm-2")
+    frames = recorded_actions(path, "arm-2")
+    assert frames[0][0] == 0.0
+    assert [action["pan.pos"] for _, action in frames][-1] == 9.0
+    with pytest.raises(ValidationError, match="arm-1, arm-2"):
+        recorded_actions(path)
+    with pytest.raises(ValidationError, match="arm-3"):
+        recorded_actions(path, "arm-3")
+
+
+def test_a_recording_is_never_overwritten_and_other_files_are_refused(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap", 1, "arm-1")
+    with pytest.raises(ValidationError, match="there already"):
+        Recorder(path)
+    with pytest.raises(ValidationError, match=r"\.mcap"):
+        Recorder(tmp_path / "run.csv")
+    (tmp_path / "text.mcap").write_text("no recording at all, only words", encoding="utf-8")
+    with pytest.raises(ValidationError, match="no recording"):
+        list(read_entries(tmp_path / "text.mcap"))
+    with pytest.raises(ValidationError, match="cannot be read"):
+        list(read_entries(tmp_path / "none.mcap"))
