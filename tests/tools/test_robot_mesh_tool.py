@@ -127,7 +127,7 @@ def test_with_device_connect_off_the_native_mesh_is_used(monkeypatch: pytest.Mon
 def on_the_mesh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
-    monkeypatch.setattr(networks, "HEAR_S", 0.05)
+    monkeypatch.setattr(networks, "HEAR_S", 0.7)
     clear_peers()
     yield
     clear_peers()

@@ -181,9 +181,8 @@ class ZenohTransport:
         return session
 
     def _declare(self, declare: Any, heard: Any, key: str) -> Any:
-        # A direct callback runs on Zenoh's own thread. An indirect one costs a thread and saves a command, whose
-        # answer is awaited, a tenth of its round trip (measured).
-        direct = self._zenoh.handlers.Callback(heard, indirect=topics.topic_of(key).name == "cmd")
+        # A direct callback runs on Zenoh's own thread; an indirect one would cost a thread for each subscriber.
+        direct = self._zenoh.handlers.Callback(heard, indirect=False)
         try:
             return declare(self._require(), direct)
         except self.errors() as exc:
