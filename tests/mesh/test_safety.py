@@ -14,6 +14,7 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.mesh.resume_authority import keygen, load_signing_key, main
 from strands_robots.mesh.transport.base import Sample
+from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
 
 PASSPHRASE = "Correct-Horse-7-Battery"
@@ -37,6 +38,14 @@ def test_an_emergency_stop_halts_and_locks_everybody_under_one_epoch(peers: Flee
     assert all(arm.halts for arm in arms)
     recorded = peers.events("emergency_stop")[0]
     assert (recorded["responses_received"], recorded["peers_not_stopped"], recorded["peers_silent"]) == (3, 0, 0)
+
+
+def test_hardware_is_kept_locked_under_its_own_key_whatever_it_is_called(peers: Fleet, tmp_path: Path) -> None:
+    arm = Arm("arm-1")
+    arm.safety_key = "hardware:so101:left"  # type: ignore[attr-defined]  # as real robots have it
+    peers.join(arm, "arm-1").emergency_stop()
+    stores = [LockoutStore(path.parent) for path in tmp_path.rglob("lockouts.json")]
+    assert [list(store.load_all()) for store in stores] == [["hardware:so101:left"]]
 
 
 def test_who_did_not_stop_and_who_was_silent_is_named(peers: Fleet, caplog: pytest.LogCaptureFixture) -> None:

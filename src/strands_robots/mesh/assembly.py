@@ -151,6 +151,14 @@ class Assembled:
         self.context.registry.prune()
 
 
+def _safety_key(robot: Any, peer: str, *, keep: bool) -> str | None:
+    """Under what the robot's lockout outlives the process: its hardware's own key, else the id it was given."""
+    own = getattr(robot, "safety_key", None)
+    if isinstance(own, str) and own:
+        return own
+    return simulation_key(peer) if keep and robot is not None else None
+
+
 def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assembled:
     """The parts of ``mesh``; those of a stay before give their door to the safety plane."""
     peer, robot = mesh.peer_id, mesh.robot
@@ -158,7 +166,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     context = Context(peer, parts.registry, recorder, Identity(), parts.clock, parts.monotonic)
     simulated = isinstance(robot, WorldRobot) or mesh.peer_type == "sim"
     lanes = Lanes(peer)
-    key = simulation_key(peer) if parts.keep and robot is not None else None
+    key = _safety_key(robot, peer, keep=parts.keep)
     door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
     caller = Caller(context)
     safety = FleetSafety(context, door, caller, lanes.stop_lane)
