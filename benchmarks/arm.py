@@ -1,0 +1,153 @@
+"""A real arm's driver on emulated servos: our control loop beside LeRobot's own calls in a plain loop, in the same run.
+
+Needs the environment of ``make real-arm``: ``.venv-lerobot/bin/python -m benchmarks arm``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from fixtures.feetech_bus import FeetechBus, Write, arm_servos, write_calibration
+from fixtures.waiting import eventually, free_port
+
+from benchmarks.table import Row
+from strands_robots.device_connect import LinkConfig, init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.device_connect.safety_controller import safety_controller
+from strands_robots.robot import Robot
+from strands_robots.safety.lane import lane
+
+HZ = 50.0
+SECONDS, SECONDS_QUICK = 60.0, 5.0
+STOPS, STOPS_QUICK = 20, 3
+STATE_HZ = 10.0
+JITTER_MS = 1.0
+LAST_WRITE_MS = 20.0
+
+
+def run(*, quick: bool = False) -> list[Row]:
+    """Every row of this part; none where LeRobot's driver is not installed."""
+    if importlib.util.find_spec("lerobot") is None:
+        return []
+    return [jitter(SECONDS_QUICK if quick else SECONDS), last_write(STOPS_QUICK if quick else STOPS)]
+
+
+@contextmanager
+def arm() -> Iterator[tuple[FeetechBus, Any]]:
+    """An arm on an emulated bus."""
+    with tempfile.TemporaryDirectory(prefix="bench-arm-") as folder, FeetechBus(arm_servos()) as bus:
+        calibration = write_calibration(Path(folder) / "calibration.json")
+        robot = Robot("so101", mode="real", port=bus.port, calibration=calibration, calibration_dir=folder)
+        try:
+            yield bus, robot
+        finally:
+            robot.cleanup()
+
+
+@contextmanager
+def served(robot: Any) -> Iterator[LinkConfig]:
+    """The robot on the network, which reads and publishes its state."""
+    link = loopback_config(free_port())
+    runtime = init_device_connect_sync(robot, peer_id="arm-1", link=link)
+    try:
+        yield link
+    finally:
+        stop_device_connect(runtime)
+
+
+def jitter(seconds: float) -> Row:
+    """How far the writes of a rollout stray from their period while its state is read, beside a plain loop."""
+    with arm() as (bus, robot):
+        began = time.monotonic()
+        plain_loop(robot.device, seconds)
+        plain = strays(bus.written_after(began))
+        with served(robot), reading(robot.get_state):
+            began = time.monotonic()
+            robot.start_task("wave", duration=seconds)
+            eventually(lambda: robot.get_task_status()["task_status"] != "running", within=seconds + 30)
+        status = robot.get_task_status()
+        ours = strays(bus.written_after(began))
+    return Row(
+        what=f"jitter of the writes at 50 Hz, p99 of {seconds:.0f} s, with 10 Hz getState and publishing",
+        ours=f"{ours:.2f} ms, {status['step_count']} steps",
+        against=f"{plain:.2f} ms, LeRobot's calls in a plain loop",
+        ratio=ours / plain,
+        must=f"at most {JITTER_MS:g} ms more",
+        ok=status["task_status"] == "completed" and ours <= plain + JITTER_MS,
+    )
+
+
+def last_write(stops: int) -> Row:
+    """From the controller's call to the last byte that a servo was told anything by."""
+    took = []
+    with arm() as (bus, robot), served(robot) as link:
+        controller = safety_controller("safety-1", link)
+        try:
+            assert controller.wait_link(10)
+            eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
+            for _ in range(stops):
+                # An operator would lift the lock of the last stop; here a latch that locks nothing takes its place.
+                robot.gate.attach(_Clear())
+                robot.start_task("wave", duration=30.0)
+                eventually(lambda: robot.get_task_status()["step_count"] > 10)
+                called = time.monotonic()
+                report = controller.stop(["arm-1"], "benchmark")
+                assert report.ok, report
+                time.sleep(0.1)
+                took.append((max(write.at for write in bus.writes) - called) * 1000)
+        finally:
+            controller.close()
+    took.sort()
+    return Row(
+        what=f"from the controller's call to the last write at a servo, {stops} stops in motion",
+        ours=f"p50 {took[len(took) // 2]:.1f} ms, worst {took[-1]:.1f} ms",
+        against="nothing to compare: LeRobot has no stop",
+        ratio=None,
+        must=f"worst at most {LAST_WRITE_MS:g} ms",
+        ok=took[-1] <= LAST_WRITE_MS,
+    )
+
+
+def plain_loop(device: Any, seconds: float) -> None:
+    """What LeRobot's own loop does: read, act, wait for the next beat."""
+    began = time.monotonic()
+    for beat in range(int(seconds * HZ)):
+        device.send_action({key: float(value) for key, value in device.get_observation().items()})
+        time.sleep(max(0.0, began + (beat + 1) / HZ - time.monotonic()))
+
+
+def strays(writes: list[Write]) -> float:
+    """99th percentile of how far the gaps between the first servo's goals are from the period, ms."""
+    times = [write.at for write in writes if write.servo == 1]
+    gaps = sorted(abs(after - before - 1 / HZ) * 1000 for before, after in pairwise(times))
+    return gaps[int(len(gaps) * 0.99)]
+
+
+@contextmanager
+def reading(read: Callable[[], object]) -> Iterator[None]:
+    """Call ``read`` ten times a second on a thread of its own."""
+    ended = threading.Event()
+
+    def loop() -> None:
+        while not ended.wait(1 / STATE_HZ):
+            read()
+
+    reader = threading.Thread(target=loop, name="reader", daemon=True)
+    reader.start()
+    yield
+    ended.set()
+    reader.join()
+
+
+class _Clear:
+    """A latch that locks nothing."""
+
+    def refusal(self, verb: str) -> None:
+        return None
