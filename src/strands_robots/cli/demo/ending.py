@@ -77,11 +77,11 @@ class Ending:
                 raise Failure(f"{self._peer} did not answer the emergency stop with a stop: {told}")
             answer = told.stopped[self._peer]
             self._estop_id = row["estop_id"] = told.estop_id
-            row["latency_ms"] = round(answer.latency_ms, 2)
+            row["latency_ms"], row["halt_ms"] = round(answer.latency_ms, 2), answer.facts.get("elapsed_ms")
             row["braking_rad"], row["drift_rad"] = self._story.rest(stream)
         self._show.done(
-            f"{self._peer} answered {CONTROLLER} in {row['latency_ms']:.1f} ms: halted and locked; "
-            f"{row['drift_rad']:.4f} rad in {WATCH_S:g} s after it"
+            f"{self._peer} halted {row['halt_ms']} ms after it heard {CONTROLLER}, and answered with its lockout on "
+            f"disk in {row['latency_ms']:.1f} ms; {row['drift_rad']:.4f} rad in {WATCH_S:g} s after that"
         )
 
     def refuse(self) -> None:
