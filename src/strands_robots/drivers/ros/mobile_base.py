@@ -18,7 +18,7 @@ from strands_robots.drivers.ros.wire import Hold, Holds, VelocityWire
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, RosLink
-from strands_robots.ros.names import graph_name, interface
+from strands_robots.ros.names import bare_kind, graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole
@@ -97,10 +97,11 @@ class MobileBaseRobot:
 
     def command_message(self, linear: float, angular: float) -> dict[str, Any]:
         """The fields of the message that commands these velocities, in m/s and rad/s, or of the zero."""
-        return {
+        twist = {
             "linear": {"x": linear, "y": 0.0, "z": 0.0},
             "angular": {"x": 0.0, "y": 0.0, "z": angular},
         }
+        return {"twist": twist} if bare_kind(self._kind) == "geometry_msgs/TwistStamped" else twist
 
     def check_motion(self, linear: float, angular: float) -> None:
         """Raise :class:`ValidationError` where the platform cannot execute this motion."""

@@ -1,0 +1,80 @@
+"""A ROS 2 mobile base over bare DDS: no ROS 2 on this side."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from strands_robots.drivers.ros.mobile_base import TWIST, UNREACHABLE, MobileBaseRobot
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.gate import CommandGate
+
+
+class RtpsRobot(MobileBaseRobot):
+    """A base that subscribes to velocities in a DDS domain. It declares no limits unless they are given.
+
+    Nothing joins the domain before the first verb. A drive that nobody subscribes to is an error, and so is a stop.
+
+    Args:
+        node_name: what the robot and its tools are called.
+        cmd_vel_topic: the velocity topic, of ``cmd_vel_type`` (a Twist or a TwistStamped).
+        publish_rate: Hz of a drive that is held.
+        max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds.
+        odom_topic: a ``nav_msgs/Odometry``; with it a stop waits to see the base still.
+        domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
+        command_gate: asks the operator's leave; that of the settings by default.
+
+    Raises:
+        ValidationError: an argument outside its domain.
+    """
+
+    link: DdsLink
+
+    def __init__(
+        self,
+        node_name: str,
+        cmd_vel_topic: str,
+        *,
+        cmd_vel_type: str = TWIST,
+        publish_rate: float = 10.0,
+        max_linear: float | None = None,
+        max_angular: float | None = None,
+        max_duration: float | None = None,
+        odom_topic: str | None = None,
+        odom_type: str | None = "nav_msgs/msg/Odometry",
+        scan_topic: str | None = None,
+        domain_id: int | None = None,
+        command_gate: CommandGate | None = None,
+    ) -> None:
+        link = DdsLink(domain_id)
+        super().__init__(
+            node_name,
+            link,
+            cmd_vel_topic,
+            cmd_vel_type,
+            odom_topic=odom_topic,
+            odom_type=odom_type,
+            scan_topic=scan_topic,
+            scan_type="sensor_msgs/msg/LaserScan",
+            publish_rate=publish_rate,
+            max_linear=max_linear,
+            max_angular=max_angular,
+            max_duration=max_duration,
+            command_gate=command_gate,
+        )
+        self._advertised = (cmd_vel_topic, cmd_vel_type)
+        self.safety_key = f"dds:{link.domain_id}:{cmd_vel_topic}"
+
+    @classmethod
+    def from_rtps(cls, node_name: str, cmd_vel_topic: str, **kwargs: Any) -> RtpsRobot:
+        """The constructor, by the name that matches the other classes'."""
+        return cls(node_name, cmd_vel_topic, **kwargs)
+
+    def advertise(self) -> Envelope:
+        """Join the domain and appear as a publisher of the velocity topic, without sending anything."""
+        try:
+            self.link.advertise(*self._advertised)
+        except UNREACHABLE as exc:
+            return error(str(exc))
+        topic, kind = self._advertised
+        return success(f"Publishing {topic}.", topic=topic, type=kind, domain_id=self.link.domain_id)

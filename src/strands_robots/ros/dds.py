@@ -1,0 +1,226 @@
+"""A ROS 2 graph over bare DDS: Cyclone DDS from a wheel, no ROS 2 on this side."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+from strands_robots import settings
+from strands_robots.ros.dds_fields import filled, plain
+from strands_robots.ros.link import Heard, Message, RosError, Unwatch
+from strands_robots.ros.names import bare_kind
+from strands_robots.utils import missing_extra, number, whole
+
+logger = logging.getLogger(__name__)
+
+DOMAIN_MAX = 232
+"""Highest DDS domain: RTPS derives its UDP ports from it, and those of 233 are past 65535."""
+
+DEPTH = 10
+_SLICE_MS = 100
+
+LOOPBACK_ONLY = """<CycloneDDS><Domain Id="any"><General>
+<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+"""Cyclone DDS on this machine alone, without multicast; for Linux, whose loopback interface is ``lo``."""
+
+_domains: dict[int, Any] = {}
+_domains_lock = threading.Lock()
+
+
+class DdsLink:
+    """A :class:`~strands_robots.ros.link.RosLink` of topics. Nothing is opened before the first use.
+
+    What is published has to reach somebody: while no subscription matches, a publish waits ``match_s`` and fails.
+
+    Args:
+        domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
+        match_s: how long a publish waits for a first subscription, and a read without a type for a publisher.
+
+    Raises:
+        ValidationError: an argument outside its domain.
+    """
+
+    def __init__(self, domain_id: int | None = None, *, match_s: float = 0.5) -> None:
+        stated = settings.integer("ROS_DOMAIN_ID") if domain_id is None else domain_id
+        self.domain_id = whole("domain_id", stated, low=0, high=DOMAIN_MAX)
+        self._match_s = number("match_s", match_s, low=0, high=60)
+        self._lock = threading.RLock()
+        self._participant: Any = None
+        self._writers: dict[tuple[str, str], Any] = {}
+        self._unwatch: list[Unwatch] = []
+
+    def advertise(self, topic: str, kind: str) -> None:
+        """Appear on the graph as a publisher of ``topic`` before there is anything to say."""
+        self._writer(topic, kind)
+
+    def publish(self, topic: str, kind: str, fields: Message) -> None:
+        message = filled(_struct(kind), fields)
+        writer = self._writer(topic, kind)
+        deadline = time.monotonic() + self._match_s
+        while not writer.get_matched_subscriptions():
+            if time.monotonic() >= deadline:
+                raise RosError(f"Nobody subscribes to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
+            time.sleep(0.002)
+        try:
+            writer.write(message)
+        except Exception as exc:
+            raise RosError(f"{topic} did not take a {bare_kind(kind)}: {exc}") from exc
+
+    def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
+        arrived, got = threading.Event(), list[Message]()
+
+        def keep(message: Message) -> None:
+            got.append(message)
+            arrived.set()
+
+        unwatch = self.watch(topic, kind, keep)
+        try:
+            if not arrived.wait(within_s):
+                raise RosError(f"Nothing arrived on {topic} within {within_s:g} s.")
+        finally:
+            unwatch()
+        return dict(got[0])
+
+    def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
+        """Refused: bare DDS carries topics alone here."""
+        del kind, fields, within_s
+        raise RosError(f"{service} is a service, and bare DDS carries topics only; use rosbridge.")
+
+    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+        sub, qos, core = _dds("sub"), _dds("qos"), _dds("core")
+        struct = _struct(kind or self._kind_of(topic))
+        # Best effort takes what a sensor sends so as well as what is sent reliably.
+        policies = qos.Qos(qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepLast(DEPTH))
+        with self._lock:
+            participant = self._open()
+            reader = sub.DataReader(participant, self._topic(topic, struct), qos=policies)
+            waitset = core.WaitSet(participant)
+        anything = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
+        waitset.attach(core.ReadCondition(reader, anything))
+        done = threading.Event()
+
+        def run() -> None:
+            slice_ns = _SLICE_MS * 1_000_000
+            while not done.is_set():
+                if waitset.wait(slice_ns):
+                    for sample in reader.take(N=DEPTH):
+                        # A writer that leaves delivers one sample without data.
+                        if sample.sample_info.valid_data and not done.is_set():
+                            _tell(heard, plain(sample), topic)
+
+        thread = threading.Thread(target=run, name=f"dds-{topic.strip('/')}", daemon=True)
+
+        def unwatch() -> None:
+            done.set()
+            if thread is not threading.current_thread():
+                thread.join(10 * _SLICE_MS / 1000)
+
+        self._unwatch.append(unwatch)
+        thread.start()
+        return unwatch
+
+    def endpoints(self) -> list[dict[str, str]]:
+        """What the graph has told so far: ``topic``, ``type`` and ``role`` (publisher, subscription) by endpoint."""
+        builtin, core = _dds("builtin"), _dds("core")
+        sources = {
+            "publisher": builtin.BuiltinTopicDcpsPublication,
+            "subscription": builtin.BuiltinTopicDcpsSubscription,
+        }
+        found = []
+        with self._lock:
+            for role, source in sources.items():
+                reader = builtin.BuiltinDataReader(self._open(), source)
+                alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
+                for each in reader.read(N=10_000, condition=core.ReadCondition(reader, alive)):
+                    if each.sample_info.valid_data and each.topic_name.startswith("rt/"):
+                        kind = each.type_name.replace("::msg::dds_::", "/msg/").removesuffix("_")
+                        found.append({"topic": each.topic_name[2:], "type": kind, "role": role})
+        return found
+
+    def close(self) -> None:
+        with self._lock:
+            unwatch, self._unwatch = self._unwatch, []
+            self._writers.clear()
+            self._participant = None
+        for each in unwatch:
+            each()
+
+    def _open(self) -> Any:
+        with self._lock:
+            if self._participant is None:
+                domain = _dds("domain")
+                try:
+                    _confine(domain, self.domain_id)
+                    self._participant = domain.DomainParticipant(self.domain_id)
+                except _dds("core").DDSException as exc:
+                    raise RosError(f"DDS domain {self.domain_id} could not be joined: {exc}") from exc
+            return self._participant
+
+    def _topic(self, topic: str, struct: type[Any]) -> Any:
+        return _dds("topic").Topic(self._open(), f"rt/{topic.lstrip('/')}", struct)
+
+    def _writer(self, topic: str, kind: str) -> Any:
+        key = (topic, bare_kind(kind))
+        with self._lock:
+            if key not in self._writers:
+                qos = _dds("qos")
+                reliable = qos.Policy.Reliability.Reliable(max_blocking_time=_SLICE_MS * 1_000_000)
+                policies = qos.Qos(reliable, qos.Policy.History.KeepLast(DEPTH))
+                struct = _struct(kind)
+                try:
+                    made = _dds("pub").DataWriter(self._open(), self._topic(topic, struct), qos=policies)
+                except _dds("core").DDSException as exc:
+                    raise RosError(f"{topic} cannot be published as {bare_kind(kind)}: {exc}") from exc
+                self._writers[key] = made
+            return self._writers[key]
+
+    def _kind_of(self, topic: str) -> str:
+        wanted = f"/{topic.lstrip('/')}"
+        deadline = time.monotonic() + self._match_s
+        while True:
+            for each in self.endpoints():
+                if each["topic"] == wanted and each["role"] == "publisher":
+                    return each["type"]
+            if time.monotonic() >= deadline:
+                raise RosError(f"Nobody publishes {topic} in domain {self.domain_id}, so its type is not known.")
+            time.sleep(0.02)
+
+
+def _confine(domain: ModuleType, domain_id: int) -> None:
+    """Give the domain its loopback configuration, once a process, where it is asked for."""
+    if settings.is_set("CYCLONEDDS_URI") or not settings.boolean("ROS_LOCALHOST_ONLY", safe=True):
+        return
+    with _domains_lock:
+        if domain_id not in _domains:
+            _domains[domain_id] = domain.Domain(domain_id, LOOPBACK_ONLY)
+
+
+def _struct(kind: str) -> type[Any]:
+    _dds("core")
+    kinds: dict[str, type[Any]] = import_module("strands_robots.ros.dds_types").KINDS
+    found = kinds.get(bare_kind(kind))
+    if found is None:
+        raise RosError(f"{kind} is not among the types that bare DDS carries here: {', '.join(sorted(kinds))}.")
+    return found
+
+
+def _dds(module: str) -> ModuleType:
+    try:
+        return import_module(f"cyclonedds.{module}")
+    except ModuleNotFoundError as exc:
+        if (exc.name or "").partition(".")[0] != "cyclonedds":
+            raise
+        raise missing_extra("Bare DDS", "ros2") from exc
+
+
+def _tell(heard: Heard, message: dict[str, Any], topic: str) -> None:
+    try:
+        heard(message)
+    except Exception:
+        logger.exception("A watcher of %s failed.", topic)

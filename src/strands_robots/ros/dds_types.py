@@ -1,0 +1,257 @@
+"""ROS 2 messages as IDL types of Cyclone DDS, named on the wire as ROS 2 names them.
+
+Fields and their order are those of the public ``.msg`` files of common_interfaces and geometry2. A ROS ``uint8``
+is declared ``byte``: with ``uint8`` a peer on Cyclone DDS 0.10, which many ROS 2 installations ship, fails to match
+and can crash. Annotations are evaluated by the library, so this module does not postpone them.
+"""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, byte, float32, float64, int32, sequence, uint32
+
+from strands_robots.ros._compat import pack_as_bytes
+
+KINDS: dict[str, type[Any]] = {}
+"""The IDL type of each ``pkg/Name`` that this bundle carries."""
+
+
+def wire_type(kind: str) -> str:
+    """The DDS type name of a ``pkg/Name``."""
+    package, _, name = kind.partition("/")
+    return f"{package}::msg::dds_::{name}_"
+
+
+def _typed(kind: str) -> dict[str, str]:
+    return {"typename": wire_type(kind)}
+
+
+def _nine() -> list[float]:
+    return [0.0] * 9
+
+
+def _thirty_six() -> list[float]:
+    return [0.0] * 36
+
+
+# The library's own spellings of lists are values, which a type checker cannot read.
+if TYPE_CHECKING:
+    Strings = list[str]
+    Float32s = list[float]
+    Float64s = list[float]
+    Nine = list[float]
+    ThirtySix = list[float]
+    Bytes = bytes
+else:
+    Strings = sequence[str]
+    Float32s = sequence[float32]
+    Float64s = sequence[float64]
+    Bytes = sequence[byte]
+    Nine = array[float64, 9]
+    ThirtySix = array[float64, 36]
+
+
+@dataclass
+class Time(IdlStruct, **_typed("builtin_interfaces/Time")):
+    sec: int32 = 0
+    nanosec: uint32 = 0
+
+
+@dataclass
+class Header(IdlStruct, **_typed("std_msgs/Header")):
+    stamp: Time = field(default_factory=Time)
+    frame_id: str = ""
+
+
+@dataclass
+class String(IdlStruct, **_typed("std_msgs/String")):
+    data: str = ""
+
+
+@dataclass
+class Vector3(IdlStruct, **_typed("geometry_msgs/Vector3")):
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Point(IdlStruct, **_typed("geometry_msgs/Point")):
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Quaternion(IdlStruct, **_typed("geometry_msgs/Quaternion")):
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+    w: float64 = 1.0
+
+
+@dataclass
+class Twist(IdlStruct, **_typed("geometry_msgs/Twist")):
+    linear: Vector3 = field(default_factory=Vector3)
+    angular: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass
+class TwistStamped(IdlStruct, **_typed("geometry_msgs/TwistStamped")):
+    header: Header = field(default_factory=Header)
+    twist: Twist = field(default_factory=Twist)
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, **_typed("geometry_msgs/TwistWithCovariance")):
+    twist: Twist = field(default_factory=Twist)
+    covariance: ThirtySix = field(default_factory=_thirty_six)
+
+
+@dataclass
+class Pose(IdlStruct, **_typed("geometry_msgs/Pose")):
+    position: Point = field(default_factory=Point)
+    orientation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass
+class PoseStamped(IdlStruct, **_typed("geometry_msgs/PoseStamped")):
+    header: Header = field(default_factory=Header)
+    pose: Pose = field(default_factory=Pose)
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, **_typed("geometry_msgs/PoseWithCovariance")):
+    pose: Pose = field(default_factory=Pose)
+    covariance: ThirtySix = field(default_factory=_thirty_six)
+
+
+@dataclass
+class Transform(IdlStruct, **_typed("geometry_msgs/Transform")):
+    translation: Vector3 = field(default_factory=Vector3)
+    rotation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass
+class TransformStamped(IdlStruct, **_typed("geometry_msgs/TransformStamped")):
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    transform: Transform = field(default_factory=Transform)
+
+
+if TYPE_CHECKING:
+    Transforms = list[TransformStamped]
+else:
+    Transforms = sequence[TransformStamped]
+
+
+@dataclass
+class TFMessage(IdlStruct, **_typed("tf2_msgs/TFMessage")):
+    transforms: Transforms = field(default_factory=list)
+
+
+@dataclass
+class Odometry(IdlStruct, **_typed("nav_msgs/Odometry")):
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+
+
+@dataclass
+class JointState(IdlStruct, **_typed("sensor_msgs/JointState")):
+    header: Header = field(default_factory=Header)
+    name: Strings = field(default_factory=list)
+    position: Float64s = field(default_factory=list)
+    velocity: Float64s = field(default_factory=list)
+    effort: Float64s = field(default_factory=list)
+
+
+@dataclass
+class LaserScan(IdlStruct, **_typed("sensor_msgs/LaserScan")):
+    header: Header = field(default_factory=Header)
+    angle_min: float32 = 0.0
+    angle_max: float32 = 0.0
+    angle_increment: float32 = 0.0
+    time_increment: float32 = 0.0
+    scan_time: float32 = 0.0
+    range_min: float32 = 0.0
+    range_max: float32 = 0.0
+    ranges: Float32s = field(default_factory=list)
+    intensities: Float32s = field(default_factory=list)
+
+
+@dataclass
+class Image(IdlStruct, **_typed("sensor_msgs/Image")):
+    header: Header = field(default_factory=Header)
+    height: uint32 = 0
+    width: uint32 = 0
+    encoding: str = ""
+    is_bigendian: byte = 0
+    step: uint32 = 0
+    data: Bytes = field(default_factory=bytes)
+
+
+@dataclass
+class CompressedImage(IdlStruct, **_typed("sensor_msgs/CompressedImage")):
+    header: Header = field(default_factory=Header)
+    format: str = ""
+    data: Bytes = field(default_factory=bytes)
+
+
+@dataclass
+class Imu(IdlStruct, **_typed("sensor_msgs/Imu")):
+    header: Header = field(default_factory=Header)
+    orientation: Quaternion = field(default_factory=Quaternion)
+    orientation_covariance: Nine = field(default_factory=_nine)
+    angular_velocity: Vector3 = field(default_factory=Vector3)
+    angular_velocity_covariance: Nine = field(default_factory=_nine)
+    linear_acceleration: Vector3 = field(default_factory=Vector3)
+    linear_acceleration_covariance: Nine = field(default_factory=_nine)
+
+
+@dataclass
+class BatteryState(IdlStruct, **_typed("sensor_msgs/BatteryState")):
+    header: Header = field(default_factory=Header)
+    voltage: float32 = 0.0
+    temperature: float32 = 0.0
+    current: float32 = 0.0
+    charge: float32 = 0.0
+    capacity: float32 = 0.0
+    design_capacity: float32 = 0.0
+    percentage: float32 = 0.0
+    power_supply_status: byte = 0
+    power_supply_health: byte = 0
+    power_supply_technology: byte = 0
+    present: bool = False
+    cell_voltage: Float32s = field(default_factory=list)
+    cell_temperature: Float32s = field(default_factory=list)
+    location: str = ""
+    serial_number: str = ""
+
+
+pack_as_bytes(Image, "data")
+pack_as_bytes(CompressedImage, "data")
+
+for _kind, _struct in {
+    "builtin_interfaces": (Time,),
+    "std_msgs": (Header, String),
+    "geometry_msgs": (
+        Vector3,
+        Point,
+        Quaternion,
+        Twist,
+        TwistStamped,
+        TwistWithCovariance,
+        Pose,
+        PoseStamped,
+        PoseWithCovariance,
+        Transform,
+        TransformStamped,
+    ),
+    "tf2_msgs": (TFMessage,),
+    "nav_msgs": (Odometry,),
+    "sensor_msgs": (JointState, LaserScan, Image, CompressedImage, Imu, BatteryState),
+}.items():
+    KINDS.update({f"{_kind}/{each.__name__}": each for each in _struct})

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.drivers.ros.rtps_robot import RtpsRobot
+from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.link import RosError
+from strands_robots.utils import ValidationError
+
+OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
+DOMAIN = 91
+ROOT = Path(__file__).resolve().parents[3]
+TWIST = "geometry_msgs/msg/Twist"
+
+
+@pytest.fixture(autouse=True)
+def loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+
+
+@pytest.fixture
+def base() -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fixtures.dds_base", str(DOMAIN)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    yield process
+    process.communicate(timeout=10)
+
+
+@pytest.fixture
+def rover() -> Iterator[RtpsRobot]:
+    robot = RtpsRobot("rover", "/cmd_vel", odom_topic="/odom", domain_id=DOMAIN, publish_rate=20, command_gate=OPEN)
+    yield robot
+    robot.disconnect()
+
+
+def x_of(robot: RtpsRobot) -> float:
+    message = robot.get_pose(3.0)["message"]
+    return float(message["pose"]["pose"]["position"]["x"])
+
+
+def test_a_base_in_another_process_is_driven_and_stopped(base: subprocess.Popen[str], rover: RtpsRobot) -> None:
+    began = x_of(rover)
+    answer = rover.drive(0.3, 0.0, duration=1.0)
+    assert (answer["status"], answer["messages"], answer["trailing_zero"]) == ("success", 20, True)
+    assert rover.stop()["stopped"] is True
+    assert x_of(rover) - began == pytest.approx(0.3, abs=0.06)
+
+
+def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: subprocess.Popen[str], rover: RtpsRobot) -> None:
+    assert rover.advertise()["status"] == "success"
+    assert rover.start_drive(1.0, 0.0, 30.0)["status"] == "success"
+    eventually(lambda: x_of(rover) > 0.1)
+    verdict = rover.halt("test")
+    assert (verdict.stopped, verdict.halted) == (True, ("drive",))
+    stood = x_of(rover)
+    assert rover.get_task_status()["task_status"] == "stopped"
+    assert x_of(rover) == stood
+
+
+def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(
+    base: subprocess.Popen[str], rover: RtpsRobot
+) -> None:
+    assert rover.start_drive(0.5, 0.0, 30.0)["status"] == "success"
+    eventually(lambda: x_of(rover) > 0.05)
+    base.communicate(timeout=10)
+    eventually(lambda: rover.get_task_status()["task_status"] == "error", within=15)
+    verdict = rover.halt()
+    assert verdict.stopped is False
+    assert "Nobody subscribes to /cmd_vel" in verdict.not_stopped["velocity"]
+
+
+def test_a_type_that_is_not_given_is_asked_of_the_graph(base: subprocess.Popen[str]) -> None:
+    link = DdsLink(DOMAIN, match_s=5.0)
+    try:
+        assert "twist" in link.read("/odom", None, 3.0)
+        seen = {(each["topic"], each["type"], each["role"]) for each in link.endpoints()}
+        assert ("/cmd_vel", TWIST, "subscription") in seen
+        assert ("/odom", "nav_msgs/msg/Odometry", "publisher") in seen
+        with pytest.raises(RosError, match="its type is not known"):
+            DdsLink(DOMAIN, match_s=0.1).read("/nothing", None, 0.1)
+    finally:
+        link.close()
+
+
+def test_nobody_to_hear_is_an_error_for_a_drive_and_for_a_stop() -> None:
+    robot = RtpsRobot.from_rtps("alone", "/alone/cmd_vel", domain_id=DOMAIN, command_gate=OPEN)
+    try:
+        assert "Nobody subscribes to /alone/cmd_vel" in robot.drive(0.1)["reason"]
+        assert robot.halt().stopped is False
+    finally:
+        robot.disconnect()
+
+
+def test_a_message_goes_from_one_link_to_another_and_a_closed_link_opens_again() -> None:
+    sender, receiver = DdsLink(DOMAIN), DdsLink(DOMAIN)
+    heard: list[Mapping[str, Any]] = []
+    try:
+        unwatch = receiver.watch("/picture", "sensor_msgs/Image", heard.append)
+        sender.publish("/picture", "sensor_msgs/msg/Image", {"height": 1, "width": 2, "data": b"\x01\x02"})
+        eventually(lambda: heard and heard[0]["data"] == b"\x01\x02")
+        sender.close()
+        sender.publish("/picture", "sensor_msgs/msg/Image", {"width": 3})
+        eventually(lambda: heard[-1]["width"] == 3)
+        unwatch()
+    finally:
+        sender.close()
+        receiver.close()
+
+
+def test_what_bare_dds_cannot_do_is_said() -> None:
+    link = DdsLink(DOMAIN)
+    with pytest.raises(RosError, match="is a service"):
+        link.call("/add", "pkg/srv/Add", {}, 1.0)
+    with pytest.raises(RosError, match="nav_msgs/msg/Path is not among the types"):
+        link.publish("/path", "nav_msgs/msg/Path", {})
+
+
+@pytest.mark.parametrize("domain", [-1, 233, True, "0", 1.0])
+def test_a_domain_that_is_none_is_refused_before_anything(domain: Any) -> None:
+    with pytest.raises(ValidationError, match="domain_id must be an integer from 0 to 232"):
+        RtpsRobot("rover", "/cmd_vel", domain_id=domain)
