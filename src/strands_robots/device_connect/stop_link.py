@@ -79,6 +79,7 @@ class ZenohStopLink:
         self._root = f"device-connect/{link.tenant}"
         self._session: Any = None
         self._keep: list[Any] = []
+        self._closing_session = threading.Lock()
         self._far_sides: set[str] = set()
         self._state = _State(lambda up: None)
         self._closing = threading.Event()
@@ -110,9 +111,11 @@ class ZenohStopLink:
         self._closing.set()
         if self._thread is not None:
             self._thread.join(10.0)
-        session, self._session = self._session, None
-        if session is not None:
-            session.close()
+        # Whoever comes second waits too: a thread that is inside Zenoh while the interpreter ends aborts the process.
+        with self._closing_session:
+            session, self._session = self._session, None
+            if session is not None:
+                session.close()
         self._state.set(False)
         _OPEN.discard(self)
 
