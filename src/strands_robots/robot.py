@@ -239,4 +239,9 @@ def _label(name: object) -> str:
 def _join_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Any:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the mesh is loaded when it is used
 
-    return init_mesh(robot, peer_id=peer_id, peer_type=peer_type)
+    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type)
+    if mesh is not None and hasattr(robot, "input_sink"):
+        from strands_robots.mesh.input_sink import MeshInputSink  # noqa: PLC0415 - as above
+
+        robot.input_sink = MeshInputSink(mesh)
+    return mesh
