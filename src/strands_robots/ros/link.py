@@ -49,6 +49,10 @@ class MemoryLink:
         self._watchers: dict[str, list[Heard]] = {}
         self._lock = threading.Lock()
 
+    def offer(self, service: str, answer: Callable[[Message], dict[str, Any]]) -> None:
+        """Offer a service from now on."""
+        self._services[service] = answer
+
     def publish(self, topic: str, kind: str, fields: Message) -> None:
         del kind
         message = copy.deepcopy(dict(fields))
