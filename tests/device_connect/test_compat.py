@@ -22,6 +22,7 @@ SOURCE_HASHES = {
     "DeviceRuntime._register": "d157bbac0df5ea4d",
     "DeviceRuntime._resubscribe_after_reconnect": "66a353dea257fe50",
     "DeviceRuntime._track_task": "37e65a174cde4a05",
+    "DeviceRuntime._warn_if_predicate_extra_missing": "0af1317091150b22",
     "DeviceRuntime._validate_startup_config": "5b239cd646cf984c",
     "DeviceRuntime.enqueue_event": "40b84ccb6d07b492",
     "DeviceRuntime.run": "a2472bb8763ce3c6",

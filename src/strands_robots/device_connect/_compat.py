@@ -38,6 +38,7 @@ LEANED_ON = {
         "_build_registration_params",
         "_register",
         "_track_task",
+        "_warn_if_predicate_extra_missing",
         "enqueue_event",
     ),
     "DeviceDriver": ("_get_functions", "_invoke_decorated", "invoke"),
@@ -106,6 +107,10 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._loop: asyncio.AbstractEventLoop | None = None
         self._running: asyncio.Task[Any] | None = None
         self._lost_at: float | None = None
+
+    def _warn_if_predicate_extra_missing(self) -> None:
+        """Keep the framework's start-up line about an optional package to those who look for it."""
+        _log.debug("%s: broadcasts with a `where` clause need device-connect-edge[predicate].", self.device_id)
 
     async def run(self) -> None:
         """Serve until ``shutdown`` or ``stop``; whatever ends it, the link is closed."""
