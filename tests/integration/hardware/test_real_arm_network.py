@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -134,3 +135,34 @@ def test_the_example_drives_the_whole_way_and_draws_it(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "0 after the agent's stop" in done.stdout
     assert picture.stat().st_size > 10_000
+
+
+def test_serve_puts_a_real_arm_on_the_network(tmp_path: Path) -> None:
+    calibration, port = write_calibration(tmp_path / "calibration.json"), free_port()
+    with FeetechBus(arm_servos(), link=tmp_path / "arm") as bus:
+        arm = {"port": bus.port, "calibration": calibration, "calibration_dir": tmp_path}
+        words = [word for key, value in arm.items() for word in ("--set", f"{key}={value}")]
+        words += ["--peer-id", "arm-7", "--rpc-allow", "tester", "--command-allow", "execute", "--port", str(port)]
+        line = [sys.executable, "-m", "strands_robots.cli", "serve", "so101", "--mode", "real", *words]
+        process = subprocess.Popen(
+            [*line, "--json", "--until-stdin-closes"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "STRANDS_STATE_DIR": str(tmp_path)},
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            assert json.loads(process.stdout.readline())["event"] == "serving"
+            with FleetClient(loopback_config(port), "tester") as fleet:
+                assert fleet.call("arm-7", "execute", MOVE)["status"] == "success"
+                eventually(lambda: fleet.call("arm-7", "getStatus")["step_count"] > 10)
+                assert fleet.stop("arm-7")["status"] == "success"
+            process.stdin.close()
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+        assert not any(servo.torque for servo in bus.servos.values()), "LeRobot lets go when it disconnects"
