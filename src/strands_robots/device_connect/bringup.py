@@ -241,6 +241,10 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
         from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver  # noqa: PLC0415 - for it alone
 
         return ReachyMiniDriver(robot=robot)
+    if callable(getattr(robot, "start_drive", None)):
+        from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver  # noqa: PLC0415 - as above
+
+        return MobileBaseDeviceDriver(robot)
     simulation = getattr(sys.modules.get("strands_robots.simulation"), "Simulation", None)
     if isinstance(simulation, type) and isinstance(robot, simulation):
         return SimulationDeviceDriver(robot)

@@ -122,3 +122,12 @@ class CommandGate:
     def _listed(self, name: str, surface: str) -> bool:
         wanted = name if name.startswith("/") else f"/{name}"
         return any(entry == surface or fnmatchcase(wanted, entry) for entry in self._read(ALLOW))
+
+
+class Approved:
+    """Stands for the operator where a network has asked for the approval of the verb already."""
+
+    def interrupt(self, name: str, reason: Any = None) -> bool:
+        """Yes."""
+        del name, reason
+        return True
