@@ -10,12 +10,13 @@ import typer
 
 from strands_robots.audit import audit_directory, read_audit_log, verify_audit_integrity
 from strands_robots.cli.command import command
-from strands_robots.cli.output import Failure, Screen, label, plain, table
+from strands_robots.cli.output import Failure, Screen, plain, table
 from strands_robots.safety.lockout import utc
 from strands_robots.utils import number, whole
 
 FOLLOW_S = 0.3
-COLUMNS = ("when", "robot", "event", "what")
+FIRST = ("stopped", "source", "who", "why", "reason", "estop_id", "epoch")
+SELDOM = ("device_id", "epochs", "issued", "timing", "repeated", "late", "road", "persisted")
 
 
 def register(app: typer.Typer) -> None:
@@ -47,7 +48,7 @@ def tail(
         records = fresh or records
         for each in fresh:
             screen.data(each)
-            screen.say(" ".join(_cells(each)))
+            screen.say(_line(each))
 
 
 def show(
@@ -76,7 +77,8 @@ def verify(screen: Screen) -> None:
     except (OSError, ValueError) as exc:
         raise Failure(f"The audit in {audit_directory()} cannot be read: {exc}") from exc
     counts = ("total", "signed", "verified", "bad", "missing", "gaps", "broken", "torn")
-    screen.show(table(str(audit_directory()), ("what", "count"), ((name, found[name]) for name in counts)))
+    screen.say(str(audit_directory()))
+    screen.show(table("", ("what", "count"), ((name, found[name]) for name in counts)))
     for each in found["breaks"]:
         screen.say(f"{each['where']}: {each['why']}", "red")
     if not found["ok"]:
@@ -94,21 +96,26 @@ def _records(since: float | None = None) -> list[dict[str, Any]]:
 
 
 def _listed(screen: Screen, records: Iterable[dict[str, Any]]) -> None:
-    rows = []
+    empty = True
     for each in records:
+        empty = False
         screen.data(each)
-        rows.append([label(cell) for cell in _cells(each)])
-    if rows:
-        screen.show(table("", COLUMNS, rows))
-    else:
+        screen.say(_line(each))
+    if empty:
         screen.say(f"No record in {audit_directory()}.")
 
 
-def _cells(record: Mapping[str, Any]) -> tuple[str, str, str, str]:
+def _line(record: Mapping[str, Any]) -> str:
+    """A record in one line: what tells most of it comes first, what seldom does is left to ``show``."""
     payload = record.get("payload")
-    pairs = payload.items() if isinstance(payload, Mapping) else ()
-    what = ", ".join(f"{name}={plain(value, 60)}" for name, value in pairs if value not in ("", None, [], {}))
-    return _when(record), plain(record.get("peer_id", "")), plain(record.get("event", "")), plain(what)
+    facts = dict(payload) if isinstance(payload, Mapping) else {"payload": payload}
+    first = [name for name in FIRST if name in facts]
+    last = [name for name in facts if name not in FIRST and name not in SELDOM]
+    told = [
+        f"{plain(name)}={plain(facts[name], 60)}" for name in (*first, *last) if facts[name] not in ("", None, [], {})
+    ]
+    who, what = plain(record.get("peer_id", "")), plain(record.get("event", ""))
+    return f"{_when(record)} {who} {what} {' '.join(told)}"
 
 
 def _names(value: object, what: str) -> bool:

@@ -13,6 +13,7 @@ from strands_robots.cli.command import command
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Exit, Failure, Screen, label, plain, table
 from strands_robots.cli.passphrase import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.quiet import kept_log
 from strands_robots.safety.controller import DEADLINE_S, Answer, Progress, SafetyController, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.utils import device_id, number
@@ -189,7 +190,8 @@ def drawn(cells: list[tuple[Any, ...]], title: str) -> Table:
 def _shown(screen: Screen, running: Running) -> StopReport:
     from rich.live import Live  # noqa: PLC0415 - Rich is loaded when something is shown
 
-    with Live(drawn([], "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
+    # The report says by name what the log says.
+    with kept_log(), Live(drawn([], "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
         while not running.finished(DRAW_S):
             if running.latest is not None:
                 link = "" if running.latest.link_up else ": THE LINK IS DOWN"

@@ -80,9 +80,13 @@ def _hold(told: Mapping[str, Any]) -> Hold:
     return Hold(str(told.get("epoch", "")), str(told.get("source", "")), str(told.get("reason", "")), at)
 
 
-def rows(name: str, holds: Iterable[Hold], where: str) -> list[tuple[str, ...]]:
-    """Cells for one robot, one row for each hold."""
-    return [(name, hold.source, hold.reason, utc(hold.at), hold.epoch, where) for hold in holds]
+def rows(name: str, held: Iterable[Hold]) -> list[tuple[str, str]]:
+    """Cells for one robot: for each hold since when, by whom and why, and its epoch, which other commands take."""
+    cells: list[tuple[str, str]] = []
+    for hold in held:
+        why = f": {hold.reason}" if hold.reason else ""
+        cells += [("" if cells else name, f"since {utc(hold.at)} by {hold.source}{why}"), ("", f"epoch {hold.epoch}")]
+    return cells
 
 
 def fields(hold: Hold) -> dict[str, Any]:

@@ -88,10 +88,10 @@ def lockout(
                 raise
             note = f"{failure.reason} "
     seen = {each.name: each for each in live}
-    cells: list[tuple[Any, ...]] = [row for each in live for row in holds.rows(each.name, each.holds, "live")]
+    cells: list[tuple[Any, ...]] = [row for each in live for row in holds.rows(each.name, each.holds)]
     # A robot that is on the network answers for itself.
     away = {name: held for name, held in kept.items() if name not in seen or seen[name].problem}
-    cells += [row for name, held in away.items() for row in holds.rows(name, held, "kept here")]
+    cells += [row for name, held in away.items() for row in holds.rows(f"{name} (kept here)", held)]
     screen.data(
         {
             "status": "success",
@@ -103,7 +103,7 @@ def lockout(
         }
     )
     if cells:
-        screen.show(table("", ("robot", "stopped by", "reason", "since", "epoch", "known from"), cells))
+        screen.show(table("", ("robot", "locked"), cells))
     for each in live:
         if each.problem:
             screen.say(f"{each.name}: {each.problem}", "yellow")

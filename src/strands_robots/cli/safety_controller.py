@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import sys
 import threading
-from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,13 +17,13 @@ from strands_robots.cli.keyboard import keys
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.cli.passphrase import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.quiet import kept_log
 from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
     from strands_robots.safety.controller import SafetyController
 
 DRAW_S = 0.1
-LOG_LINES = 5
 
 
 def register(app: typer.Typer) -> None:
@@ -82,31 +78,10 @@ def _run(screen: Screen, controller: SafetyController, board: Board, reason: str
         elif key in "fF":
             board.forget()
 
-    with _logged() as lines, board.looking(), keys(pressed, done.set):
+    with kept_log() as lines, board.looking(), keys(pressed, done.set):
         try:
             with Live(board.draw(button, lines), console=screen.out, screen=True, auto_refresh=False) as live:
                 while not done.wait(DRAW_S):
                     live.update(board.draw(button, lines), refresh=True)
         finally:
             button.close()
-
-
-class _Lines(logging.Handler):
-    """The last lines of the log, kept for the screen: writing them would tear it, and could block."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.lines: deque[str] = deque(maxlen=LOG_LINES)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(f"{record.levelname} {record.getMessage()}")
-
-
-@contextmanager
-def _logged() -> Iterator[deque[str]]:
-    root, mine = logging.getLogger(), _Lines()
-    before, root.handlers = root.handlers, [mine]
-    try:
-        yield mine.lines
-    finally:
-        root.handlers = before
