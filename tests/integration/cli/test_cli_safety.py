@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.nats_server import NatsServer
 from fixtures.terminal import on_a_terminal
 from fixtures.waiting import eventually, free_port
 
@@ -52,10 +53,10 @@ class Site:
         return result.returncode, json.loads(result.stdout)
 
     @contextmanager
-    def serving(self, peer_id: str) -> Iterator[subprocess.Popen[str]]:
+    def serving(self, peer_id: str, *words: str, **settings: str) -> Iterator[subprocess.Popen[str]]:
         served = subprocess.Popen(
-            self.words("serve", "so100", "--peer-id", peer_id, "--json"),
-            env=self.environment,
+            self.words("serve", "so100", "--peer-id", peer_id, "--json", *words),
+            env=self.environment | settings,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
@@ -122,6 +123,30 @@ def test_a_key_that_the_robots_do_not_know_frees_nothing(site: Site, arms: tuple
     )
     assert (code, said["devices"]["arm-1"]["free"]) == (1, False)
     assert site.signed()[0] == 0
+
+
+def test_a_stop_on_a_terminal_is_a_table_that_ends_with_counts(site: Site, arms: tuple[str, str]) -> None:
+    with on_a_terminal(site.words("estop", *arms, "arm-9", "--deadline", "0.5"), site.environment) as terminal:
+        assert terminal.process.wait(WITHIN_S) == 3
+        eventually(lambda: "2 stopped, 1 silent, in" in terminal.drawn, within=5.0)
+        assert "unconfirmed" in terminal.drawn and "NO ANSWER" in terminal.drawn
+        assert "CRITICAL" not in terminal.drawn, "the log does not tear the table"
+    assert site.signed()[0] == 0
+
+
+def test_over_a_broker_a_robot_that_asks_for_signed_stops_heeds_no_others(site: Site) -> None:
+    public = keygen(site.folder / "stop.pem", PASSPHRASE)
+    signed = ("--key", str(site.folder / "stop.pem"), "--passphrase-file", str(site.passphrase))
+    with NatsServer() as server:
+        there = ("--nats", server.url)
+        with site.serving("arm-5", *there, DEVICE_CONNECT_ESTOP_PUBLIC_KEYS=public):
+            stop = ("estop", "arm-5", "--deadline", "1.5", *there)
+            code, said = site.json(*stop)
+            assert (code, said["silent"]) == (3, ["arm-5"])
+            assert site.json("lockout", *there)[1]["live"]["arm-5"]["locked"] is False
+            assert site.json(*stop, *signed)[0] == 0
+            assert site.json("lockout", *there)[1]["live"]["arm-5"]["locked"] is True
+            assert site.signed(*there)[0] == 0
 
 
 def test_a_robot_that_is_expected_and_silent_is_exit_3_by_name(site: Site, arms: tuple[str, str]) -> None:
