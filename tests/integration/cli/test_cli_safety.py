@@ -208,3 +208,23 @@ def test_a_controller_without_a_terminal_is_refused(site: Site) -> None:
     result = site.run("safety-controller")
     assert result.returncode == 2
     assert "needs a terminal" in result.stderr
+
+
+def test_a_robot_that_needs_a_controller_locks_when_the_last_one_leaves(site: Site) -> None:
+    def held() -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = site.json("lockout")[1]["live"]["arm-6"]["holds"]
+        return found
+
+    with on_a_terminal(
+        site.words("safety-controller", "--id", "desk-3", "--check-in", "0.2"), site.environment
+    ) as terminal:
+        eventually(lambda: "checks in every 0.2 s" in terminal.drawn, within=WITHIN_S)
+        with site.serving("arm-6", STRANDS_CHECKIN_TIMEOUT_S="3"):
+            eventually(lambda: "s left" in terminal.drawn, within=WITHIN_S)
+            assert held() == []
+            terminal.press("q")
+            assert terminal.process.wait(WITHIN_S) == 0
+            eventually(held, within=10.0)
+            assert "desk-3" in str(held())
+            assert site.wave("arm-6")[0] == 1
+    assert site.json("resume", "--local", "arm-6")[0] == 0
