@@ -1,1 +1,18 @@
-"""ROS graphs: names, the command gate, and the roads to them."""
+"""ROS graphs: names, the command gate, and the roads to them. Importing this package loads none of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from strands_robots.ros.actions import ros_action
+
+__all__ = ["ros_action"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "ros_action":
+        from strands_robots.ros.actions import ros_action  # noqa: PLC0415 - the package loads nothing by itself
+
+        return ros_action
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -143,6 +143,28 @@ class DdsLink:
                         found.append({"topic": each.topic_name[2:], "type": kind, "role": role})
         return found
 
+    def topics(self) -> list[dict[str, Any]]:
+        """``topic``, ``type``, and how many ``publishers`` and ``subscriptions`` it has, by topic and type.
+
+        A domain that was joined just now is given ``match_s`` to tell.
+        """
+        deadline = time.monotonic() + self._match_s
+        while not (seen := self.endpoints()) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        found: dict[tuple[str, str], dict[str, Any]] = {}
+        for each in seen:
+            row = {"topic": each["topic"], "type": each["type"], "publishers": 0, "subscriptions": 0}
+            found.setdefault((each["topic"], each["type"]), row)[f"{each['role']}s"] += 1
+        return [found[key] for key in sorted(found)]
+
+    def nodes(self) -> list[str]:
+        """Refused: nodes are a notion of ROS that bare DDS does not carry here."""
+        raise RosError("Bare DDS does not tell of nodes; use rosbridge.")
+
+    def services(self) -> list[str]:
+        """Refused: bare DDS carries topics alone here."""
+        raise RosError("Bare DDS carries topics only; use rosbridge for services.")
+
     def close(self) -> None:
         with self._lock:
             unwatch, self._unwatch = self._unwatch, []

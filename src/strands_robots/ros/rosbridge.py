@@ -19,6 +19,9 @@ logger = logging.getLogger(__name__)
 SUCCEEDED = 4
 """``action_msgs/GoalStatus`` of a goal that was reached."""
 
+ROSAPI_S = 5.0
+"""Seconds within which the server's own services answer."""
+
 
 @dataclass(slots=True)
 class _Asked:
@@ -140,6 +143,28 @@ class RosbridgeLink:
 
     def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
         return self._watch(topic, kind, heard, lambda problem: logger.warning("%s: %s", topic, problem))
+
+    def topics(self) -> list[dict[str, Any]]:
+        """``topic`` and ``type`` of each topic, as rosapi tells them."""
+        answer = self.call("/rosapi/topics", "rosapi/Topics", {}, ROSAPI_S)
+        names, kinds = answer.get("topics"), answer.get("types")
+        if not isinstance(names, list) or not isinstance(kinds, list) or len(names) != len(kinds):
+            raise RosError(f"/rosapi/topics answered {shown(answer)}.")
+        return [{"topic": str(name), "type": str(kind)} for name, kind in sorted(zip(names, kinds, strict=True))]
+
+    def nodes(self) -> list[str]:
+        """Names of the nodes, as rosapi tells them."""
+        return self._names("/rosapi/nodes", "rosapi/Nodes", "nodes")
+
+    def services(self) -> list[str]:
+        """Names of the services, as rosapi tells them."""
+        return self._names("/rosapi/services", "rosapi/Services", "services")
+
+    def _names(self, service: str, kind: str, key: str) -> list[str]:
+        names = self.call(service, kind, {}, ROSAPI_S).get(key)
+        if not isinstance(names, list):
+            raise RosError(f"{service} answered without {key}.")
+        return sorted(str(name) for name in names)
 
     def close(self) -> None:
         self._session.close()

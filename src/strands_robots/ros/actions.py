@@ -1,0 +1,209 @@
+"""``ros_action``: look at a ROS graph, read it and write to it, over bare DDS or a rosbridge server."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.link import Message, RosError, RosLink
+from strands_robots.ros.names import graph_name, interface
+from strands_robots.ros.rosbridge import SUCCEEDED, RosbridgeLink
+from strands_robots.utils import MissingExtraError, ValidationError, choice, mapping, number, whole
+
+BACKENDS = ("auto", "dds", "rosbridge")
+ACTIONS = (
+    "status",
+    "list_topics",
+    "list_nodes",
+    "list_services",
+    "info",
+    "echo",
+    "publish",
+    "service_call",
+    "action_goal",
+)
+COUNT_MAX = 1000
+RATE_MAX_HZ = 100.0
+TIMEOUT_MAX_S = 600.0
+
+
+@runtime_checkable
+class Browsable(Protocol):
+    """A link that can tell what is on its graph."""
+
+    def topics(self) -> list[dict[str, Any]]:
+        """``topic`` and ``type`` of each topic, with what else the road tells."""
+
+    def nodes(self) -> list[str]:
+        """Names of the nodes."""
+
+    def services(self) -> list[str]:
+        """Names of the services."""
+
+
+_links: dict[tuple[Any, ...], RosLink] = {}
+_links_lock = threading.Lock()
+
+
+def link_for(backend: str, host: str, port: int, domain_id: int | None) -> RosLink:
+    """The process's link to a graph, made at its first use and kept. Raises :class:`ValidationError`."""
+    with _links_lock:
+        key = ("rosbridge", host, port) if backend == "rosbridge" else ("dds", domain_id)
+        if key not in _links:
+            _links[key] = RosbridgeLink(host, port) if backend == "rosbridge" else DdsLink(domain_id)
+        return _links[key]
+
+
+def close_links() -> None:
+    """Let go of every graph that :func:`ros_action` has used."""
+    with _links_lock:
+        links = list(_links.values())
+        _links.clear()
+    for link in links:
+        link.close()
+
+
+def ros_action(
+    action: str,
+    *,
+    name: str = "",
+    type: str | None = None,  # noqa: A002 - ROS calls it so
+    fields: Mapping[str, Any] | None = None,
+    count: int = 1,
+    rate: float = 10.0,
+    timeout: float = 5.0,
+    backend: str = "auto",
+    host: str = "localhost",
+    port: int = 9090,
+    domain_id: int | None = None,
+    tool_context: Any = None,
+    command_gate: CommandGate | None = None,
+) -> Envelope:
+    """Do one thing on a ROS graph; every refusal and failure is an error envelope.
+
+    A publish, a service call and a goal on a command surface ask the command gate first. They are single commands:
+    no lockout holds them and no halt ends what they began, so a robot is driven by its own class.
+
+    Args:
+        action: one of :data:`ACTIONS`.
+        name: topic, service or action, where the action needs one.
+        type: its interface; what is published, called or sent as a goal needs one.
+        fields: of the message, request or goal; what is left out is zero.
+        count: messages to read or publish, 1 to 1000. ``rate``: Hz of several, above 0 and at most 100.
+        timeout: seconds to wait for each message, answer or end, above 0 and at most 600.
+        backend: ``dds`` (topics alone), ``rosbridge``, or ``auto``, which is bare DDS.
+        host: of the rosbridge server, with its ``port``. ``domain_id``: of DDS, ``ROS_DOMAIN_ID`` by default.
+    """
+    try:
+        wanted = choice("action", action, ACTIONS)
+        road = choice("backend", backend, BACKENDS)
+        seconds = number("timeout", timeout, above=0, high=TIMEOUT_MAX_S)
+        link = link_for(road, host, port, domain_id)
+        if wanted in _LOOKS:
+            return _LOOKS[wanted](link)
+        target = graph_name("name", name)
+        kind = None if type is None and wanted in ("info", "echo") else interface("type", type)
+        messages = whole("count", count, low=1, high=COUNT_MAX)
+        if wanted == "info":
+            return _info(link, target)
+        if wanted == "echo":
+            return _echo(link, target, kind, messages, seconds)
+        assert kind is not None
+        body = mapping("fields", {} if fields is None else fields)
+        hertz = number("rate", rate, above=0, high=RATE_MAX_HZ)
+        refusal = (command_gate or CommandGate()).refusal(target, kind, wanted, tool_context)
+        if refusal is not None:
+            return refusal
+        if wanted == "publish":
+            return _publish(link, target, kind, body, messages, rate_hz=hertz)
+        if wanted == "service_call":
+            return success(f"{target} answered.", response=_shown(link.call(target, kind, body, seconds)))
+        return _goal(link, target, kind, body, seconds)
+    except (ValidationError, RosError, MissingExtraError) as exc:
+        return error(str(exc))
+
+
+def _status(link: RosLink) -> Envelope:
+    found = _browsable(link).topics()
+    return success(f"{len(found)} topics can be seen.", backend=_named(link), topics=len(found))
+
+
+def _topics(link: RosLink) -> Envelope:
+    found = _browsable(link).topics()
+    return success("\n".join(f"{each['topic']} {each['type']}" for each in found) or "No topics.", topics=found)
+
+
+def _nodes(link: RosLink) -> Envelope:
+    found = _browsable(link).nodes()
+    return success("\n".join(found) or "No nodes.", nodes=found)
+
+
+def _services(link: RosLink) -> Envelope:
+    found = _browsable(link).services()
+    return success("\n".join(found) or "No services.", services=found)
+
+
+_LOOKS: dict[str, Callable[[RosLink], Envelope]] = {
+    "status": _status,
+    "list_topics": _topics,
+    "list_nodes": _nodes,
+    "list_services": _services,
+}
+
+
+def _info(link: RosLink, topic: str) -> Envelope:
+    wanted = f"/{topic.lstrip('/')}"
+    found = [each for each in _browsable(link).topics() if each["topic"] == wanted]
+    if not found:
+        return error(f"{wanted} is not on the graph.", topic=wanted)
+    return success(f"{wanted} carries {found[0]['type']}.", **found[0])
+
+
+def _echo(link: RosLink, topic: str, kind: str | None, count: int, within_s: float) -> Envelope:
+    messages = [_shown(link.read(topic, kind, within_s)) for _ in range(count)]
+    return success(f"{len(messages)} messages of {topic}.", topic=topic, messages=messages)
+
+
+def _publish(link: RosLink, topic: str, kind: str, fields: Message, count: int, *, rate_hz: float) -> Envelope:
+    for sent in range(count):
+        if sent:
+            time.sleep(1 / rate_hz)
+        try:
+            link.publish(topic, kind, fields)
+        except RosError as exc:
+            return error(f"{sent} of {count} messages were published: {exc}", messages=sent)
+    return success(f"Published {count} messages on {topic}.", topic=topic, messages=count)
+
+
+def _goal(link: RosLink, action: str, kind: str, goal: Message, within_s: float) -> Envelope:
+    if not isinstance(link, RosbridgeLink):
+        raise RosError(f"{action} is an action, and bare DDS carries topics only; use rosbridge.")
+    result = link.send_goal(action, kind, goal, within_s)
+    told = {"goal_status": result["status"], "values": _shown(result["values"])}
+    if result["status"] != SUCCEEDED:
+        return error(f"{action} ended with status {result['status']}, not {SUCCEEDED}, succeeded.", **told)
+    return success(f"{action} succeeded.", **told)
+
+
+def _browsable(link: RosLink) -> Browsable:
+    if not isinstance(link, Browsable):
+        raise RosError(f"A {_named(link)} cannot tell what is on its graph.")
+    return link
+
+
+def _named(link: RosLink) -> str:
+    return link.__class__.__name__
+
+
+def _shown(value: Any) -> Any:
+    """A message as JSON can carry it: bytes are told by their number."""
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if isinstance(value, Mapping):
+        return {key: _shown(each) for key, each in value.items()}
+    return [_shown(each) for each in value] if isinstance(value, list | tuple) else value
