@@ -58,6 +58,8 @@ def test_a_wrapper_and_its_device_share_one_reentrant_lock() -> None:
 def test_a_lock_goes_with_its_device() -> None:
     from strands_robots import bus_access  # noqa: PLC0415 - the table under test
 
+    # Devices of earlier tests may still wait to be collected.
+    gc.collect()
     before = len(bus_access._locks)
     devices = [RecordingDevice() for _ in range(50)]
     for device in devices:
