@@ -142,7 +142,7 @@ class Running:
         try:
             with FleetClient(self._link) as fleet:
                 found = [peer.id for peer in fleet.peers(min(2.0, self._deadline_s)) if peer.stop_verb]
-        except MessagingError:
+        except (MessagingError, TimeoutError):
             # Who answers is still in the report, at the deadline.
             return
         answered = self.latest.answered if self.latest else {}

@@ -141,6 +141,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
         label(f"  strands-robots peers{where}"),
         label(f"  strands-robots call {peer_id} {_example(functions)}{where}"),
         label(f"  strands-robots stop {peer_id}{where}"),
+        label(f"  strands-robots estop{where}"),
         label(""),
         label("Ctrl-C stops the robot, then takes it off the network."),
     ]
