@@ -88,6 +88,12 @@ _declare(
         "",
         "ROS commands the operator approves: a surface such as cmd_vel, or a glob over names such as /turtle1/*.",
     ),
+    Setting(
+        "STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE",
+        "boolean",
+        "false",
+        "Opt in to joint commands from a ROS 2 graph that is not secured.",
+    ),
     Setting("ROS_DOMAIN_ID", "integer", "0", "DDS domain of ROS 2 robots.", 0, 232),
     Setting("ROS_LOCALHOST_ONLY", "boolean", "false", "Keep DDS on this machine, unless CYCLONEDDS_URI is set."),
     Setting("CYCLONEDDS_URI", "text", "", "Configuration of Cyclone DDS, which the library reads itself."),

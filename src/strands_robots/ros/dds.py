@@ -67,10 +67,12 @@ class DdsLink:
             if time.monotonic() >= deadline:
                 raise RosError(f"Nobody subscribes to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
             time.sleep(0.002)
-        try:
-            writer.write(message)
-        except Exception as exc:
-            raise RosError(f"{topic} did not take a {bare_kind(kind)}: {exc}") from exc
+        _write(writer, message, topic, kind)
+
+    def tell(self, topic: str, kind: str, fields: Message) -> None:
+        """Publish what is for whoever cares, such as telemetry: it is no error that nobody subscribes."""
+        message = filled(_struct(kind), fields)
+        _write(self._writer(topic, kind), message, topic, kind)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
         arrived, got = threading.Event(), list[Message]()
@@ -212,6 +214,13 @@ class DdsLink:
             if time.monotonic() >= deadline:
                 raise RosError(f"Nobody publishes {topic} in domain {self.domain_id}, so its type is not known.")
             time.sleep(0.02)
+
+
+def _write(writer: Any, message: Any, topic: str, kind: str) -> None:
+    try:
+        writer.write(message)
+    except Exception as exc:
+        raise RosError(f"{topic} did not take a {bare_kind(kind)}: {exc}") from exc
 
 
 def _confine(domain: ModuleType, domain_id: int) -> None:

@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.envelope import error, success
+from strands_robots.hardware_rtps_bridge import INSECURE, HardwareRtpsBridge
+from strands_robots.ros.dds import DdsLink
+from strands_robots.utils import ValidationError
+
+DOMAIN = 94
+COMMAND = "/my_arm/joint_command"
+JOINTS = "sensor_msgs/msg/JointState"
+LIMITS = {"a.pos": (-1.0, 1.0)}
+
+
+class Arm:
+    """Takes actions and keeps them; refuses while locked."""
+
+    tool_name_str = "my arm"
+
+    def __init__(self) -> None:
+        self.taken: list[dict[str, float]] = []
+        self.locked = False
+
+    def send_action(self, action: dict[str, float]) -> dict[str, Any]:
+        if self.locked:
+            return error("locked")
+        self.taken.append(action)
+        return success("taken")
+
+
+@pytest.fixture(autouse=True)
+def confined(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    monkeypatch.delenv(INSECURE, raising=False)
+
+
+@pytest.fixture
+def arm() -> Arm:
+    return Arm()
+
+
+@pytest.fixture
+def bridge(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> Iterator[HardwareRtpsBridge]:
+    monkeypatch.setenv(INSECURE, "1")
+    made = HardwareRtpsBridge(arm, domain_id=DOMAIN, joint_limits=LIMITS, poll_period=0.005)
+    yield made
+    made.shutdown()
+    made.shutdown()
+    assert not [t for t in threading.enumerate() if t.name in ("rtps-bridge", "dds-my_arm/joint_command")]
+
+
+@pytest.fixture
+def controller() -> Iterator[DdsLink]:
+    link = DdsLink(DOMAIN, match_s=5.0)
+    yield link
+    link.close()
+
+
+def test_a_joint_command_drives_the_arm(arm: Arm, bridge: HardwareRtpsBridge, controller: DdsLink) -> None:
+    controller.publish(COMMAND, JOINTS, {"name": ["a.pos", "b.pos"], "position": [0.5, 7.0]})
+    eventually(lambda: arm.taken == [{"a.pos": 0.5, "b.pos": 7.0}])
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"name": ["b.pos", "a.pos"], "position": [0.1, 1.5]},
+        {"name": ["a.pos", "b.pos"], "position": [0.1]},
+        {"name": ["a.pos"], "position": [float("nan")]},
+        {"name": ["a.pos", "a.pos"], "position": [0.1, 0.2]},
+        {},
+    ],
+)
+def test_a_command_that_is_wrong_in_one_place_is_dropped_whole(
+    arm: Arm, bridge: HardwareRtpsBridge, bad: dict[str, Any]
+) -> None:
+    assert bridge.apply(bad) is False
+    assert arm.taken == []
+
+
+def test_a_locked_arm_refuses_commands_from_the_graph(arm: Arm, bridge: HardwareRtpsBridge) -> None:
+    arm.locked = True
+    assert bridge.apply({"name": ["a.pos"], "position": [0.1]}) is False
+    assert arm.taken == []
+
+
+def test_joints_and_images_are_told_to_whoever_listens(controller: DdsLink) -> None:
+    bridge = HardwareRtpsBridge(domain_id=DOMAIN)
+    heard: dict[str, Any] = {}
+    controller.watch("/my_arm/joint_states", JOINTS, lambda m: heard.update(joints=m))
+    controller.watch("/my_arm/front/image_raw", "sensor_msgs/msg/Image", lambda m: heard.update(image=m))
+    picture = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
+
+    def told() -> bool:
+        bridge.publish_joint_states("my arm", ["a.pos"], [0.25])
+        bridge.publish_joint_states("my arm", ["a.pos", "b.pos"], [9.0])
+        bridge.publish_image("my arm", "front", picture)
+        bridge.publish_image("my arm", "front", picture[:, :, 0])
+        return len(heard) == 2
+
+    try:
+        eventually(told)
+        assert (heard["joints"]["name"], heard["joints"]["position"]) == (["a.pos"], [0.25])
+        image = heard["image"]
+        assert (image["height"], image["width"], image["step"], image["encoding"]) == (2, 4, 12, "rgb8")
+        assert image["data"] == picture.tobytes()
+    finally:
+        bridge.shutdown()
+
+
+def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists(arm: Arm) -> None:
+    with pytest.raises(ValidationError, match=INSECURE):
+        HardwareRtpsBridge(arm, domain_id=DOMAIN)
+    HardwareRtpsBridge(arm, domain_id=DOMAIN, enable_commands=False).shutdown()
+
+
+CREDENTIALS = dict.fromkeys(("identity_ca", "certificate", "private_key", "governance", "permissions"), "file:/x")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"enable_commands": "false"}, "enable_commands"),
+        ({"domain_id": 233}, "domain_id"),
+        ({"poll_period": 0}, "poll_period"),
+        ({"poll_period": float("inf")}, "poll_period"),
+        ({"command_robot_name": 0}, "command_robot_name"),
+        ({"joint_limits": {"a": (1.0, float("nan"))}}, "joint_limits"),
+        ({"joint_limits": {"a": (2.0, 1.0)}}, "joint_limits"),
+        ({"joint_limits": [1]}, "joint_limits"),
+        ({"dds_security_config": {"certificate": "x"}}, "dds_security_config must have"),
+        ({"dds_security_config": {**CREDENTIALS, "certificate": ""}}, "certificate"),
+        ({"dds_security_config": CREDENTIALS}, "have no DDS Security"),
+    ],
+)
+def test_a_bridge_that_cannot_be_is_refused_before_anything_happens(
+    arm: Arm, options: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(INSECURE, "1")
+    before = threading.active_count()
+    with pytest.raises(ValueError, match=named):
+        HardwareRtpsBridge(arm, **{"domain_id": DOMAIN, **options})
+    assert threading.active_count() == before
