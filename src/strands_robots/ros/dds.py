@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -120,6 +121,8 @@ class DdsLink:
 
         def unwatch() -> None:
             done.set()
+            with contextlib.suppress(ValueError):  # a second call has nothing left to take out
+                self._unwatch.remove(unwatch)
             if thread is not threading.current_thread():
                 thread.join(10 * _SLICE_MS / 1000)
 
@@ -168,12 +171,12 @@ class DdsLink:
         raise RosError("Bare DDS carries topics only; use rosbridge for services.")
 
     def close(self) -> None:
+        # The watchers end first: what they wait on goes with the participant.
+        for each in list(self._unwatch):
+            each()
         with self._lock:
-            unwatch, self._unwatch = self._unwatch, []
             self._writers.clear()
             self._participant = None
-        for each in unwatch:
-            each()
 
     def _open(self) -> Any:
         with self._lock:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections.abc import Callable
@@ -193,7 +194,8 @@ class RosbridgeLink:
                 if last:
                     del self._watched[topic]
             if last and self._session.up:
-                self._session.send(encoded("unsubscribe", id=watched.id, topic=topic))
+                with contextlib.suppress(RosError):  # a connection that just broke has no subscriptions left
+                    self._session.send(encoded("unsubscribe", id=watched.id, topic=topic))
 
         if frame:
             try:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,16 @@ def test_a_message_goes_from_one_link_to_another_and_a_closed_link_opens_again()
     finally:
         sender.close()
         receiver.close()
+
+
+def test_a_read_leaves_no_thread_behind(base: subprocess.Popen[str]) -> None:
+    link = DdsLink(DOMAIN)
+    try:
+        for _ in range(3):
+            link.read("/odom", "nav_msgs/Odometry", 5.0)
+            assert not [t for t in threading.enumerate() if t.name.startswith("dds-")]
+    finally:
+        link.close()
 
 
 def test_what_bare_dds_cannot_do_is_said() -> None:
