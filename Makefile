@@ -3,6 +3,8 @@
 VENV := .venv
 BIN := $(VENV)/bin
 REAL_ARM := .venv-lerobot/bin
+# Most tests wait for another process; a file stays on one worker, so that its own tests never meet.
+WORKERS := --numprocesses 4 --dist loadfile
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 
 help:  ## Show these targets
@@ -19,10 +21,10 @@ serve: venv  ## Serve a simulated SO-100 on this machine (ROBOT=..., ARGS=...)
 	@$(BIN)/strands-robots serve $(or $(ROBOT),so100) $(ARGS)
 
 test: venv  ## Everything that needs nothing but wheels
-	@$(BIN)/python -m pytest -m "not system" $(ARGS)
+	@$(BIN)/python -m pytest -m "not system" $(WORKERS) $(ARGS)
 
 system:
-	@./scripts/system-packages.sh $(GL_PACKAGES) mosquitto
+	@./scripts/system-packages.sh $(GL_PACKAGES) mosquitto iproute2
 	@./scripts/reachy-daemon.sh 1.13.0
 	@./scripts/reachy-daemon.sh 1.4.1
 	@./scripts/real-arm.sh

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from fixtures.waiting import eventually, free_port
+from fixtures.waiting import accepts, eventually, free_port
 
 from strands_robots import settings
 
@@ -52,6 +52,8 @@ def live(environment: dict[str, str], peer: str) -> bool:
 def test_the_served_arm_is_driven_by_an_agents_tools(environment: dict[str, str]) -> None:
     with example("serve_arm.py", environment):
         eventually(lambda: live(environment, "so100-lab-1"), within=WITHIN_S, what="the arm is live")
+        # A caller that came before the arm may have had the meeting port, and the arm takes it when that one goes.
+        eventually(lambda: accepts(int(environment["STRANDS_DC_PORT"])), within=WITHIN_S, what="the arm has the port")
         line = [sys.executable, EXAMPLES / "drive_from_agent.py"]
         driven = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
         assert driven.returncode == 0, driven.stderr
