@@ -18,8 +18,9 @@ from typing import Any, Literal, Protocol
 
 from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
 from strands_robots.policies.actions import checked_action, numbers
-from strands_robots.policies.base import Action, Policy, Ranges
+from strands_robots.policies.base import Action, Policy, PolicyError, Ranges
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
 
@@ -221,17 +222,24 @@ class Rollout:
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"
-                except Exception as exc:
+                except Exception as exc:  # noqa: BLE001 - whatever a policy raises is told in `_lament`
                     # What was told to stop may give up in any way it likes.
                     if self._permit.valid:
                         state, self.error = "error", f"{type(exc).__name__}: {exc}"
-                        logger.exception("The rollout of %s on %s failed; it holds.", self.policy_name, self.robot)
+                        self._lament(exc)
                 state = self._hold(state)
         except Exception as exc:
             state, self.error = "error", f"{type(exc).__name__}: {exc}"
             logger.exception("The rollout of %s on %s could not run.", self.policy_name, self.robot)
         finally:
             self._finish(state)
+
+    def _lament(self, exc: Exception) -> None:
+        what = "The rollout of %s on %s failed; it holds: %s"
+        if isinstance(exc, PolicyError | OSError | ValidationError):
+            logger.error(what, self.policy_name, self.robot, exc)
+        else:
+            logger.exception(what, self.policy_name, self.robot, exc)
 
     def _loop(self, bounds: Ranges) -> State:
         started = self._clock.now()

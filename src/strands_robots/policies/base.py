@@ -12,6 +12,10 @@ Ranges = Mapping[str, tuple[float, float]]
 """Lowest and highest target of every action key the body has; infinite where the body declares none."""
 
 
+class PolicyError(RuntimeError):
+    """A policy cannot go on, for a reason that its sentence tells in full: no traceback is needed."""
+
+
 @runtime_checkable
 class Policy(Protocol):
     """Decides a robot's actions. One object serves one rollout, on that rollout's control thread.

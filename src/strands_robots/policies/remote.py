@@ -25,7 +25,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from strands_robots.policies.actions import checked_action, numbers
-from strands_robots.policies.base import Action, Ranges
+from strands_robots.policies.base import Action, PolicyError, Ranges
 from strands_robots.utils import ValidationError, choice, dial_host_error, flag, missing_extra, number, shown, whole
 
 DEFAULT_PORT = 8765
@@ -36,7 +36,7 @@ _SLICE_S = 0.05
 _CLOSE_S = 0.5
 
 
-class PolicyServerError(RuntimeError):
+class PolicyServerError(PolicyError):
     """The policy server refused, answered nonsense, or did not answer in time."""
 
 

@@ -97,7 +97,7 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             self._shared = await on_a_thread(partial(sessions.acquire, self._link), undo=sessions.release)
         except zenoh.ZError as error:
             where = ", ".join(self._link.connect or self._link.listeners)
-            raise MessagingConnectionError(f"no Zenoh link at {where}: {error}") from error
+            raise MessagingConnectionError(f"no Zenoh link at {where}: {_plain(error)}") from error
         self._closed = False
         self._shared.watch(self._on_link)
 
@@ -299,3 +299,8 @@ def _answer(query: Any, data: bytes) -> Awaitable[None] | None:
         answer_query(query, data)
         return None
     return on_a_thread(partial(answer_query, query, data))
+
+
+def _plain(error: BaseException) -> str:
+    """What Zenoh says, without the place in its own sources."""
+    return str(error).partition(" at /")[0].strip()
