@@ -66,6 +66,7 @@ def stepping(repeats: int) -> Row:
 
 def fleet(seconds: float) -> Row:
     """Worlds of one arm each, served on Device Connect, a rollout of 50 Hz in each, heard by another process."""
+    usual = settings.raw("STRANDS_DC_STREAM_HZ")
     settings.put("STRANDS_DC_STREAM_HZ", str(PUBLISH_HZ))
     logging.disable(logging.ERROR)
     process, port = psutil.Process(), free_port()
@@ -101,6 +102,7 @@ def fleet(seconds: float) -> Row:
         for world in worlds:
             world.cleanup()
         logging.disable(logging.NOTSET)
+        settings.put("STRANDS_DC_STREAM_HZ", usual)
     pairs = zip(before, after, strict=True)
     factor = min((later.sim_time - sooner.sim_time) / (later.at - sooner.at) for sooner, later in pairs)
     slowest = min(heard.values()) if len(heard) == FLEET else 0.0
