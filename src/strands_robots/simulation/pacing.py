@@ -22,6 +22,10 @@ logger = logging.getLogger(__name__)
 TICK_S = 0.005
 """How often the pacing thread visits each running world."""
 
+WORLDS_A_TICK = 10
+"""So many worlds are visited every tick. More are visited less often, in longer steps: every visit has to win the
+interpreter back from the threads that ran meanwhile."""
+
 SETTLE_S = 2.0
 """How long physics goes on after a single command."""
 
@@ -170,7 +174,7 @@ class _Pacer:
             now = time.monotonic()
             for clock in clocks:
                 self._visit(clock, now)
-            due = max(due + TICK_S, time.monotonic())
+            due = max(due + TICK_S * max(1.0, len(clocks) / WORLDS_A_TICK), time.monotonic())
             time.sleep(max(0.0, due - time.monotonic()))
 
     def _visited(self) -> list[Clock]:
