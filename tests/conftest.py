@@ -1,13 +1,18 @@
-"""What every test gets: a state directory of its own, so that none reads or writes the user's."""
+"""What every test gets: a state directory of its own, so that none reads or writes the user's, and a working Ctrl-C."""
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from strands_robots.audit import flush_audit
+
+# A shell starts background jobs with Ctrl-C ignored, and every process that a test starts would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
