@@ -114,6 +114,13 @@ class ZenohStopLink:
         # Whoever comes second waits too: a thread that is inside Zenoh while the interpreter ends aborts the process.
         with self._closing_session:
             session, self._session = self._session, None
+            keep, self._keep = self._keep, []
+            for declared in keep:
+                # Closing ends links, which Zenoh would tell on its own threads after this has returned.
+                try:
+                    declared.undeclare()
+                except Exception as exc:  # noqa: BLE001 - the binding has one error for all; the close goes on
+                    logger.debug("a declaration of the stop lane was gone already: %s", exc)
             if session is not None:
                 session.close()
         self._state.set(False)

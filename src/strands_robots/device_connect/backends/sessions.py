@@ -13,6 +13,7 @@ import logging
 import random
 import socket
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +32,12 @@ Sink = Callable[[Any], None]
 # How often a process without the meeting port looks whether somebody still has it, in seconds, half of it at random
 # so that two survivors rarely try in the same instant.
 MEETING_CHECK_S = 1.0
+
+# What Zenoh's threads may still need after a close to let go of callbacks. One that asks for the interpreter while that
+# ends aborts the process, and nothing tells when the last has let go.
+LET_GO_S = 0.05
+
+_ever_opened = threading.Event()
 
 _sessions: dict[LinkConfig, SharedSession] = {}
 _lock = threading.Lock()
@@ -98,6 +105,7 @@ class SharedSession:
             if self.session is not None:
                 return
             self.session, self._meeting = _open(self.link)
+            _ever_opened.set()
             self._link_events = self.session.info.declare_transport_events_listener(
                 direct(self._on_transport), history=True
             )
@@ -107,10 +115,14 @@ class SharedSession:
         with self._lock:
             session, self.session = self.session, None
             meeting, self._meeting = self._meeting, None
+            link_events, self._link_events = self._link_events, None
             self._watchers.clear()
             self._topics.clear()
         if meeting is not None:
             meeting.close()
+        if link_events is not None:
+            # Closing ends links, which Zenoh would tell on its own threads after this has returned.
+            _undeclare(link_events)
         if session is not None:
             try:
                 session.close()
@@ -262,3 +274,5 @@ def _close_all() -> None:
         _sessions.clear()
     for shared in left:
         shared.close()
+    if _ever_opened.is_set():
+        time.sleep(LET_GO_S)
