@@ -14,9 +14,9 @@ from strands_robots.contract import RolloutEvent, TaskRobot
 from strands_robots.device_connect.base_driver import Activity, Call, RobotDriver
 from strands_robots.device_connect.declare import Labels, emit, on, rpc
 from strands_robots.drivers.reachy import ReachyDriver
+from strands_robots.drivers.reachy.catalogue import LIBRARIES
 from strands_robots.drivers.reachy.connection import STATUS_PATH
 from strands_robots.drivers.reachy.envelope import Target, bounded
-from strands_robots.drivers.reachy.library import LIBRARIES
 from strands_robots.drivers.reachy.motors import selected
 from strands_robots.drivers.reachy.pose import HeadPose
 from strands_robots.drivers.reachy.rest import DaemonError
@@ -232,7 +232,7 @@ class ReachyMiniDriver(RobotDriver):
 
         def prepare() -> Call:
             name, known = identifier("move_name", move_name), choice("library", library, tuple(LIBRARIES))
-            return self.answering(lambda: self.reachy.library.play(name, known))
+            return self.answering(lambda: self.reachy.catalogue.play(name, known))
 
         return await self.move("playMove", prepare)
 
@@ -295,7 +295,7 @@ class ReachyMiniDriver(RobotDriver):
         Args:
             library: Which library, one of 'emotions' or 'dances'
         """
-        return await self.read("listMoves", lambda: self.reachy.library.names(library))
+        return await self.read("listMoves", lambda: self.reachy.catalogue.names(library))
 
     def _daemon_status(self) -> Envelope:
         payload = self.reachy.connection.rest.get(STATUS_PATH)

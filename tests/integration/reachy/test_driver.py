@@ -132,7 +132,7 @@ def test_a_new_move_stops_the_one_before_it(daemon: Daemon, reachy: ReachyDriver
     assert running(daemon) == []
     reachy.wake_up()
     assert len(running(daemon)) == 1
-    reachy.library.names("emotions")
+    reachy.catalogue.names("emotions")
     reachy.halt("test")
 
 
@@ -148,14 +148,14 @@ def test_many_callers_at_once_leave_one_move(daemon: Daemon, reachy: ReachyDrive
 
 
 def test_a_recorded_move_plays_and_an_unknown_one_does_not(reachy: ReachyDriver) -> None:
-    assert sorted(reachy.library.names("emotions")["moves"]) == ["no1", "yes1"]
-    assert reachy.library.play("yes1", "emotions")["move"] == "yes1"
-    assert "no move 'nope'" in reachy.library.play("nope", "emotions")["reason"]
+    assert sorted(reachy.catalogue.names("emotions")["moves"]) == ["no1", "yes1"]
+    assert reachy.catalogue.play("yes1", "emotions")["move"] == "yes1"
+    assert "no move 'nope'" in reachy.catalogue.play("nope", "emotions")["reason"]
     assert finished(reachy)["name"] == "yes1"
 
 
 def test_an_uncached_library_is_unknown_and_not_empty(reachy: ReachyDriver) -> None:
-    answer = reachy.library.names("dances")
+    answer = reachy.catalogue.names("dances")
     assert answer["status"] == "error"
     assert answer["reason"].startswith("The catalogue of dances is unknown")
     assert "moves" not in answer
@@ -163,7 +163,7 @@ def test_an_uncached_library_is_unknown_and_not_empty(reachy: ReachyDriver) -> N
 
 def test_an_uncached_library_is_not_asked_for_while_the_robot_moves(reachy: ReachyDriver) -> None:
     reachy.gesture("nod")
-    assert "could freeze its daemon" in reachy.library.play("x1", "dances")["reason"]
+    assert "could freeze its daemon" in reachy.catalogue.play("x1", "dances")["reason"]
     assert finished(reachy)["state"] == "completed"
 
 
@@ -207,7 +207,7 @@ def test_a_locked_robot_refuses_every_motion(reachy: ReachyDriver) -> None:
         reachy.sleep,
         lambda: reachy.go(Target(HeadPose(yaw=0.1))),
         lambda: reachy.send_action({"head_yaw": 0.1}),
-        lambda: reachy.library.play("yes1", "emotions"),
+        lambda: reachy.catalogue.play("yes1", "emotions"),
         lambda: reachy.motors.torque(True, "", "enableMotors"),
     ):
         with pytest.raises(MotionRefused, match="locked"):

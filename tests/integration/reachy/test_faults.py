@@ -50,7 +50,7 @@ def test_a_hub_that_never_answers_freezes_the_daemon_and_the_driver_says_so(
     daemon: Daemon, reachy: ReachyDriver
 ) -> None:
     daemon.control(hub="frozen")
-    asked = threading.Thread(target=lambda: reachy.library.names("dances"))
+    asked = threading.Thread(target=lambda: reachy.catalogue.names("dances"))
     asked.start()
     try:
         eventually(lambda: not reachy.is_connected, 4.0, "silence is noticed")

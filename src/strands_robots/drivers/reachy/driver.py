@@ -7,6 +7,7 @@ from typing import Any
 
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.drivers.reachy import gestures
+from strands_robots.drivers.reachy.catalogue import Library
 from strands_robots.drivers.reachy.connection import Connection
 from strands_robots.drivers.reachy.envelope import (
     ACTION_KEYS,
@@ -17,7 +18,6 @@ from strands_robots.drivers.reachy.envelope import (
     from_action,
 )
 from strands_robots.drivers.reachy.feed import FRESH_S
-from strands_robots.drivers.reachy.library import Library
 from strands_robots.drivers.reachy.links import ZENOH_PORT, PubSub
 from strands_robots.drivers.reachy.motion import Motions, head_distance
 from strands_robots.drivers.reachy.motors import Motors
@@ -74,7 +74,7 @@ class ReachyDriver:
         self.gate = MotionGate()
         self.motions = Motions(self.connection, self.gate, self.tool_name_str, automatic_body_yaw=self._automatic)
         self.motors = Motors(self.connection, self.motions)
-        self.library = Library(self.connection, self.motions)
+        self.catalogue = Library(self.connection, self.motions)
 
     @property
     def safety_key(self) -> str:
