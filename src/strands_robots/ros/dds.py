@@ -183,7 +183,7 @@ class DdsLink:
             if self._participant is None:
                 domain = _dds("domain")
                 try:
-                    _confine(domain, self.domain_id)
+                    confine(domain, self.domain_id)
                     self._participant = domain.DomainParticipant(self.domain_id)
                 except _dds("core").DDSException as exc:
                     raise RosError(f"DDS domain {self.domain_id} could not be joined: {exc}") from exc
@@ -226,8 +226,8 @@ def _write(writer: Any, message: Any, topic: str, kind: str) -> None:
         raise RosError(f"{topic} did not take a {bare_kind(kind)}: {exc}") from exc
 
 
-def _confine(domain: ModuleType, domain_id: int) -> None:
-    """Give the domain its loopback configuration, once a process, where it is asked for."""
+def confine(domain: ModuleType, domain_id: int) -> None:
+    """Give the domain its loopback configuration, once a process, where ``ROS_LOCALHOST_ONLY`` asks for it."""
     if settings.is_set("CYCLONEDDS_URI") or not settings.boolean("ROS_LOCALHOST_ONLY", safe=True):
         return
     with _domains_lock:
