@@ -10,9 +10,10 @@ from typing import Any, Protocol, runtime_checkable
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.goals import run_goal, said
 from strands_robots.ros.link import Message, RosError, RosLink
 from strands_robots.ros.names import graph_name, interface
-from strands_robots.ros.rosbridge import SUCCEEDED, RosbridgeLink
+from strands_robots.ros.rosbridge import RosbridgeLink
 from strands_robots.utils import MissingExtraError, ValidationError, choice, mapping, number, whole
 
 BACKENDS = ("auto", "dds", "rosbridge")
@@ -181,12 +182,10 @@ def _publish(link: RosLink, topic: str, kind: str, fields: Message, count: int, 
 
 
 def _goal(link: RosLink, action: str, kind: str, goal: Message, within_s: float) -> Envelope:
-    if not isinstance(link, RosbridgeLink):
-        raise RosError(f"{action} is an action, and bare DDS carries topics only; use rosbridge.")
-    result = link.send_goal(action, kind, goal, within_s)
-    told = {"goal_status": result["status"], "values": _shown(result["values"])}
-    if result["status"] != SUCCEEDED:
-        return error(f"{action} ended with status {result['status']}, not {SUCCEEDED}, succeeded.", **told)
+    report = run_goal(link, action, kind, goal, within_s)
+    told = {"goal_status": report.status, "goal_state": report.state, "values": _shown(report.values)}
+    if report.state != "succeeded":
+        return error(f"{action}: {said(report)}", **told)
     return success(f"{action} succeeded.", **told)
 
 

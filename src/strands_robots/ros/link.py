@@ -5,15 +5,70 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 Message = Mapping[str, Any]
 Heard = Callable[[Message], None]
 Unwatch = Callable[[], None]
+GivenUp = Callable[[], bool]
 
 
 class RosError(RuntimeError):
     """The road to the graph, or the graph, did not do what was asked; the message is one sentence."""
+
+
+def never() -> bool:
+    """Nobody gives the goal up."""
+    return False
+
+
+class Goal:
+    """A goal that was sent: ``done`` once the server told its end, or once that can no longer be told.
+
+    Args:
+        cancel: asks the server to end it; returns at once, raises :class:`RosError` when it cannot be asked.
+    """
+
+    def __init__(self, cancel: Callable[[], None]) -> None:
+        self.done = threading.Event()
+        self.status: int | None = None
+        self.values: Any = {}
+        self.problem = ""
+        self.cancel = cancel
+
+    def end(self, status: int, values: Any) -> None:
+        """The server told the end: a ``GoalStatus`` and the result's fields."""
+        if not self.done.is_set():
+            self.status, self.values = status, values
+            self.done.set()
+
+    def fail(self, problem: str) -> None:
+        """The end will not be told, for this reason; the first one counts."""
+        if not self.done.is_set():
+            self.problem = problem
+            self.done.set()
+
+
+@runtime_checkable
+class GoalLink(Protocol):
+    """A link that carries actions."""
+
+    def begin_goal(
+        self,
+        action: str,
+        kind: str,
+        goal: Message,
+        within_s: float,
+        *,
+        feedback: Heard | None = None,
+        given_up: GivenUp = never,
+    ) -> Goal:
+        """Send a goal and return once the server has it. ``given_up`` is asked meanwhile and ends the attempt.
+
+        Raises:
+            RosError: no server, or it refused the goal, or did not take it in time. A goal that is taken after
+                that is cancelled at once.
+        """
 
 
 class RosLink(Protocol):
@@ -35,6 +90,9 @@ class RosLink(Protocol):
         """Let go of the graph. A later use opens it anew."""
 
 
+MemoryAction = Callable[[Message, Heard, Goal], None]
+
+
 class MemoryLink:
     """A graph inside this process: what is published is kept in ``sent`` and told to whoever watches.
 
@@ -46,12 +104,36 @@ class MemoryLink:
         self.sent: list[tuple[str, dict[str, Any]]] = []
         self.called: list[tuple[str, dict[str, Any]]] = []
         self._services = dict(services or {})
+        self._actions: dict[str, MemoryAction] = {}
         self._watchers: dict[str, list[Heard]] = {}
         self._lock = threading.Lock()
 
     def offer(self, service: str, answer: Callable[[Message], dict[str, Any]]) -> None:
         """Offer a service from now on."""
         self._services[service] = answer
+
+    def serve(self, action: str, begun: MemoryAction) -> None:
+        """Serve an action: ``begun`` gets the goal's fields, the way to tell feedback, and the goal to end."""
+        self._actions[action] = begun
+
+    def begin_goal(
+        self,
+        action: str,
+        kind: str,
+        goal: Message,
+        within_s: float,
+        *,
+        feedback: Heard | None = None,
+        given_up: GivenUp = never,
+    ) -> Goal:
+        del kind, within_s
+        if given_up():
+            raise RosError(f"{action} was given up before its goal was sent.")
+        if action not in self._actions:
+            raise RosError(f"Nobody serves the action {action}.")
+        sent = Goal(lambda: sent.end(5, {}))
+        self._actions[action](copy.deepcopy(dict(goal)), feedback or (lambda message: None), sent)
+        return sent
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
         del kind
@@ -84,6 +166,10 @@ class MemoryLink:
             raise RosError(f"Nobody offers the service {service}.")
         self.called.append((service, dict(fields)))
         return self._services[service](fields)
+
+    def tell(self, topic: str, kind: str, fields: Message) -> None:
+        """The same as :meth:`publish`: a graph in memory misses nobody."""
+        self.publish(topic, kind, fields)
 
     def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
         del kind

@@ -10,15 +10,12 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
 
-from strands_robots.ros.link import Heard, Message, RosError, Unwatch
+from strands_robots.ros.link import GivenUp, Goal, Heard, Message, RosError, Unwatch, never
 from strands_robots.ros.rosbridge_session import Session
 from strands_robots.ros.rosbridge_wire import Fragments, decoded, encoded, with_bytes
 from strands_robots.utils import number, shown
 
 logger = logging.getLogger(__name__)
-
-SUCCEEDED = 4
-"""``action_msgs/GoalStatus`` of a goal that was reached."""
 
 ROSAPI_S = 5.0
 """Seconds within which the server's own services answer."""
@@ -31,7 +28,6 @@ class _Asked:
     done: threading.Event = field(default_factory=threading.Event)
     answer: dict[str, Any] | None = None
     problem: str = ""
-    feedback: Heard | None = None
 
 
 @dataclass(slots=True)
@@ -74,6 +70,7 @@ class RosbridgeLink:
         self._advertised: dict[str, str] = {}
         self._watched: dict[str, _Watched] = {}
         self._asked: dict[str, _Asked] = {}
+        self._goals: dict[str, tuple[Goal, Heard | None]] = {}
         self._complaints: dict[str, str] = {}
         self._fragments = Fragments()
 
@@ -121,26 +118,30 @@ class RosbridgeLink:
             raise RosError(f"{service} failed: {shown(values)}")
         return values if isinstance(values, dict) else {}
 
-    def send_goal(
-        self, action: str, kind: str, goal: Message, within_s: float, feedback: Heard | None = None
-    ) -> dict[str, Any]:
-        """Send an action goal and wait for its end; ``status`` (4 is reached) and ``values``.
-
-        The goal is cancelled when ``within_s`` is over, or whatever else ends the wait.
-
-        Raises:
-            RosError: the goal was refused, failed, or did not end in time.
-        """
+    def begin_goal(
+        self,
+        action: str,
+        kind: str,
+        goal: Message,
+        within_s: float,
+        *,
+        feedback: Heard | None = None,
+        given_up: GivenUp = never,
+    ) -> Goal:
+        """Send an action goal. The protocol tells its end and not its acceptance, so this returns at once."""
+        if given_up():
+            raise RosError(f"{action} was given up before its goal was sent.")
+        del within_s
         key = self._id("send_action_goal", action)
         frame = encoded("send_action_goal", id=key, action=action, action_type=kind, args=goal, feedback=True)
+        sent = Goal(lambda: self._session.send(encoded("cancel_action_goal", id=key, action=action)))
+        self._goals[key] = (sent, feedback)
         try:
-            answer = self._request(key, frame, f"{action} did not end", within_s, feedback)
+            self._session.send(frame)
         except BaseException:
-            self._cancel(key, action)
+            del self._goals[key]
             raise
-        if answer.get("result") is False:
-            raise RosError(f"{action} failed with status {answer.get('status')}: {shown(answer.get('values'))}")
-        return {"status": answer.get("status"), "values": answer.get("values")}
+        return sent
 
     def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
         return self._watch(topic, kind, heard, lambda problem: logger.warning("%s: %s", topic, problem))
@@ -160,6 +161,10 @@ class RosbridgeLink:
     def services(self) -> list[str]:
         """Names of the services, as rosapi tells them."""
         return self._names("/rosapi/services", "rosapi/Services", "services")
+
+    def actions(self) -> list[str]:
+        """Names of the actions that somebody serves, as rosapi tells them."""
+        return self._names("/rosapi/action_servers", "rosapi/GetActionServers", "action_servers")
 
     def _names(self, service: str, kind: str, key: str) -> list[str]:
         names = self.call(service, kind, {}, ROSAPI_S).get(key)
@@ -211,10 +216,8 @@ class RosbridgeLink:
         # A queue of one: a robot's state is worth something only while it is the latest.
         return encoded("subscribe", id=watched.id, topic=topic, queue_length=1, compression="none", **kind)
 
-    def _request(
-        self, key: str, frame: str, what: str, within_s: float, feedback: Heard | None = None
-    ) -> dict[str, Any]:
-        asked = self._asked[key] = _Asked(feedback=feedback)
+    def _request(self, key: str, frame: str, what: str, within_s: float) -> dict[str, Any]:
+        asked = self._asked[key] = _Asked()
         try:
             self._session.send(frame)
             return self._awaited(asked, what, within_s)
@@ -227,13 +230,6 @@ class RosbridgeLink:
         if asked.answer is None:
             raise RosError(asked.problem)
         return asked.answer
-
-    def _cancel(self, key: str, action: str) -> None:
-        if self._session.up:
-            try:
-                self._session.send(encoded("cancel_action_goal", id=key, action=action))
-            except RosError as exc:
-                logger.warning("The goal of %s could not be cancelled: %s", action, exc)
 
     def _id(self, op: str, name: str) -> str:
         return f"{op}:{name}:{next(self._numbers)}"
@@ -251,6 +247,9 @@ class RosbridgeLink:
         for asked in list(self._asked.values()):
             asked.problem = f"The connection to rosbridge at {self.url} was lost: {why}."
             asked.done.set()
+        while self._goals:
+            _, (goal, _) = self._goals.popitem()
+            goal.fail(f"the connection to rosbridge at {self.url} was lost: {why}")
 
     def _received(self, frame: str | bytes) -> None:
         try:
@@ -266,18 +265,30 @@ class RosbridgeLink:
         op, key = message["op"], message.get("id")
         if op == "publish":
             self._published(message)
-        elif op in ("service_response", "action_result"):
+        elif op in ("action_feedback", "action_result"):
+            self._goal_told(op, key, message)
+        elif op == "service_response":
             asked = self._asked.get(key) if isinstance(key, str) else None
             if asked is not None:
                 asked.answer = message
                 asked.done.set()
-        elif op == "action_feedback":
-            asked = self._asked.get(key) if isinstance(key, str) else None
-            values = message.get("values")
-            if asked is not None and asked.feedback is not None and isinstance(values, dict):
-                asked.feedback(values)
         elif op == "status":
             self._status(message)
+
+    def _goal_told(self, op: str, key: object, message: dict[str, Any]) -> None:
+        goal, feedback = self._goals.get(key, (None, None)) if isinstance(key, str) else (None, None)
+        if goal is None:
+            return
+        values, status = message.get("values"), message.get("status")
+        if op == "action_feedback":
+            if feedback is not None and isinstance(values, dict):
+                feedback(values)
+            return
+        del self._goals[str(key)]
+        if isinstance(status, int):
+            goal.end(status, values)
+        else:
+            goal.fail(f"the server told no status: {shown(values)}")
 
     def _published(self, message: dict[str, Any]) -> None:
         topic, body = message.get("topic"), message.get("msg")
@@ -304,6 +315,9 @@ class RosbridgeLink:
         if asked is not None:
             asked.problem = said
             asked.done.set()
+            return
+        if key in self._goals:
+            self._goals.pop(key)[0].fail(said)
             return
         op, _, rest = key.partition(":")
         topic = rest.rpartition(":")[0]

@@ -12,7 +12,9 @@ from fixtures.rosbridge_server import RosbridgeServer
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
+from strands_robots.ros import goals
 from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.goals import run_goal
 from strands_robots.ros.link import RosError
 from strands_robots.ros.rosbridge import RosbridgeLink
 from strands_robots.utils import ValidationError
@@ -189,15 +191,28 @@ def test_an_action_goal_reports_feedback_and_its_end(server: RosbridgeServer, li
         {"op": "action_result", "values": {"ok": 1}, "status": 4, "result": True},
     ]
     told: list[Mapping[str, Any]] = []
-    assert link.send_goal("/go", "pkg/action/Go", {"metres": 2}, 2.0, told.append) == {"status": 4, "values": {"ok": 1}}
+    report = run_goal(link, "/go", "pkg/action/Go", {"metres": 2}, 2.0, feedback=told.append)
+    assert (report.state, report.over, report.values) == ("succeeded", True, {"ok": 1})
     assert told == [{"left": 2}]
 
 
-def test_an_action_goal_that_does_not_end_is_cancelled(server: RosbridgeServer, link: RosbridgeLink) -> None:
-    with pytest.raises(RosError, match="did not end within"):
-        link.send_goal("/go", "pkg/action/Go", {}, 0.2)
+def test_an_action_goal_that_does_not_end_is_cancelled(
+    server: RosbridgeServer, link: RosbridgeLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(goals, "CANCEL_S", 0.1)
+    report = run_goal(link, "/go", "pkg/action/Go", {}, 0.2)
+    assert (report.state, report.over, report.cut) == ("lost", False, "its time of 0.2 s")
     cancelled = eventually(lambda: server.seen("cancel_action_goal"))
     assert cancelled[0]["id"] == server.seen("send_action_goal")[0]["id"]
+
+
+def test_a_goal_whose_server_dies_is_lost_and_not_reached(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    sent = link.begin_goal("/go", "pkg/action/Go", {}, 1.0)
+    eventually(lambda: server.seen("send_action_goal"))
+    server.stop()
+    eventually(sent.done.is_set)
+    assert "was lost" in sent.problem
+    server.start()
 
 
 def standing(server: RosbridgeServer) -> None:
