@@ -119,7 +119,7 @@ def pings(console: Mesh, session: Any, shared: dict[str, str], count: int) -> li
                 session.put("strands/bench/ask", json.dumps(REQUEST).encode(), source_info=source)
                 assert answered.wait(2)
                 bare.append((time.perf_counter() - started) * 1000)
-        assert peer.ready
+        assert peer.ask("alive")
     heard.undeclare()
     mine, raw = statistics.median(ours), statistics.median(bare)
     ratio = mine / raw

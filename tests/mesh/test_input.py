@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -52,11 +52,12 @@ class Stream:
 
 
 @pytest.fixture
-def stream(peers: Fleet) -> Stream:
+def stream(peers: Fleet) -> Iterator[Stream]:
     made = Stream(peers)
     made.receiver.start()
     assert made.receiver.start_refusal is None
-    return made
+    yield made
+    made.receiver.stop()
 
 
 def test_a_leaders_actions_reach_the_follower_in_order(peers: Fleet) -> None:

@@ -44,19 +44,33 @@ class Lane:
                     return False
                 self._forget_oldest()
         with self._lock:
+            if not self._open:
+                return False  # closed meanwhile: nobody takes the job
             if not self._threads or (len(self._threads) < self._workers and self._busy >= len(self._threads)):
                 self._add()
         return True
 
-    def stop(self, timeout: float) -> list[str]:
-        """Take no more jobs, forget those waiting, and wait for those that run; names of threads still running."""
+    def close(self) -> None:
+        """Take no more jobs, forget those waiting, and let the threads end; twice is once."""
         with self._lock:
+            if not self._open:
+                return
             self._open = False
-            threads, self._threads = self._threads, []
+            threads = list(self._threads)
         while not self._queue.empty():
             self._forget_oldest()
         for _ in threads:
             self._queue.put(None)
+
+    def stop(self, timeout: float) -> list[str]:
+        """Take no more jobs, forget those waiting, and wait for those that run; names of threads still running."""
+        self.close()
+        return self.join(timeout)
+
+    def join(self, timeout: float) -> list[str]:
+        """Wait for the threads of a closed lane; names of those still running."""
+        with self._lock:
+            threads, self._threads = self._threads, []
         deadline = time.monotonic() + timeout
         for thread in threads:
             if thread is not threading.current_thread():

@@ -112,7 +112,7 @@ class InputReceiver:
         """Close the stream, wait at most 2 s for a frame that is being applied, and return the counters."""
         self._close()
         lane = self._lane
-        if lane is not None and lane.stop(2.0):
+        if lane is not None and lane.join(2.0):
             logger.warning("%s: an action is still being applied.", self.topic)
         return self.stats
 
@@ -151,6 +151,8 @@ class InputReceiver:
         if self._running:
             self._running, self._ended = False, time.monotonic()
             self._mesh.unsubscribe(self._name)
+            if self._lane is not None:
+                self._lane.close()
 
     def _take(self, sample: Sample) -> None:
         if not self._running:

@@ -77,4 +77,4 @@ def test_leaving_loopback_without_certificates_is_refused_by_name(tmp_path: Path
     state.mkdir(mode=0o700)
     settings = {"ZENOH_LISTEN": f"tcp/0.0.0.0:{free_port()}", "STRANDS_STATE_DIR": str(state)}
     with MeshPeer("sim-1", "world", settings) as peer:
-        assert peer.ready == {"ready": False}
+        assert peer.ask("alive") is False
