@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit
 
@@ -24,3 +26,18 @@ def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     monkeypatch.delenv("STRANDS_MESH_AUDIT_DIR", raising=False)
     yield directory
     flush_audit(0.5)
+
+
+OURS = ("rollout-", "simulation", "device-connect", "fleet-client", "rosbridge", "rtps-bridge", "dds-", "mesh-")
+
+
+@pytest.fixture(autouse=True)
+def no_thread_of_ours_left(state_directory: Path) -> Iterator[None]:
+    """Every thread of the package that a test starts has ended when the test has, so that none meets the next one."""
+    before = set(threading.enumerate())
+    yield
+
+    def left() -> list[str]:
+        return [t.name for t in threading.enumerate() if t not in before and t.name.startswith(OURS)]
+
+    eventually(lambda: not left(), within=3, what=f"the end of {left()}")

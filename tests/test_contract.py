@@ -115,3 +115,17 @@ def test_a_gate_of_its_own_is_used() -> None:
     assert adapt(foreign).gate is foreign.gate  # type: ignore[attr-defined]
     foreign.gate = "no gate"  # type: ignore[attr-defined]
     assert isinstance(AdaptedRobot(foreign).gate, MotionGate)
+
+
+def test_a_halt_while_a_foreign_robot_starts_stops_it_again() -> None:
+    class Slow(Foreign):
+        def start_task(self, instruction: str, **options: Any) -> Envelope:
+            assert robot.halt("meanwhile").stopped
+            return super().start_task(instruction, **options)
+
+    foreign = Slow()
+    robot = adapt(foreign)
+    answer = robot.start_task("wave")
+    assert answer["status"] == "error"
+    assert "halted while it started, and was stopped again" in answer["reason"]
+    assert foreign.calls[-1] == "stop"

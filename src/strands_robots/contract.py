@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from strands_robots.envelope import Envelope
+from strands_robots.envelope import Envelope, error
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.utils import ValidationError, shown
@@ -153,12 +153,17 @@ class AdaptedRobot:
         self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
     ) -> Envelope:
         try:
-            self.gate.permit("start_task")
+            permit = self.gate.permit("start_task")
         except MotionRefused as refused:
             return refused.envelope
         answer: Envelope = self.wrapped.start_task(
             instruction, policy_provider=policy_provider, duration=duration, policy_port=policy_port
         )
+        if not permit.valid:
+            # The stop came while the robot was starting, and may have found nothing to stop.
+            again = self.halt("halted while it started")
+            end = "and was stopped again" if again.stopped else "and DID NOT STOP AGAIN"
+            return error(f"start_task is refused: {self.tool_name_str} was halted while it started, {end}.")
         return answer
 
     def stop_task(self) -> Envelope:

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from strands_robots.device_connect import base_driver
+from strands_robots.device_connect import base_driver, live_driver
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.envelope import error, success
 from strands_robots.safety.approval import Approval, Grants, state_dir
@@ -209,7 +209,7 @@ async def test_a_stop_is_answered_while_motion_and_reads_block(robot: ToyRobot) 
         let_go.set()
         answers = await asyncio.gather(*blocked)
     refused = [answer for answer in answers if "has not yet answered" in answer.get("reason", "")]
-    assert len(refused) == 14 - base_driver.MOVES_AT_ONCE - base_driver.READS_AT_ONCE + 1 or len(refused) >= 8
+    assert len(refused) == 14 - base_driver.MOVES_AT_ONCE - live_driver.READS_AT_ONCE + 1 or len(refused) >= 8
 
 
 async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,11 +217,33 @@ async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, mon
     let_go = threading.Event()
     robot.before["start_task"] = let_go.wait
     async with DriverBench(drive(robot)) as bench:
-        generation = robot.gate.generation
         answer = await bench.call("execute", instruction="wave")
         assert "in time" in answer["reason"]
-        assert robot.gate.generation > generation
         let_go.set()
+        await bench.until(lambda: len(robot.answers) == 1)
+    assert "halted after it was asked for" in robot.answers[0]["reason"]
+    assert robot.writes == []
+
+
+async def test_a_stop_reaches_the_motion_that_has_not_begun_yet(robot: ToyRobot) -> None:
+    let_go, entered = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        entered.set()
+        let_go.wait(10)
+
+    robot.before["start_task"] = wait
+    async with DriverBench(drive(robot)) as bench:
+        asked = asyncio.create_task(bench.call("execute", instruction="wave"))
+        await bench.until(entered.is_set)
+        assert (await bench.call("stop"))["stopped"] is True
+        let_go.set()
+        answer = await asked
+        assert answer["status"] == "error"
+        assert "halted after it was asked for" in answer["reason"]
+        assert robot.writes == []
+        robot.before.clear()
+        assert (await bench.call("execute", instruction="wave"))["status"] == "success"
 
 
 async def test_a_halt_without_an_answer_is_reported_as_not_stopped(

@@ -199,6 +199,36 @@ def test_a_full_queue_answers_busy_and_stop_and_ping_still_work(peers: Fleet) ->
     release.set()
 
 
+def test_a_stop_reaches_the_commands_that_still_wait_for_their_turn(peers: Fleet) -> None:
+    release = threading.Event()
+
+    class Slow(World):
+        def get_features(self) -> dict[str, Any]:
+            release.wait(10)
+            return super().get_features()
+
+    world = Slow("left")
+    console = peers.join(None, "console")
+    peers.join(world, "sim-1", "sim")
+    stranger = peers.stranger()
+    results: dict[str, Any] = {}
+
+    def heard(sample: Any) -> None:
+        reply = json.loads(sample.payload)
+        results[reply["turn_id"]] = reply["result"]
+
+    stranger.declare_subscriber("strands/agent/response/**", heard)
+    start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
+    for turn, command in enumerate([{"action": "features"}] * 4 + [start]):
+        body = {"sender_id": "agent", "turn_id": f"t{turn}", "timestamp": peers.clock(), "command": command}
+        stranger.put("strands/sim-1/cmd", body)
+    assert console.send("sim-1", {"action": "stop"}, timeout=2)["result"]["ok"] is True
+    release.set()
+    eventually(lambda: "t4" in results, within=5)
+    assert "halted after it was asked for" in results["t4"]["reason"]
+    assert world.running == {}
+
+
 def test_a_refused_precondition_leaves_nothing_on_the_wire(peers: Fleet) -> None:
     console = peers.join(None, "console")
     for target in ("", "a\x00b", None, 5, "a/b", "*"):

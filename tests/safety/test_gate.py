@@ -79,3 +79,30 @@ def test_generations_rise_whoever_revokes() -> None:
     for thread in threads:
         thread.join()
     assert len(seen) == 2000
+
+
+def test_a_motion_asked_for_before_a_halt_is_refused_when_its_turn_comes_after() -> None:
+    gate = MotionGate()
+    asked = gate.generation
+    gate.revoke()
+    with gate.asked_at(asked), pytest.raises(MotionRefused, match="halted after it was asked for"):
+        gate.permit("start")
+    assert gate.permit("start").valid, "what is asked for after the halt may move"
+
+
+def test_a_motion_asked_for_at_this_generation_is_given_its_permit() -> None:
+    gate = MotionGate()
+    with gate.asked_at(gate.generation):
+        permit = gate.permit("start")
+    assert permit.valid
+
+
+def test_the_moment_of_asking_belongs_to_one_thread() -> None:
+    gate, seen = MotionGate(), []
+    asked = gate.generation
+    gate.revoke()
+    with gate.asked_at(asked):
+        other = threading.Thread(target=lambda: seen.append(gate.refusal("start")))
+        other.start()
+        other.join(5)
+    assert seen == [None]

@@ -249,6 +249,18 @@ def test_a_locked_world_starts_nothing(world: Simulation) -> None:
     assert busy(world) == []
 
 
+def test_a_halt_while_a_policy_is_made_ready_keeps_it_from_starting(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(provider: str, **options: Any) -> Stuck:
+        assert world.halt("meanwhile").stopped
+        return Stuck()
+
+    monkeypatch.setattr(motion, "create_policy", slow)
+    assert "halted while its policy was made ready" in world.start_policy("left", "wave")["reason"]
+    assert busy(world) == []
+
+
 def test_stopping_what_does_not_run_is_a_stop(world: Simulation) -> None:
     assert world.stop_policy("left")["stopped"] is True
     assert world.halt("test").stopped is True

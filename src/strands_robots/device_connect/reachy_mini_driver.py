@@ -11,8 +11,9 @@ from typing import Any, ClassVar, cast
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots.contract import RolloutEvent, TaskRobot
-from strands_robots.device_connect.base_driver import Activity, Call, RobotDriver
-from strands_robots.device_connect.declare import Labels, emit, on, rpc
+from strands_robots.device_connect.base_driver import Call, RobotDriver
+from strands_robots.device_connect.declare import Labels, emit, rpc
+from strands_robots.device_connect.live_driver import Activity
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.reachy.catalogue import LIBRARIES
 from strands_robots.drivers.reachy.connection import STATUS_PATH
@@ -317,11 +318,6 @@ class ReachyMiniDriver(RobotDriver):
         level = logging.WARNING if told.get("stopped") else logging.CRITICAL
         text = told["content"][0]["text"]
         logger.log(level, "%s: emergency stop (%s): %s Torque %s.", self.peer_id, reason, text, told.get("torque"))
-
-    @on(event_name="emergencyStop")
-    async def onEmergencyStop(self, device_id: str, event_name: str, payload: dict[str, Any]) -> None:
-        """Halt on the emergency stop of an allowed source."""
-        await self.on_estop(device_id, payload)
 
     @emit()
     async def motionComplete(self, name: str, state: str, detail: str = "", duration: float = 0.0) -> None:

@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 from device_connect_edge.types import DeviceIdentity
 
 from strands_robots.contract import AdaptedRobot, RolloutEvent, adapt
-from strands_robots.device_connect.base_driver import Activity, Call, RobotDriver
-from strands_robots.device_connect.declare import Labels, emit, on, rpc
+from strands_robots.device_connect.base_driver import Call, RobotDriver
+from strands_robots.device_connect.declare import Labels, emit, rpc
+from strands_robots.device_connect.live_driver import Activity
 from strands_robots.device_connect.wire import numbers, record
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
@@ -156,19 +157,6 @@ class RobotDeviceDriver(RobotDriver):
             instruction: What the robot was told
             step_count: Steps so far
         """
-
-    @emit(labels={"safety": "critical"})
-    async def emergencyStop(self, reason: str = "") -> None:
-        """This device calls for an emergency stop.
-
-        Args:
-            reason: Why
-        """
-
-    @on(event_name="emergencyStop")
-    async def onEmergencyStop(self, device_id: str, event_name: str, payload: dict[str, Any]) -> None:
-        """Halt on the emergency stop of an allowed source."""
-        await self.on_estop(device_id, payload)
 
     def glance(self) -> Activity:
         """The task's state."""

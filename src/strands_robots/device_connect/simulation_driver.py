@@ -9,8 +9,9 @@ from device_connect_edge.types import DeviceIdentity
 
 from strands_robots import settings
 from strands_robots.contract import RolloutEvent, WorldRobot
-from strands_robots.device_connect.base_driver import Activity, Call, RobotDriver
-from strands_robots.device_connect.declare import Labels, emit, on, rpc
+from strands_robots.device_connect.base_driver import Call, RobotDriver
+from strands_robots.device_connect.declare import Labels, emit, rpc
+from strands_robots.device_connect.live_driver import Activity
 from strands_robots.device_connect.robot_driver import task_arguments
 from strands_robots.device_connect.telemetry import paced
 from strands_robots.device_connect.wire import numbers, record
@@ -186,19 +187,6 @@ class SimulationDeviceDriver(RobotDriver):
             action: What the policy told the joints, by name
             robot_name: The simulated robot
         """
-
-    @emit(labels={"safety": "critical"})
-    async def emergencyStop(self, reason: str = "") -> None:
-        """This device calls for an emergency stop.
-
-        Args:
-            reason: Why
-        """
-
-    @on(event_name="emergencyStop")
-    async def onEmergencyStop(self, device_id: str, event_name: str, payload: dict[str, Any]) -> None:
-        """Halt every motion source on the emergency stop of an allowed source."""
-        await self.on_estop(device_id, payload)
 
     def glance(self) -> Activity:
         """Time, steps and running policies of the world; keeps the joints for :meth:`observationUpdate`."""

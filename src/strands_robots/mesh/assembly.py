@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -189,6 +190,9 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     def dispatch(command: dict[str, Any], sample: Sample) -> Any:
         return (desk.get(command["action"]) or dispatcher)(command)
 
+    def asked() -> AbstractContextManager[None]:
+        return nullcontext() if robot is None else robot.gate.asked_at(robot.gate.generation)
+
     approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
     assembled: Assembled
 
@@ -207,7 +211,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         lanes=lanes,
         door=door,
         caller=caller,
-        server=Server(context, lanes, approval_door, safety.locked, dispatch),
+        server=Server(context, lanes, approval_door, safety.locked, dispatch, asked=asked),
         herald=Herald(context, mesh.peer_type, facts),
         safety=safety,
         state=StateReader(peer, robot, parts.clock),

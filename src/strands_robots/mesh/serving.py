@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from strands_robots.envelope import is_error
@@ -100,16 +101,25 @@ class Server:
     Args:
         locked: whether the lockout holds this peer.
         dispatch: carries out a validated command and returns its result.
+        asked: taken when a command arrives and entered when its turn comes, so that a stop in between refuses it.
     """
 
     def __init__(
-        self, context: Context, lanes: Lanes, door: MotionDoor, locked: Callable[[], bool], dispatch: Dispatch
+        self,
+        context: Context,
+        lanes: Lanes,
+        door: MotionDoor,
+        locked: Callable[[], bool],
+        dispatch: Dispatch,
+        *,
+        asked: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self._context = context
         self._lanes = lanes
         self._door = door
         self._locked = locked
         self._dispatch = dispatch
+        self._asked = asked
         self._replays = Replays(context.monotonic)
 
     def on_command(self, sample: Sample) -> None:
@@ -128,7 +138,13 @@ class Server:
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
             self._serve(request, sample)
             return
-        if not self._lanes.of(action).submit(lambda: self._serve(request, sample)):
+        asked = self._asked()
+
+        def serve() -> None:
+            with asked:
+                self._serve(request, sample)
+
+        if not self._lanes.of(action).submit(serve):
             context.audit("command_refused", request.sender_id, reason=BUSY)
             self._reply(request, error=BUSY)
 

@@ -8,10 +8,13 @@ action reaches the device. Revoking is one assignment: it takes no lock and cann
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from typing import Protocol
 
-from strands_robots.envelope import Envelope
+from strands_robots.envelope import Envelope, error
 
 
 class Latch(Protocol):
@@ -66,6 +69,7 @@ class MotionGate:
         self._latch = latch
         self._numbers = count(1)
         self._generation = 0
+        self._asked = threading.local()
 
     @property
     def generation(self) -> int:
@@ -76,14 +80,28 @@ class MotionGate:
         """Let ``latch`` decide from now on whether motion is locked."""
         self._latch = latch
 
+    @contextmanager
+    def asked_at(self, generation: int) -> Iterator[None]:
+        """For this thread: motions begun inside were asked for at ``generation``; a halt since then refuses them.
+
+        A call that waited for a thread or a connection is thus older than the stop that came meanwhile.
+        """
+        self._asked.generation = generation
+        try:
+            yield
+        finally:
+            del self._asked.generation
+
     def refusal(self, verb: str) -> Envelope | None:
-        """The answer to ``verb`` while locked, or None."""
+        """The answer to ``verb`` while locked, or when the robot was halted since it was asked for; else None."""
+        if getattr(self._asked, "generation", self._generation) != self._generation:
+            return error(f"{verb} is refused: the robot was halted after it was asked for; nothing was started.")
         return self._latch.refusal(verb) if self._latch is not None else None
 
     def permit(self, verb: str) -> Permit:
-        """Leave to move. Raises :class:`MotionRefused` while locked."""
+        """Leave to move. Raises :class:`MotionRefused` while locked, and when halted since it was asked for."""
         # The generation is read before the latch, so that a lock engaged in between voids this permit.
-        permit = Permit(self, self._generation, verb)
+        permit = Permit(self, getattr(self._asked, "generation", self._generation), verb)
         refusal = self.refusal(verb)
         if refusal is not None:
             raise MotionRefused(refusal)

@@ -120,6 +120,7 @@ class Rollouts(Pictures, TeleopMixin):
         seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
         if not whole("policy_port", options.get("policy_port", 0), low=0, high=65535):
             options.pop("policy_port", None)
+        permit = self.gate.permit("start_policy")
         try:
             policy = create_policy(provider, **options)
         except MissingExtraError as missing:
@@ -128,10 +129,12 @@ class Rollouts(Pictures, TeleopMixin):
             self._open()
             body = self.body(robot_name)
             self._idle(body.name)
+            if not permit.valid:
+                raise ValidationError(f"start_policy: {body.name} was halted while its policy was made ready.")
             rollout = Rollout(
                 body,
                 policy,
-                permit=self.gate.permit("start_policy"),
+                permit=permit,
                 instruction=task,
                 policy_name=provider,
                 duration=seconds,

@@ -93,6 +93,8 @@ class Floor:
         eventually(lambda: self.world.writes and self.arm.writes)
 
     def close(self) -> None:
+        self.world.close()
+        self.arm.close()
         self.controller.close()
         self.agent.close()
         for runtime in self.runtimes:
