@@ -20,6 +20,7 @@ from unittest.mock import patch
 from fixtures.feetech_bus import MOTORS, FeetechBus, Write, arm_servos, write_calibration
 from fixtures.waiting import eventually, free_port
 
+from benchmarks.arm_leading import leading
 from benchmarks.table import Row
 from strands_robots.device_connect import LinkConfig, init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.device_connect.safety_controller import safety_controller
@@ -49,6 +50,7 @@ def run(*, quick: bool = False) -> list[Row]:
         rows = [recording(RECORDED_S_QUICK if quick else RECORDED_S)]
         if importlib.util.find_spec("lerobot") is not None:
             rows += [jitter(SECONDS_QUICK if quick else SECONDS), last_write(STOPS_QUICK if quick else STOPS)]
+            rows += leading(quick=quick)
         return rows
 
 

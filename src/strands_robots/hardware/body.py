@@ -23,7 +23,10 @@ READ_TRIES = 3
 """How often joints are asked for before a motor counts as silent; LeRobot waits 50 ms for each answer."""
 
 CONNECT_TRIES = 3
-"""How often connecting is tried: it takes some two hundred exchanges, and LeRobot gives up at the first lost one."""
+"""How often connecting is tried: it takes some two hundred exchanges, and LeRobot gives up at the first lost one.
+
+A motor that does not answer its first ping is a ``RuntimeError`` of LeRobot's, one that falls silent later a
+``ConnectionError``."""
 
 HOLD_FRESH_S = 0.25
 """How old the last joint read may be to be held at when a new one fails."""
@@ -106,7 +109,7 @@ class DeviceBody:
                     device.connect()
             except BaseException as exc:
                 drop(device)
-                if left and isinstance(exc, ConnectionError) and not isinstance(exc.__cause__, OSError):
+                if left and isinstance(exc, ConnectionError | RuntimeError) and not isinstance(exc.__cause__, OSError):
                     continue
                 raise
             return

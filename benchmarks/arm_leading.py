@@ -1,0 +1,56 @@
+"""A leader arm that leads a follower arm in another process, to the bytes on the follower's bus."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from fixtures.arm_pair import ArmPair, Led
+from fixtures.network_lab import NetworkLab, Weather, missing
+
+from benchmarks.table import Row
+
+SECONDS, SECONDS_QUICK = 600.0, 10.0
+FAR_SECONDS = 60.0
+DELAY_S = 0.05
+BOUND_MS = 12.0
+
+
+def leading(*, quick: bool) -> list[Row]:
+    """Over Zenoh on one machine, and over a network of 50 ms one way."""
+    return [near(SECONDS_QUICK if quick else SECONDS), far(SECONDS_QUICK if quick else FAR_SECONDS)]
+
+
+def near(seconds: float) -> Row:
+    with tempfile.TemporaryDirectory(prefix="bench-pair-") as folder, ArmPair(Path(folder)) as pair:
+        return _row("on one machine", seconds, pair.lead(seconds), 0.0)
+
+
+def far(seconds: float) -> Row:
+    where = f"with {DELAY_S * 1000:g} ms of network delay, mutual TLS"
+    if why := missing():
+        return Row(f"leader to follower's bus {where}", f"not measured: {why}", "", None, "", ok=True)
+    with (
+        NetworkLab() as lab,
+        tempfile.TemporaryDirectory(prefix="bench-pair-") as folder,
+        ArmPair(Path(folder), lab) as pair,
+    ):
+        lab.weather = Weather(delay_s=DELAY_S)
+        row = _row(where, seconds, pair.lead(seconds), DELAY_S * 1000)
+        # Processes say goodbye, which needs a network.
+        lab.weather = Weather()
+        return row
+
+
+def _row(where: str, seconds: float, led: Led, delay_ms: float) -> Row:
+    took = sorted(led.took_ms) or [float("inf")]
+    p50, p99 = (took[int(len(took) * share)] for share in (0.5, 0.99))
+    bound = delay_ms + BOUND_MS
+    return Row(
+        what=f"leader's arm read to the write at the follower's servo, {where}, 50 Hz for {seconds:g} s",
+        ours=f"p50 {p50:.2f} p99 {p99:.2f} max {took[-1]:.2f} ms; {led.lost} of {led.sent} lost",
+        against="",
+        ratio=None,
+        must=f"p99 at most {bound:g} ms, none lost",
+        ok=p99 <= bound and led.lost == 0 and led.publisher["errors"] == 0,
+    )
