@@ -30,20 +30,29 @@ class Clock:
         self.at += seconds
 
 
+class RealClock(Clock):
+    """Seconds as they pass."""
+
+    def __call__(self) -> float:
+        return time.time()
+
+
 class Fleet:
     """Peers in one process, each as if alone in a process of its own: own session, registry and safety plane."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, clock: Clock | None = None) -> None:
         self.bus = MemoryBus()
-        self.clock = Clock()
+        self.clock = clock or Clock()
         self.meshes: list[Mesh] = []
         self.transports: dict[str, MemoryTransport] = {}
         self.audit: list[tuple[str, str, dict[str, Any]]] = []
+        self.planes: dict[str, SafetyPlane] = {}
         self._folder = folder
 
     def parts(self, peer_id: str, *, identity: Identity | None = None, sessionless: bool = False) -> Parts:
         transport = MemoryTransport(self.bus, sessionless=sessionless)
         self.transports[peer_id] = transport
+        own = self.planes[peer_id] = SafetyPlane(LockoutStore(self._folder / peer_id))
 
         def acquire() -> MemoryTransport:
             transport.connect()
@@ -57,7 +66,7 @@ class Fleet:
             monotonic=self.clock,
             identity=lambda _: identity or Identity(),
             audit=lambda event, peer, payload: self.audit.append((event, peer, payload)),
-            plane=SafetyPlane(LockoutStore(self._folder / peer_id)),
+            plane=own,
         )
 
     def join(self, robot: Any, peer_id: str, peer_type: str = "robot", **options: Any) -> Mesh:

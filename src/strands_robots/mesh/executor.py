@@ -44,11 +44,11 @@ class Lane:
                     return False
                 self._forget_oldest()
         with self._lock:
-            if not self._open:
-                return False  # closed meanwhile: nobody takes the job
-            if not self._threads or (len(self._threads) < self._workers and self._busy >= len(self._threads)):
+            short = not self._threads or (len(self._threads) < self._workers and self._busy >= len(self._threads))
+            # Closed meanwhile, nobody takes the job: a thread made now would wait for ever.
+            if self._open and short:
                 self._add()
-        return True
+            return self._open
 
     def close(self) -> None:
         """Take no more jobs, forget those waiting, and let the threads end; twice is once."""

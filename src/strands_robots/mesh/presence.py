@@ -102,6 +102,9 @@ class Herald:
         if not wire.fresh(presence.timestamp, context.clock()):
             context.audit("presence_rejected", peer, reason="the timestamp is not fresh")
             return
+        if sample.sessionless and not _speaks_there(sample.key, peer):
+            context.audit("presence_rejected", peer, reason="the topic and the body disagree")
+            return
         session, certificate = sample.session, None
         if context.identity.checks or context.identity.required:
             try:
@@ -111,7 +114,8 @@ class Herald:
                 if context.identity.required:
                     context.audit("presence_unverified", peer, reason=str(exc))
                     session = None
-        held = context.registry.conflicts(peer, session)
+        good_enough = certificate is not None or not context.identity.required
+        held = context.registry.conflicts(peer, session, certified=good_enough)
         if held is not None:
             context.audit("presence_identity_conflict", peer, held=held, offered=session)
             return
@@ -155,3 +159,9 @@ class Herald:
         ours = self._context.session_id()
         if sample.session is not None and ours is not None and sample.session != ours:
             self._context.audit("presence_identity_conflict", self._context.peer_id, held=ours, offered=sample.session)
+
+
+def _speaks_there(key: str, peer: str) -> bool:
+    """Without sessions the topic is all that a broker vouches for: the peer's own, or that of its parent."""
+    parts = key.split("/")
+    return len(parts) > 1 and (peer == parts[1] or peer.startswith(f"{parts[1]}__"))

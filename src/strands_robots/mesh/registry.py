@@ -82,13 +82,18 @@ class PeerRegistry:
                 del self._rows[next(iter(self._rows))]
         return known is None
 
-    def conflicts(self, peer_id: str, session: str | None) -> str | None:
-        """The live session that already speaks for ``peer_id`` when it is another than ``session``, else None."""
+    def conflicts(self, peer_id: str, session: str | None, *, certified: bool = False) -> str | None:
+        """What already speaks for the living ``peer_id`` and bars this heartbeat of it, else None.
+
+        That is its session when it is another than ``session``, or the certificate (SHA-256) that it announced itself
+        with when this heartbeat is not ``certified`` for the peer.
+        """
         row = self._row(peer_id)
-        if row is None or row.session is None or row.session == session:
+        if row is None or row.gone or self._clock() - row.seen > PEER_TIMEOUT:
             return None
-        alive = not row.gone and self._clock() - row.seen <= PEER_TIMEOUT
-        return row.session if alive else None
+        if row.session is not None and row.session != session:
+            return row.session
+        return row.certificate[0] if row.certificate is not None and not certified else None
 
     def session_of(self, peer_id: str) -> str | None:
         row = self._row(peer_id)

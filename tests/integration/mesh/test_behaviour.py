@@ -1,0 +1,353 @@
+"""What a mesh does, the same on every transport: in memory, Zenoh, Zenoh with mutual TLS, an MQTT 5 broker.
+
+Three peers: an operator's console, a simulated world and a real arm. Over Zenoh and MQTT each is a process.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+from tests.integration.mesh.networks import Network, network
+
+from strands_robots.mesh.resume_authority import keygen
+from strands_robots.mesh.transport.base import Transport
+
+PASSPHRASE = "Correct-Horse-7-Battery"
+APPROVED = "execute@arm-1,start@arm-1,teleop_receive@arm-1"
+WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
+
+
+@pytest.fixture(scope="module", params=["memory", "zenoh", "zenoh-tls", pytest.param("mqtt", marks=pytest.mark.system)])
+def net(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
+    folder = tmp_path_factory.mktemp("network")
+    public = keygen(folder / "operator.pem", PASSPHRASE)
+    settings = {"STRANDS_MESH_RESUME_PUBLIC_KEY": public, "STRANDS_ROBOT_COMMAND_ALLOW": APPROVED}
+    with network(request.param, folder, settings) as made:
+        names = {"console": "none", "sim-1": "world", "arm-1": "arm"}
+        for peer_id, robot in names.items():
+            made.join(peer_id, robot)
+        for peer_id, peer in made.peers.items():
+            peer.sees(*(other for other in names if other != peer_id), within=15)
+        yield made
+
+
+@pytest.fixture(autouse=True)
+def free(net: Network) -> Iterator[None]:
+    """Every test leaves its peers standing still and unlocked."""
+    yield
+    for peer in net.peers.values():
+        peer.ask("clear")
+    for robot in ("sim-1", "arm-1"):
+        net.peers["console"].ask("send", robot, {"action": "stop"}, 5)
+
+
+def request(sender: str, command: object, **fields: Any) -> dict[str, Any]:
+    """A hand-made command."""
+    return {"sender_id": sender, "turn_id": uuid.uuid4().hex, "command": command, "timestamp": time.time(), **fields}
+
+
+def replies_to(transport: Transport, sender: str) -> list[dict[str, Any]]:
+    """Everything that is answered to ``sender`` from now on, whoever that is."""
+    found: list[dict[str, Any]] = []
+    key = f"strands/{sender}/response/**"
+    transport.declare_subscriber(key, lambda sample: found.append(json.loads(sample.payload)))
+    return found
+
+
+def until_answered(transport: Transport, key: str, body: dict[str, Any], found: list[dict[str, Any]]) -> dict[str, Any]:
+    """Publish until an answer comes: a new subscription takes a moment to reach everybody."""
+
+    def ask() -> dict[str, Any] | None:
+        if not found:
+            transport.put(key, body)
+            time.sleep(0.1)
+        return found[0] if found else None
+
+    return eventually(ask, within=5, what="an answer") or {}
+
+
+# Who is there.
+
+
+def test_a_peer_tells_what_it_is(net: Network) -> None:
+    rows = {row["peer_id"]: row for row in net.peers["console"].ask("peers")}
+    assert (rows["sim-1"]["type"], rows["sim-1"]["world"], rows["sim-1"]["sim_robots"]) == ("sim", True, ["left"])
+    assert (rows["arm-1"]["type"], rows["arm-1"]["tool_name"]) == ("robot", "arm-1")
+    for row in rows.values():
+        assert row["reachable"] is True
+        assert 0 <= row["age"] < 10
+        assert row["hostname"]
+    assert "console" not in rows
+
+
+def test_a_peer_is_bound_to_the_session_it_came_from(net: Network) -> None:
+    net.needs("session")
+    seen = {peer.ask("zid", "arm-1") for name, peer in net.peers.items() if name != "arm-1"}
+    assert len(seen) == 1 and None not in seen
+    assert net.peers["console"].ask("zid", "sim-1") not in seen
+
+
+def test_nobody_takes_a_living_peers_name(net: Network) -> None:
+    mallory, sim = net.stranger("impostor"), net.peers["sim-1"]
+    before = sim.ask("zid", "arm-1"), sim.ask("cert", "arm-1")
+    for number in range(30):
+        body = {"robot_id": "arm-1", "robot_type": "impostor", "hostname": "elsewhere", "timestamp": time.time()}
+        mallory.put(f"strands/{('arm-1', 'impostor')[number % 2]}/presence", body)
+        row = next(row for row in sim.ask("peers") if row["peer_id"] == "arm-1")
+        assert row["type"] == "robot"
+        time.sleep(0.01)
+    assert (sim.ask("zid", "arm-1"), sim.ask("cert", "arm-1")) == before
+    assert sim.ask("ping", "arm-1")["status"] == "ok"
+
+
+# Asking.
+
+
+def test_a_ping_is_answered_and_timed(net: Network) -> None:
+    answer = net.peers["console"].ask("ping", "arm-1")
+    assert answer["status"] == "ok"
+    assert answer["via"] == ("direct" if net.kind == "mqtt" else "publish")
+    assert answer["confirmed"] is (net.kind == "mqtt")
+    assert 0 < answer["latency_ms"] < 2000
+
+
+def test_a_peer_that_is_nowhere_is_offline_at_once(net: Network) -> None:
+    net.needs("confirm")
+    assert net.peers["console"].ask("ping", "nobody")["status"] == "offline"
+
+
+def test_a_peer_that_is_nowhere_times_out(net: Network) -> None:
+    answer = net.peers["console"].ask("send", "nobody", {"action": "status"}, 0.2)
+    assert answer.get("status") == "timeout" or answer.get("error") == "offline"
+
+
+@pytest.mark.parametrize("target", ["arm-1", "sim-1"])
+@pytest.mark.parametrize("action", ["status", "state", "features"])
+def test_reads_are_answered(net: Network, target: str, action: str) -> None:
+    reply = net.peers["console"].ask("send", target, {"action": action}, 5)
+    assert (reply["type"], reply["responder_id"]) == ("response", target)
+    assert reply["result"]["status"] == "success"
+
+
+def test_a_simulation_starts_and_stops_on_demand(net: Network) -> None:
+    console, sim = net.peers["console"], net.peers["sim-1"]
+    assert console.ask("send", "sim-1", WAVE, 5)["result"]["status"] == "success"
+    assert sim.ask("moving") == ["left"]
+    told = console.ask("send", "sim-1", {"action": "stop"}, 5)["result"]
+    assert told == {"ok": True, "stopped": ["left"], "not_stopped": [], "results": {"left": "stopped"}}
+    assert sim.ask("moving") == []
+
+
+def test_tell_runs_an_approved_arm_and_waits_for_its_end(net: Network) -> None:
+    reply = net.peers["console"].ask("tell", "arm-1", "wave", 0.5)
+    assert reply["result"]["task_status"] == "idle"
+
+
+def test_an_arm_does_not_move_without_approval(net: Network) -> None:
+    reply = net.peers["console"].ask("send", "arm-1", {"action": "reset"}, 5)
+    assert reply["type"] == "error"
+    assert "operator approval" in reply["error"]
+
+
+def test_a_broadcast_collects_every_peer(net: Network) -> None:
+    replies = net.peers["console"].ask("broadcast", {"action": "ping"}, 0.7)
+    assert sorted(reply["responder_id"] for reply in replies) == ["arm-1", "sim-1"]
+
+
+# Publishing.
+
+
+def test_what_is_published_is_heard_until_one_is_deaf(net: Network) -> None:
+    console, sim = net.peers["console"], net.peers["sim-1"]
+    assert console.ask("hear", "strands/*/notes", None, "notes") == "notes"
+
+    def heard() -> list[Any]:
+        sim.ask("publish", "strands/sim-1/notes", {"words": "good morning"})
+        found: list[Any] = console.ask("heard", "notes")
+        return found
+
+    assert eventually(heard, within=5)[0] == {"key": "strands/sim-1/notes", "words": "good morning"}
+    console.ask("deaf", "notes")
+    sim.ask("publish", "strands/sim-1/notes", {"words": "good night"})
+    assert console.ask("heard", "notes") == []
+
+
+def test_a_message_too_large_is_an_error_to_its_sender(net: Network) -> None:
+    with pytest.raises(RuntimeError, match="16384"):
+        net.peers["console"].ask("publish", "strands/sim-1/cmd", {"words": "x" * 16384})
+
+
+def test_the_state_of_a_robot_and_of_a_world_is_published(net: Network) -> None:
+    console = net.peers["console"]
+    console.ask("hear", "strands/*/state", None, "states")
+
+    def by_peer() -> dict[str, Any] | None:
+        found = {each["peer_id"]: each for each in console.ask("heard", "states")}
+        return found if len(found) >= 2 else None
+
+    found = eventually(by_peer, within=5) or {}
+    console.ask("deaf", "states")
+    assert found["arm-1"]["joints"] == {"shoulder": 1.5}
+    assert found["sim-1"]["sim_time"] == 1.25
+    assert abs(found["sim-1"]["t"] - time.time()) < 10
+
+
+def test_a_policys_steps_are_streamed(net: Network) -> None:
+    console, sim = net.peers["console"], net.peers["sim-1"]
+    console.ask("hear", "strands/sim-1/stream", None, "steps")
+
+    def heard() -> list[Any]:
+        sim.ask("step", 7)
+        found: list[Any] = console.ask("heard", "steps")
+        return found
+
+    step = eventually(heard, within=5)[0]
+    console.ask("deaf", "steps")
+    assert (step["peer_id"], step["step"], step["instruction"], step["policy"]) == ("sim-1", 7, "wave", "mock")
+    assert step["action"] == {"joint": 0.6}
+
+
+# Leading and following.
+
+
+def test_a_leader_moves_its_follower_in_order_until_a_stop(net: Network) -> None:
+    net.needs("input")
+    console, arm = net.peers["console"], net.peers["arm-1"]
+    before = len(arm.ask("actions"))
+    assert arm.ask("follow", "console") is None
+    console.ask("lead")
+    eventually(lambda: len(arm.ask("actions")) - before >= 15, within=5)
+    moved = [action["shoulder.pos"] for action in arm.ask("actions")[before:]]
+    assert moved == sorted(moved)
+    stats = arm.ask("followed")
+    assert (stats["rejected"], stats["errors"], stats["out_of_order"]) == (0, 0, 0)
+    console.ask("send", "arm-1", {"action": "stop"}, 5)
+    eventually(lambda: arm.ask("followed")["running"] is False, within=2)
+    still = len(arm.ask("actions"))
+    time.sleep(0.1)
+    assert len(arm.ask("actions")) == still
+    assert console.ask("rest")["thread_alive"] is False
+    assert arm.ask("unfollow")["running"] is False
+
+
+def test_frames_of_another_session_move_nothing(net: Network) -> None:
+    net.needs("input")
+    arm, mallory = net.peers["arm-1"], net.stranger("puppeteer")
+    before = len(arm.ask("actions"))
+    assert arm.ask("follow", "console") is None
+    frame = {"peer_id": "console", "device": "leader", "method": "arm", "t": time.time(), "seq": 10**6}
+
+    def refused() -> int:
+        mallory.put("strands/console/input/leader", {**frame, "action": {"shoulder.pos": 90.0}})
+        count: int = arm.ask("followed")["rejected_source"]
+        return count
+
+    eventually(refused, within=5)
+    assert arm.ask("unfollow")["running"] is False
+    assert len(arm.ask("actions")) == before
+
+
+# Somebody else's words.
+
+
+def test_a_command_in_anothers_name_does_not_move_an_arm(net: Network) -> None:
+    mallory, arm = net.stranger("forger"), net.peers["arm-1"]
+    found = replies_to(mallory, "console")
+    reply = until_answered(mallory, "strands/arm-1/cmd", request("console", WAVE), found)
+    assert "operator approval" in reply["error"]
+    assert arm.ask("moving") is False
+
+
+def test_a_command_is_carried_out_once(net: Network) -> None:
+    mallory, sim = net.stranger("repeater"), net.peers["sim-1"]
+    found = replies_to(mallory, "repeater")
+    until_answered(mallory, "strands/sim-1/cmd", request("repeater", {"action": "ping"}), found)
+    found.clear()
+    before, step = sim.ask("steps"), request("repeater", {"action": "step", "steps": 3})
+    for _ in range(3):
+        mallory.put("strands/sim-1/cmd", step)
+    eventually(lambda: len(found) == 3, within=5)
+    assert sorted(reply.get("error", "") for reply in found) == ["", "replay rejected", "replay rejected"]
+    assert sim.ask("steps") == before + 3
+
+
+@pytest.mark.parametrize("shift", [-61.0, 6.0])
+def test_a_motion_of_another_time_is_refused(net: Network, shift: float) -> None:
+    mallory, sim = net.stranger("late" if shift < 0 else "early"), net.peers["sim-1"]
+    sender, before = "late" if shift < 0 else "early", sim.ask("steps")
+    found = replies_to(mallory, sender)
+    stale = request(sender, {"action": "step"}, timestamp=time.time() + shift)
+    assert until_answered(mallory, "strands/sim-1/cmd", stale, found)["error"] == "replay rejected"
+    assert sim.ask("steps") == before
+
+
+def test_a_command_out_of_bounds_is_answered_with_the_reason(net: Network) -> None:
+    mallory = net.stranger("careless")
+    found = replies_to(mallory, "careless")
+    body = request("careless", {**WAVE, "duration": True})
+    reply = until_answered(mallory, "strands/sim-1/cmd", body, found)
+    assert reply["error"].startswith("validation: duration")
+
+
+# Safety.
+
+
+def test_an_emergency_stop_halts_and_locks_everybody_until_the_signed_resume(net: Network) -> None:
+    console, arm, sim = (net.peers[name] for name in ("console", "arm-1", "sim-1"))
+    arm.ask("start", "wave")
+    sim.ask("start", "wave")
+    answers = console.ask("estop")[1]
+    assert answers[0]["responder_id"] == "console"
+    assert {answer["responder_id"] for answer in answers} == {"console", "arm-1", "sim-1"}
+    epoch = console.ask("epoch")
+    assert [peer.ask("epoch") for peer in (arm, sim)] == [epoch, epoch]
+    assert arm.ask("moving") is False and sim.ask("moving") == []
+    assert console.ask("send", "sim-1", WAVE, 5)["error"] == "command rejected"
+    for action in ("status", "state", "features", "teleop_status", "ping", "stop"):
+        assert console.ask("send", "sim-1", {"action": action}, 5)["type"] == "response"
+    assert console.ask("resume", str(net.folder / "operator.pem"), PASSPHRASE) == {"status": "ok"}
+    for peer in (arm, sim):
+        eventually(lambda peer=peer: peer.ask("epoch") is None, within=3, what=f"{peer.peer_id} is free")
+    assert console.ask("send", "sim-1", WAVE, 5)["result"]["status"] == "success"
+
+
+def test_a_stop_of_anybody_counts_and_a_resume_of_anybody_does_not(net: Network, tmp_path: Path) -> None:
+    keygen(tmp_path / "own.pem", PASSPHRASE)
+    console, arm = net.peers["console"], net.peers["arm-1"]
+    arm.ask("estop")
+    eventually(lambda: console.ask("epoch"), within=3)
+    assert console.ask("resume", str(tmp_path / "own.pem"), PASSPHRASE) == {
+        "status": "error",
+        "error": "resume rejected",
+    }
+    assert arm.ask("epoch") == console.ask("epoch")
+
+
+# Last, because its ghost stays listed for a while and every stop would wait for it.
+
+
+def test_a_reply_in_anothers_name_does_not_count(net: Network) -> None:
+    mallory, ghost = net.stranger("liar"), net.stranger("ghost")
+    ghost.put("strands/ghost/presence", {"robot_id": "ghost", "robot_type": "robot", "timestamp": time.time()})
+    asked: list[str] = []
+
+    def answer(sample: Any) -> None:
+        turn = json.loads(sample.payload)["turn_id"]
+        asked.append(turn)
+        body = {"type": "response", "responder_id": "ghost", "turn_id": turn, "result": {}, "timestamp": time.time()}
+        mallory.put(f"strands/console/response/ghost/{turn}", body)
+
+    mallory.declare_subscriber("strands/ghost/cmd", answer)
+
+    def unanswered() -> bool:
+        assert net.peers["console"].ask("send", "ghost", {"action": "ping"}, 0.3).get("type") is None
+        return len(asked) >= 2
+
+    eventually(unanswered, within=5, what="two commands that the liar answered")
