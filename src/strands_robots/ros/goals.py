@@ -11,15 +11,7 @@ from strands_robots.ros.link import GivenUp, Goal, GoalLink, Heard, Message, Ros
 SUCCEEDED = 4
 """``action_msgs/GoalStatus`` of a goal that was reached."""
 
-STATUS_WORDS = {
-    0: "unknown",
-    1: "accepted",
-    2: "executing",
-    3: "canceling",
-    4: "succeeded",
-    5: "canceled",
-    6: "aborted",
-}
+STATUS_WORDS = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 """The statuses of ``action_msgs/GoalStatus``, in the order of their numbers."""
 
 CANCEL_S = 5.0
@@ -30,7 +22,7 @@ SLICE_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class GoalReport:
-    """How a goal went. ``state``: a word of :data:`STATUS_WORDS`, or ``lost`` where its end is not known.
+    """How a goal went. ``state``: a word of :data:`STATUS_WORDS`, ``rejected``, or ``lost`` where its end is not known.
 
     ``over`` is true when the server told its end, so that nothing goes on; ``cut`` says who ended it, "" nobody.
     """
@@ -76,6 +68,8 @@ def run_goal(
         sent.cancel()
         raise
     problem = _cancelled(sent) if cut else ""
+    if sent.rejected:
+        return GoalReport("rejected", True, cut, problem=sent.problem)
     if sent.status is None:
         return GoalReport("lost", False, cut, problem=problem or sent.problem)
     known = SUCCEEDED <= sent.status < len(STATUS_WORDS)
@@ -95,5 +89,7 @@ def said(report: GoalReport) -> str:
     if report.state == "lost":
         ended = f"After {report.cut}, " if report.cut else ""
         return f"{ended}nobody knows whether the goal still goes on: {report.problem}."
+    if report.state == "rejected":
+        return report.problem
     cut = f" after {report.cut} ended it" if report.cut else ""
     return f"the goal {'was ' if report.state in ('canceled', 'aborted') else ''}{report.state}{cut}."

@@ -33,6 +33,7 @@ class Goal:
         self.done = threading.Event()
         self.status: int | None = None
         self.values: Any = {}
+        self.rejected = False
         self.problem = ""
         self.cancel = cancel
 
@@ -41,6 +42,11 @@ class Goal:
         if not self.done.is_set():
             self.status, self.values = status, values
             self.done.set()
+
+    def reject(self, problem: str) -> None:
+        """The server did not take it, so that nothing began."""
+        self.rejected = True
+        self.fail(problem)
 
     def fail(self, problem: str) -> None:
         """The end will not be told, for this reason; the first one counts."""
@@ -63,11 +69,12 @@ class GoalLink(Protocol):
         feedback: Heard | None = None,
         given_up: GivenUp = never,
     ) -> Goal:
-        """Send a goal and return once the server has it. ``given_up`` is asked meanwhile and ends the attempt.
+        """Send a goal and return once the server took it, time is over, or ``given_up`` says so.
+
+        A goal that is cancelled before the server took it is cancelled once it does.
 
         Raises:
-            RosError: no server, or it refused the goal, or did not take it in time. A goal that is taken after
-                that is cancelled at once.
+            RosError: there is no server, or it refused the goal; nothing began.
         """
 
 

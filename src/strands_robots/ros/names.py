@@ -10,6 +10,7 @@ NAME_MAX = 255
 """Longest graph name in characters, the bound of DDS topic names."""
 
 _NAME = re.compile(r"[/~]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*\Z")
+_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _KIND = re.compile(r"([a-z][a-z0-9_]*)/(?:(?:msg|srv|action)/)?([A-Z][A-Za-z0-9]*)\Z")
 
 
@@ -35,3 +36,20 @@ def bare_kind(kind: str) -> str:
     """``pkg/Name`` of either spelling, so that types can be compared."""
     found = _KIND.match(kind)
     return f"{found[1]}/{found[2]}" if found else kind
+
+
+def class_place(kind: str, section: str) -> tuple[str, str]:
+    """Python module and class of an interface: ``section`` is msg, srv or action. Raises :class:`ValidationError`."""
+    found = _KIND.match(kind)
+    if found is None:
+        raise ValidationError(f"type must be a ROS type such as geometry_msgs/msg/Twist, not {shown(kind)}.")
+    return f"{found[1]}.{section}", found[2]
+
+
+def node_name(name: str, value: object) -> str:
+    """A node: letters, digits and underscores, the first no digit."""
+    if not isinstance(value, str) or len(value) > NAME_MAX or not _NODE.match(value):
+        raise ValidationError(
+            f"{name} must be a ROS node name of letters, digits and '_', not starting with a digit, not {shown(value)}."
+        )
+    return value

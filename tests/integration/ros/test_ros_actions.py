@@ -153,7 +153,7 @@ def test_a_graph_over_dds_is_looked_at_and_read(tmp_path: Path) -> None:
         ("list_nodes", {}),
         ("list_services", {}),
     ):
-        assert "use rosbridge" in ros_action(action, domain_id=DOMAIN, **options)["reason"]
+        assert "rosbridge" in ros_action(action, domain_id=DOMAIN, **options)["reason"]
 
 
 @pytest.mark.parametrize("tool", [use_rosbridge, use_rtps])

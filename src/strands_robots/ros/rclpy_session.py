@@ -1,0 +1,99 @@
+"""A node of our own in the ROS 2 that is sourced: its context, its executor and the thread that spins it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+
+from strands_robots.ros.link import RosError
+
+logger = logging.getLogger(__name__)
+
+SPIN_S = 0.1
+"""Longest time in seconds that the executor waits before it looks whether it shall end."""
+
+NO_RCLPY = (
+    "rclpy cannot be imported here: source a ROS 2 installation, Humble or later, "
+    "and use the Python that it was built for."
+)
+
+
+def sourced() -> bool:
+    """A ROS 2 is sourced in this process: its Python client is on the path."""
+    return find_spec("rclpy") is not None
+
+
+def ros2(module: str) -> ModuleType:
+    """A module of the ROS 2 client, such as ``rclpy.qos``. Raises :class:`RosError` where none is sourced."""
+    try:
+        return import_module(module)
+    except ImportError as exc:
+        raise RosError(f"{NO_RCLPY} ({exc})") from exc
+
+
+class Session:
+    """One node, spun by a thread of its own from construction to :meth:`close`.
+
+    It has its own context, so that it takes no signal handler, needs no environment variable written for its domain,
+    and neither ends nor is ended by what else in the process uses rclpy.
+
+    Raises:
+        RosError: no ROS 2 is sourced, or its middleware did not start.
+    """
+
+    def __init__(self, name: str, domain_id: int) -> None:
+        rclpy, contexts, executors = ros2("rclpy"), ros2("rclpy.context"), ros2("rclpy.executors")
+        self._rclpy = rclpy
+        self._context = contexts.Context()
+        try:
+            rclpy.init(context=self._context, domain_id=domain_id)
+            self.node = rclpy.create_node(name, context=self._context, use_global_arguments=False)
+            self._executor = executors.SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self.node)
+        except Exception as exc:
+            # Whatever the middleware raises; what has been made so far goes with the context.
+            self._shut()
+            raise RosError(f"ROS 2 could not be joined in domain {domain_id}: {exc}") from exc
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._spin, name=f"rclpy-{name}", daemon=True)
+        self._thread.start()
+
+    def later(self, what: Callable[[], None]) -> None:
+        """Do this on the executor's thread, soon, and log what it raises.
+
+        Requests go out there: a response that is taken before the request is noted would be lost.
+        """
+
+        def run() -> None:
+            try:
+                what()
+            except Exception:
+                logger.exception("A request to the ROS 2 graph failed.")
+
+        self._executor.create_task(run)
+
+    def close(self) -> None:
+        """End the thread and take the node off the graph; not to be called by a callback of this node."""
+        self._done.set()
+        self._thread.join(20 * SPIN_S)
+        self._executor.shutdown(timeout_sec=SPIN_S)
+        self.node.destroy_node()
+        self._shut()
+
+    def _shut(self) -> None:
+        if self._context.ok():
+            self._rclpy.shutdown(context=self._context)
+
+    def _spin(self) -> None:
+        while not self._done.is_set() and self._context.ok():
+            try:
+                self._executor.spin_once(timeout_sec=SPIN_S)
+            except Exception:
+                if self._done.is_set() or not self._context.ok():
+                    return
+                logger.exception("The executor of %s raised; it goes on.", self._thread.name)
+                self._done.wait(SPIN_S)
