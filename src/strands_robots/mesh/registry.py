@@ -14,6 +14,8 @@ from typing import Any
 PEER_TIMEOUT = 10.0
 """Seconds of silence after which a peer is out of reach."""
 
+PAST_MAX = 1024
+
 
 @dataclass(frozen=True, slots=True)
 class PeerInfo:
@@ -61,6 +63,7 @@ class PeerRegistry:
         self._retention = retention
         self._lock = threading.Lock()
         self._rows: dict[str, PeerInfo] = {}
+        self._past: dict[str, float] = {}
 
     def update(
         self,
@@ -77,6 +80,7 @@ class PeerRegistry:
         with self._lock:
             # Taken out and put in again, so that the order of the rows is the order of their last word.
             known = self._rows.pop(peer_id, None)
+            self._past.pop(peer_id, None)
             self._rows[peer_id] = row
             while len(self._rows) > max(1, self._most()):
                 del self._rows[next(iter(self._rows))]
@@ -126,6 +130,7 @@ class PeerRegistry:
     def clear(self) -> None:
         with self._lock:
             self._rows.clear()
+            self._past.clear()
 
     def prune(self, timeout: float = PEER_TIMEOUT) -> list[str]:
         """Drop the rows that were silent for longer than ``timeout`` and the retention; their ids."""
@@ -133,8 +138,17 @@ class PeerRegistry:
         with self._lock:
             gone = [peer for peer, row in self._rows.items() if now - row.seen > limit]
             for peer in gone:
-                del self._rows[peer]
+                self._past[peer] = self._rows.pop(peer).seen
+            while len(self._past) > PAST_MAX:
+                del self._past[next(iter(self._past))]
         return gone
+
+    def heard_within(self, seconds: float) -> set[str]:
+        """Every peer heard of in the last ``seconds``, also those that were dropped for their silence."""
+        now = self._clock()
+        with self._lock:
+            seen = {**self._past, **{peer: row.seen for peer, row in self._rows.items()}}
+        return {peer for peer, at in seen.items() if now - at <= seconds}
 
     def _row(self, peer_id: str) -> PeerInfo | None:
         with self._lock:

@@ -17,6 +17,7 @@ from strands_robots.mesh import dispatch, topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.door import SafetyDoor
 from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.pursuit import KNOWN_S, Pursuit
 from strands_robots.mesh.rpc import Caller
 from strands_robots.mesh.transport.base import Sample, TransportError
 from strands_robots.safety import ed25519
@@ -46,6 +47,7 @@ class FleetSafety:
         self._door = door
         self._caller = caller
         self._lane = lane
+        self._pursuit = Pursuit(context, caller, f"mesh-{context.peer_id}-pursuit")
         self._recent: deque[str] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
@@ -94,6 +96,15 @@ class FleetSafety:
         }
         self._publish_estop(order, counts)
         self._tell("emergency_stop", order.epoch)
+        unreached = (roster | context.registry.heard_within(KNOWN_S)) - {
+            str(each["responder_id"]) for each in responses
+        }
+        self._pursuit.begin(
+            order.epoch,
+            unreached,
+            lambda: order.epoch in self._door.epochs(),
+            lambda: self._publish_estop(order, counts),
+        )
         context.audit.always(
             "emergency_stop",
             estop_id=order.epoch,

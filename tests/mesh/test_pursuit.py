@@ -1,0 +1,62 @@
+"""An emergency stop follows those who missed it."""
+
+from __future__ import annotations
+
+import time
+
+from fixtures.mesh_robots import Arm
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet
+
+from strands_robots.mesh.core import Mesh
+
+
+def cut_off(peers: Fleet) -> tuple[Mesh, Mesh, Arm]:
+    """A console that issued a stop while one arm was parted from everybody."""
+    arm = Arm()
+    console, far = peers.join(None, "console"), peers.join(arm, "arm-1")
+    peers.bus.partition(peers.transports["arm-1"])
+    console.emergency_stop()
+    assert far.lockout_epoch is None
+    return console, far, arm
+
+
+def test_a_robot_that_was_cut_off_is_stopped_and_locked_when_it_is_back(peers: Fleet) -> None:
+    console, far, arm = cut_off(peers)
+    assert peers.events("emergency_stop")[0]["silent"] == ["arm-1"]
+    peers.bus.partition(peers.transports["arm-1"], cut=False)
+    peers.meet()
+    eventually(lambda: far.lockout_epoch == console.lockout_epoch, within=3)
+    eventually(lambda: arm.halts, within=2)
+
+
+def test_a_robot_that_was_dropped_from_the_roster_is_not_forgotten(peers: Fleet) -> None:
+    arm = Arm()
+    console, far = peers.join(None, "console"), peers.join(arm, "arm-1")
+    peers.bus.partition(peers.transports["arm-1"])
+    peers.clock.pass_(60)
+    eventually(lambda: console.peers == [], within=3, what="the silent arm is dropped")
+    console.emergency_stop()
+    peers.bus.partition(peers.transports["arm-1"], cut=False)
+    peers.meet()
+    eventually(lambda: far.lockout_epoch == console.lockout_epoch, within=3)
+
+
+def test_nobody_is_pursued_once_the_stop_was_cleared(peers: Fleet) -> None:
+    _, far, arm = cut_off(peers)
+    peers.planes["console"].clear_local("operator")
+    peers.bus.partition(peers.transports["arm-1"], cut=False)
+    peers.meet()
+    # Longer than two rounds of the pursuit.
+    time.sleep(1.3)
+    assert far.lockout_epoch is None
+    assert arm.halts == []
+
+
+def test_a_newcomer_is_not_pursued(peers: Fleet) -> None:
+    cut_off(peers)
+    late = Arm()
+    mesh = peers.join(late, "arm-2")
+    time.sleep(1.3)
+    assert mesh.lockout_epoch is None
+    assert late.halts == []
