@@ -16,7 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 FLOORS: list[set[str]] = [
     {"envelope", "settings", "utils", "_mesh_switch"},
     {"safety", "audit", "contract"},
-    {"policies", "rollout", "teleop", "teleop_mixin", "leaders", "recording"},
+    {"policies", "rollout", "teleop", "teleop_mixin", "leaders", "recording", "cameras"},
     {
         "hardware",
         "simulation",

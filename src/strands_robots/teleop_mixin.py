@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.rollout import STOP_JOIN_S, Body, Rollout
+from strands_robots.rollout import STOP_JOIN_S, Body, Observers, Rollout
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.teleop import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
@@ -42,6 +42,8 @@ class TeleopMixin:
 
     gate: MotionGate
     starting: AbstractContextManager[Any]
+    observers: Observers
+    """Who is told of teleoperations, as of tasks."""
     input_sink: InputSink | None = None
     """Where frames go when ``publish`` is asked for; a network that carries input streams sets it."""
 
@@ -198,6 +200,7 @@ class TeleopMixin:
             policy_name="teleoperation",
             duration=seconds,
             hz=rate,
+            observers=self.observers,
         )
         self._teleop_sessions[name] = (session, policy)
         session.start()

@@ -12,7 +12,8 @@ import typer
 from strands_robots.cli.command import command
 from strands_robots.cli.fleet import reached
 from strands_robots.cli.network import Network
-from strands_robots.cli.output import Failure, Screen, table
+from strands_robots.cli.output import Failure, Screen
+from strands_robots.cli.recorded import lossless, told
 from strands_robots.cli.teleop import arm_options, drive, recorded
 from strands_robots.recording import Recorder
 from strands_robots.utils import number
@@ -45,12 +46,9 @@ def record(
         screen.say(f"Recording {', '.join(devices)} into {out}. Ctrl-C ends it.")
         with contextlib.suppress(KeyboardInterrupt):
             _wait(screen, recorder, longest)
-    counts = dict(recorder.counts)
-    screen.data({"event": "recorded", "file": str(out), "messages": counts, "lost": recorder.lost})
-    screen.show(table("", ("channel", "messages"), sorted(counts.items())))
-    if recorder.lost:
-        raise Failure(f"{recorder.lost} events were lost: the disk was too slow.")
-    if not counts:
+    told(screen, recorder)
+    lossless(recorder)
+    if not recorder.counts:
         raise Failure(f"Nothing was heard of {', '.join(devices)}; {out} is empty.")
 
 

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,6 +17,7 @@ from strands_robots.cli.command import command
 from strands_robots.cli.mesh import serve_on_mesh
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Failure, Screen, label, plain, table
+from strands_robots.cli.recorded import recorded
 from strands_robots.cli.words import assignments
 from strands_robots.envelope import text_of
 from strands_robots.utils import device_id, number
@@ -58,6 +60,12 @@ def serve(
         str | None, _allow("--command-allow", "Verbs approved on real hardware: verb or verb@peer.")
     ] = None,
     state_hz: Annotated[float | None, typer.Option("--state-hz", help="stateUpdate events a second, idle.")] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Also record joints, pictures and events: a new .mcap file.")
+    ] = None,
+    record_cameras: Annotated[
+        str | None, typer.Option("--record-cameras", help="Which cameras: names with commas, or none.", metavar="LIST")
+    ] = None,
     on_mesh: Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")] = False,
     until_stdin_closes: Annotated[bool, typer.Option("--until-stdin-closes", hidden=True)] = False,
 ) -> None:
@@ -79,10 +87,11 @@ def serve(
     chosen = assignments(options or []) | ({} if host is None else {"host": host})
     body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
     try:
-        if link is None:
-            serve_on_mesh(screen, body, wanted, mode)
-        else:
-            _serve(screen, network, link, body, wanted=wanted, piped=until_stdin_closes)
+        with recorded(screen, body, wanted or str(body.tool_name_str), record, record_cameras):
+            if link is None:
+                serve_on_mesh(screen, body, wanted, mode)
+            else:
+                _serve(screen, network, link, body, wanted=wanted, piped=until_stdin_closes)
     finally:
         cleanup = getattr(body, "cleanup", None)
         if callable(cleanup):

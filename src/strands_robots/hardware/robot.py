@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -84,8 +85,9 @@ class HardwareRobot(Tasks):
     def get_state(self) -> Envelope:
         """``joints`` by name in the device's unit, ``joints_age_s``, and ``task``.
 
-        The read waits its turn on the bus for at most a control period; then the joints are those of the last
-        read, and ``joints_error`` says why. A camera that fails does not touch them.
+        While a loop drives the robot the joints are those of its last read, which is not a control period old. The
+        read waits its turn on the bus for at most a control period; then the joints are those of the last read, and
+        ``joints_error`` says why. A camera that fails does not touch them.
         """
         problem = self._refresh(1 / self.control_hz)
         age, joints = self._body.latest_joints or (None, {})
@@ -98,6 +100,14 @@ class HardwareRobot(Tasks):
     def get_observation(self) -> dict[str, Any]:
         """Everything the device sees, images included, in its turn on the bus. Raises what the device raises."""
         return self._body.get_observation()
+
+    def camera_frames(self) -> dict[str, Any]:
+        """The newest picture of each of the device's cameras, RGB (height, width, 3), without the bus.
+
+        Raises what a camera raises.
+        """
+        cameras = getattr(self.device, "cameras", None)
+        return {str(name): _picture(camera) for name, camera in (cameras or {}).items()}
 
     def send_action(self, action: Mapping[str, float]) -> Envelope:
         """Set targets once; ``sent`` is what the device really took. Refused while a task or a leader drives it."""
@@ -163,6 +173,9 @@ class HardwareRobot(Tasks):
             return "The device is not connected."
         if self._body.lost:
             return "The device's port is gone; these are the joints of the last read."
+        age, _ = self._body.latest_joints or (math.inf, {})
+        if age < within_s and (self.teleoperating() or (self._task is not None and self._task.running)):
+            return ""
         if not self._body.lock.acquire(timeout=within_s):
             return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
         try:
@@ -178,6 +191,12 @@ class HardwareRobot(Tasks):
 def _unfrozen(problem: str, moving: tuple[str, ...]) -> StopVerdict:
     """What moved may move on; of a robot that stood still nobody knows."""
     return StopVerdict(not_stopped=dict.fromkeys(moving, problem), unknown={} if moving else {"bus": problem})
+
+
+def _picture(camera: Any) -> Any:
+    """LeRobot's cameras keep the newest picture of a thread of their own; older ones only hand out new ones."""
+    newest = getattr(camera, "read_latest", None)
+    return newest() if callable(newest) else camera.async_read()
 
 
 def _kind(feature: Any) -> Any:

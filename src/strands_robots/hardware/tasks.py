@@ -40,7 +40,7 @@ class Tasks(TeleopMixin):
         self.starting = threading.RLock()
         self._body = body
         self._freezer = Freezer(body)
-        self._observers = Observers()
+        self.observers = Observers()
         self._task: Rollout | None = None
 
     def body(self, robot_name: str | None = None) -> DeviceBody:
@@ -51,7 +51,7 @@ class Tasks(TeleopMixin):
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
         """Tell ``observer`` of every task event until the returned callable is called."""
-        return self._observers.subscribe(observer)
+        return self.observers.subscribe(observer)
 
     def start_task(
         self,
@@ -153,7 +153,7 @@ class Tasks(TeleopMixin):
                 policy_name=name,
                 duration=seconds,
                 hz=self.control_hz,
-                observers=self._observers,
+                observers=self.observers,
             )
             self._task = rollout
             rollout.start()

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
+from strands_robots.cameras import Frames, frames_of
 from strands_robots.contract import WorldRobot
 from strands_robots.mesh import camera, session, topics
 from strands_robots.mesh.context import Context
@@ -111,7 +112,7 @@ class Assembled:
         every("state", rates["state"].rate_hz, self._publish_state)
         every("tokens", TOKENS_HZ, self.herald.judge_tokens, quick=True)
         every("prune", PRUNE_HZ, self._prune, quick=True)
-        frames = camera.frames_of(self.mesh.robot)
+        frames = frames_of(self.mesh.robot)
         if frames is not None:
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), lambda: self._publish_frames(frames))
         self.scheduler.start()
@@ -145,7 +146,7 @@ class Assembled:
         if body is not None:
             self.context.put(topics.state(self.context.peer_id), body)
 
-    def _publish_frames(self, frames: camera.Frames) -> None:
+    def _publish_frames(self, frames: Frames) -> None:
         camera.publish_frames(self.context, frames)
 
     def _prune(self) -> None:

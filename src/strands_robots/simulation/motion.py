@@ -34,12 +34,12 @@ class Rollouts(Pictures, TeleopMixin):
 
     def __init__(self, plan: Plan, *, realtime: bool) -> None:
         super().__init__(plan, realtime=realtime)
-        self._observers = Observers()
+        self.observers = Observers()
         self._rollouts: dict[str, Rollout] = {}
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
         """Tell ``observer`` of every rollout event until the returned callable is called."""
-        return self._observers.subscribe(observer)
+        return self.observers.subscribe(observer)
 
     @answered
     def start_policy(
@@ -139,7 +139,7 @@ class Rollouts(Pictures, TeleopMixin):
                 policy_name=provider,
                 duration=seconds,
                 hz=settings.number("STRANDS_CONTROL_HZ"),
-                observers=self._observers,
+                observers=self.observers,
             )
             self._rollouts[body.name] = rollout
             rollout.start()

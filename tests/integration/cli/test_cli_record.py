@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from fixtures.waiting import free_port
+from fixtures.waiting import eventually, free_port
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
-from strands_robots.recording import read_entries
+from strands_robots.recording import Entry, read_entries, read_items, recorded_actions
 from strands_robots.simulation import Simulation
 
 pytest.importorskip("mcap")
+
+COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
 
 def test_what_an_arm_did_is_recorded_and_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,6 +44,34 @@ def test_what_an_arm_did_is_recorded_and_done_again(tmp_path: Path, monkeypatch:
     assert again.exit_code == 0, again.output
     told = json.loads(again.stdout.splitlines()[-1])
     assert (told["state"], told["stopped"], told["errors"]) == ("completed", True, 0)
+
+
+def test_who_serves_an_arm_records_it_also_while_it_stands(tmp_path: Path) -> None:
+    run, port = tmp_path / "run.mcap", str(free_port())
+    line = [*COMMAND, "serve", "so100", "--port", port, "--peer-id", "sim-1", "--record", str(run), "--json"]
+    serving = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
+    try:
+        assert serving.stdout is not None
+        assert json.loads(serving.stdout.readline())["event"] == "serving"
+        moved = CliRunner().invoke(
+            build(), ["call", "sim-1", "execute", "instruction=wave", "duration=20", "--port", port, "--json"]
+        )
+        assert moved.exit_code == 0, moved.output
+        eventually(lambda: run.stat().st_size > 30_000, within=20)
+        serving.send_signal(signal.SIGINT)
+        rest = [json.loads(text) for text in serving.communicate(timeout=20)[0].splitlines()]
+    finally:
+        serving.kill()
+        serving.wait()
+    told = next(each for each in rest if each["event"] == "recorded")
+    assert told["lost"] == 0
+    assert told["messages"]["/sim-1/so100/joint_states"] > 20
+    assert told["messages"]["/sim-1/policyStarted"] == 1
+    assert told["messages"]["/sim-1/halted"] >= 1
+    items = list(read_items(run))
+    ended = [item for item in items if isinstance(item, Entry) and item.event == "policyComplete"]
+    assert [entry.payload["state"] for entry in ended] == ["stopped"]
+    assert recorded_actions(run)
 
 
 def test_nothing_heard_is_a_failure_and_not_an_empty_success(tmp_path: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import pytest
 
-from strands_robots.recording import CHUNK_BYTES, Recorder, read_entries, recorded_actions
+from strands_robots.recording import CHUNK_BYTES, Joints, Picture, Recorder, read_entries, read_items, recorded_actions
 from strands_robots.utils import ValidationError
 
 pytest.importorskip("mcap")
@@ -42,6 +43,46 @@ def test_a_file_that_was_cut_off_is_read_to_the_cut(tmp_path: Path, share: float
     assert recorded_actions(path)
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_pictures_and_joints_of_a_file_that_was_cut_off_are_whole_to_the_cut(tmp_path: Path, share: float) -> None:
+    path = tmp_path / "run.mcap"
+    pictures = [random.Random(number).randbytes(6000) for number in range(60)]
+    with Recorder(path) as recorder:
+        for number, picture in enumerate(pictures):
+            recorder.take_joints("arm-1", {"pan": float(number)})
+            recorder.take_picture("arm-1", "front", picture)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    items = list(read_items(path))
+    kept = [item.jpeg for item in items if isinstance(item, Picture)]
+    joints = [item.joints for item in items if isinstance(item, Joints)]
+    assert kept == pictures[: len(kept)]
+    assert len(kept) > 60 * share - 2 * CHUNK_BYTES / 6000 - 2
+    assert joints == [{"pan": float(number)} for number in range(len(joints))]
+    assert len(joints) >= len(kept)
+
+
+def test_joints_of_events_are_joint_states_and_what_happened_is_a_log_line(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        recorder.take("arm-1", "streamStep", {"observation": {"pan.pos": 1.0, "name": "x"}, "action": {}})
+        recorder.take("sim-1", "observationUpdate", {"robot_name": "left", "joints": {"pan": 2.0}})
+        recorder.take("arm-1", "taskComplete", {"state": "error", "error": "no bus"})
+    assert [(item.device, item.joints) for item in read_items(path) if isinstance(item, Joints)] == [
+        ("arm-1", {"pan.pos": 1.0}),
+        ("sim-1/left", {"pan": 2.0}),
+    ]
+    assert recorder.counts["/arm-1/log"] == 1
+    assert set(recorder.counts) == {
+        "/arm-1/streamStep",
+        "/arm-1/joint_states",
+        "/sim-1/observationUpdate",
+        "/sim-1/left/joint_states",
+        "/arm-1/taskComplete",
+        "/arm-1/log",
+    }
+
+
 def test_actions_lead_and_a_device_is_named_where_there_are_several(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", 10, "arm-1", "arm-2")
     frames = recorded_actions(path, "arm-2")
@@ -62,5 +103,7 @@ def test_a_recording_is_never_overwritten_and_other_files_are_refused(tmp_path: 
     (tmp_path / "text.mcap").write_text("no recording at all, only words", encoding="utf-8")
     with pytest.raises(ValidationError, match="no recording"):
         list(read_entries(tmp_path / "text.mcap"))
+    with pytest.raises(ValidationError, match="cannot be written"), Recorder(tmp_path / "none" / "run.mcap"):
+        pass
     with pytest.raises(ValidationError, match="cannot be read"):
         list(read_entries(tmp_path / "none.mcap"))

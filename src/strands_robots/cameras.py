@@ -1,0 +1,81 @@
+"""What a robot sees: its cameras by name, and a picture as JPEG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from strands_robots.contract import WorldRobot
+from strands_robots.utils import ValidationError, missing_extra, shown
+
+QUALITY = 80
+
+OVERVIEW = "overview"
+"""The camera that every simulated world has."""
+
+Frames = Callable[[], Mapping[str, Any]]
+"""Gives height x width x 3 arrays of uint8 by camera name."""
+
+
+def frames_of(robot: Any) -> Frames | None:
+    """How to take a picture with each of a robot's cameras; None for one without.
+
+    A robot's own ``camera_frames()`` comes first, then a simulation's ``render``, then the pictures in a device's
+    ``get_observation()``. A camera ``arm/wrist`` is called ``arm.wrist`` on the wire, which allows no slash.
+    """
+    body = getattr(robot, "wrapped", robot)
+    own, render, observe = (getattr(body, verb, None) for verb in ("camera_frames", "render", "get_observation"))
+    if callable(own):
+        return lambda: dict(own())
+    if isinstance(robot, WorldRobot) and callable(render):
+        return lambda: {str(name).replace("/", "."): render(name) for name in robot.get_features().get("cameras", ())}
+    if callable(observe):
+        return lambda: {str(name): value for name, value in observe().items() if getattr(value, "ndim", 0) == 3}
+    return None
+
+
+def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
+    """The same of some cameras.
+
+    Args:
+        robot: whose cameras.
+        names: which; None means all of a real robot, and of a simulated world the robots' own (such as ``wrist``) or,
+            where they have none, the overview: drawing costs more than seeing.
+
+    Raises:
+        ValidationError: a simulated world has no camera of that name.
+    """
+    render = getattr(robot, "render", None)
+    if not isinstance(robot, WorldRobot) or not callable(render):
+        frames = frames_of(robot)
+        if frames is None or names is None:
+            return frames
+        return lambda: {name: picture for name, picture in frames().items() if name in names}
+    features = robot.get_features()
+    known = [str(name) for name in features.get("cameras", ())]
+    own = [name for name in known if "/" in name] or [OVERVIEW]
+    wanted = own if names is None else list(names)
+    for name in wanted:
+        if name not in known:
+            raise ValidationError(f"camera must be one of {', '.join(known)}, not {shown(name)}.")
+    return lambda: {name.replace("/", "."): render(name) for name in wanted}
+
+
+def jpeg(name: str, pixels: Any) -> bytes:
+    """One picture of the camera ``name`` as JPEG.
+
+    Raises:
+        ValidationError: ``pixels`` is no height x width x 3 array of uint8.
+        MissingExtraError: Pillow is not installed.
+    """
+    shape = tuple(getattr(pixels, "shape", ()))
+    if len(shape) != 3 or shape[2] != 3 or str(getattr(pixels, "dtype", "")) != "uint8":
+        raise ValidationError(f"a frame of {name} must be height x width x 3 of uint8, not {shape}.")
+    try:
+        from PIL import Image  # noqa: PLC0415 - optional, loaded when a picture is taken
+    except ImportError:
+        raise missing_extra("Encoding camera frames", "record") from None
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="JPEG", quality=QUALITY)
+    return buffer.getvalue()

@@ -1,0 +1,35 @@
+"""Recordings of robots, in an MCAP file that Foxglove and Rerun open.
+
+| channel | schema | what |
+|---|---|---|
+| ``/DEVICE/EVENT`` | JSON | every event as it came |
+| ``/DEVICE[/ROBOT]/joint_states`` | ``sensor_msgs/msg/JointState`` | joints, in the robot's own units |
+| ``/DEVICE/camera/CAMERA`` | ``foxglove.CompressedImage`` | pictures, JPEG |
+| ``/DEVICE/log`` | ``foxglove.Log`` | one line an event that is not steady: tasks, stops, locks |
+"""
+
+from __future__ import annotations
+
+from strands_robots.recording.actions import recorded_actions
+from strands_robots.recording.file import (
+    CHUNK_BYTES,
+    Entry,
+    Joints,
+    Picture,
+    Recorder,
+    read_entries,
+    read_items,
+)
+from strands_robots.recording.sampling import RobotRecording
+
+__all__ = [
+    "CHUNK_BYTES",
+    "Entry",
+    "Joints",
+    "Picture",
+    "Recorder",
+    "RobotRecording",
+    "read_entries",
+    "read_items",
+    "recorded_actions",
+]

@@ -1,0 +1,142 @@
+"""Recording a robot in the process that serves it: joints also while it stands, pictures, tasks, halts and locks."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Self
+
+from strands_robots.cameras import Frames, jpeg
+from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot, adapt
+from strands_robots.envelope import text_of
+from strands_robots.policies.actions import numbers
+from strands_robots.recording.file import STEP, Recorder
+from strands_robots.utils import number
+
+logger = logging.getLogger(__name__)
+
+JOINTS_HZ, CAMERAS_HZ, LOOKS_HZ = 50.0, 15.0, 50.0
+"""How often joints are read, pictures taken, and the gate is looked at for halts and locks."""
+
+
+class RobotRecording:
+    """Writes what a robot does to ``recorder`` while it is entered as a context.
+
+    What cannot be read is told once in the log and once in the recording, as the event ``notRecorded``, and is asked
+    for again at the next beat. A beat that is missed is left out.
+
+    Args:
+        robot: behind the contract, or an object that :func:`~strands_robots.contract.adapt` makes fit.
+        recorder: entered, made with ``joints_of_events=False``.
+        device: what the robot is called in the recording.
+        frames: takes its pictures; None for none.
+        joints_hz: 1 to 200.
+        cameras_hz: 0.1 to 60.
+
+    Raises:
+        ValidationError: a rate outside its domain, or an object that is no robot.
+    """
+
+    def __init__(
+        self,
+        robot: Any,
+        recorder: Recorder,
+        device: str,
+        *,
+        frames: Frames | None = None,
+        joints_hz: float = JOINTS_HZ,
+        cameras_hz: float = CAMERAS_HZ,
+    ) -> None:
+        self._robot = robot if isinstance(robot, WorldRobot) else adapt(robot)
+        self._recorder = recorder
+        self._device = device
+        self._frames = frames
+        self._ending = threading.Event()
+        self._problems: dict[str, str] = {}
+        self._generation = self._robot.gate.generation
+        self._lock = ""
+        works: list[tuple[str, float, Callable[[], None]]] = [
+            ("joints", number("joints_hz", joints_hz, low=1, high=200), self._joints),
+            ("gate", LOOKS_HZ, self._look),
+        ]
+        if frames is not None:
+            works.append(("cameras", number("cameras_hz", cameras_hz, low=0.1, high=60), self._pictures))
+        self._threads = [
+            threading.Thread(target=partial(self._paced, name, hz, work), name=f"record-{name}", daemon=True)
+            for name, hz, work in works
+        ]
+        self._unsubscribe: Unsubscribe = lambda: None
+
+    def __enter__(self) -> Self:
+        self._unsubscribe = self._robot.subscribe(self._tell)
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._look()
+        self._ending.set()
+        for thread in self._threads:
+            thread.join()
+        self._unsubscribe()
+
+    def _paced(self, what: str, hz: float, work: Callable[[], None]) -> None:
+        began, beat = time.monotonic(), 0
+        while not self._ending.wait(max(0.0, began + beat / hz - time.monotonic())):
+            try:
+                work()
+            except Exception as exc:  # noqa: BLE001 - a robot's read raises what it likes; the recording goes on
+                self._note(what, f"{type(exc).__name__}: {exc}")
+            else:
+                self._problems.pop(what, None)
+            beat = max(beat + 1, int((time.monotonic() - began) * hz))
+
+    def _joints(self) -> None:
+        told = self._robot.get_state()
+        if isinstance(self._robot, WorldRobot):
+            for name, joints in (told.get("robots") or {}).items():
+                self._recorder.take_joints(f"{self._device}/{name}", numbers(joints))
+            return
+        if told.get("joints_error"):
+            raise ConnectionError(told["joints_error"])
+        self._recorder.take_joints(self._device, numbers(told.get("joints") or {}))
+
+    def _pictures(self) -> None:
+        for camera, pixels in self._frames().items() if self._frames is not None else ():
+            self._recorder.take_picture(self._device, camera, jpeg(camera, pixels))
+
+    def _look(self) -> None:
+        gate = self._robot.gate
+        if gate.generation != self._generation:
+            self._generation = gate.generation
+            self._recorder.take(self._device, "halted", {"generation": self._generation})
+        refusal = gate.refusal("motion")
+        lock = "" if refusal is None else text_of(refusal)
+        if lock != self._lock:
+            self._lock = lock
+            self._recorder.take(self._device, "locked" if lock else "unlocked", {"reason": lock} if lock else {})
+
+    def _note(self, what: str, problem: str) -> None:
+        if self._problems.get(what) != problem:
+            self._problems[what] = problem
+            logger.warning("%s: its %s are not recorded: %s", self._device, what, problem)
+            self._recorder.take(self._device, "notRecorded", {"what": what, "error": problem})
+
+    def _tell(self, event: RolloutEvent) -> None:
+        """Under the names and with the fields that the events of a device have on Device Connect."""
+        world = isinstance(self._robot, WorldRobot)
+        whose = {"robot_name": event.robot} if world else {}
+        kind = "policy" if world else "task"
+        if event.kind == "step":
+            told = {"step": event.step, "observation": dict(event.observation), "action": dict(event.action)}
+            self._recorder.take(self._device, STEP, {**told, **whose})
+        elif event.kind == "started":
+            told = {"instruction": event.instruction, "policy_provider": event.policy}
+            self._recorder.take(self._device, f"{kind}Started", {**told, **whose})
+        else:
+            told = {"instruction": event.instruction, "steps": event.step, "duration": event.elapsed_s}
+            told |= {"state": event.state, "error": event.error}
+            self._recorder.take(self._device, f"{kind}Complete", {**told, **whose})

@@ -1,0 +1,133 @@
+"""A served robot is recorded where it is served: while it stands, while it moves, halted and locked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fixtures.devices import RecordingDevice
+from fixtures.waiting import eventually
+
+from strands_robots.cameras import chosen_frames, frames_of
+from strands_robots.envelope import Envelope, error
+from strands_robots.hardware import HardwareRobot
+from strands_robots.recording import Entry, Joints, Picture, Recorder, RobotRecording, read_items
+from strands_robots.simulation import Simulation
+from strands_robots.teleop import ScriptedLeader
+from strands_robots.utils import ValidationError
+
+pytest.importorskip("mcap")
+
+
+class Camera:
+    """A camera that keeps its newest picture, as LeRobot's do."""
+
+    def __init__(self) -> None:
+        self.broken = False
+        self.looks = 0
+
+    def read_latest(self) -> Any:
+        self.looks += 1
+        if self.broken:
+            raise TimeoutError("no frame in 200 ms")
+        return np.full((24, 32, 3), self.looks % 256, dtype=np.uint8)
+
+
+class SeeingDevice(RecordingDevice):
+    def __init__(self) -> None:
+        super().__init__()
+        self.cameras = {"front": Camera()}
+
+
+class Latch:
+    def __init__(self) -> None:
+        self.locked = False
+
+    def refusal(self, verb: str) -> Envelope | None:
+        return error("locked by the emergency stop e-1") if self.locked else None
+
+
+@pytest.fixture
+def arm() -> Any:
+    robot = HardwareRobot(SeeingDevice(), "arm", control_hz=50)
+    robot.connect()
+    yield robot
+    robot.cleanup()
+
+
+def events(path: Path) -> list[str]:
+    return [item.event for item in read_items(path) if isinstance(item, Entry)]
+
+
+def test_an_idle_arm_gives_joints_and_pictures(arm: HardwareRobot, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with (
+        Recorder(path, joints_of_events=False) as recorder,
+        RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
+    ):
+        eventually(lambda: recorder.counts["/arm-1/joint_states"] >= 25)
+        eventually(lambda: recorder.counts["/arm-1/camera/front"] >= 5)
+    items = list(read_items(path))
+    assert next(item for item in items if isinstance(item, Joints)).joints == arm.get_state()["joints"]
+    assert next(item for item in items if isinstance(item, Picture)).jpeg[:2] == b"\xff\xd8"
+    assert events(path) == []
+
+
+def test_a_task_its_halt_and_the_lock_are_told_in_their_order(arm: HardwareRobot, tmp_path: Path) -> None:
+    path, latch = tmp_path / "run.mcap", Latch()
+    arm.gate.attach(latch)
+    with Recorder(path, joints_of_events=False) as recorder, RobotRecording(arm, recorder, "arm-1"):
+        arm.start_task("wave", duration=20)
+        eventually(lambda: recorder.counts["/arm-1/streamStep"] > 5)
+        latch.locked = True
+        arm.halt("test")
+        eventually(lambda: recorder.counts["/arm-1/locked"] == 1)
+        latch.locked = False
+        eventually(lambda: recorder.counts["/arm-1/unlocked"] == 1)
+    told = [event for event in events(path) if event != "streamStep"]
+    assert told[0] == "taskStarted"
+    assert set(told[1:-1]) == {"taskComplete", "halted", "locked"}
+    assert told[-1] == "unlocked"
+
+
+def test_a_teleoperation_is_recorded_as_a_task_is(arm: HardwareRobot, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path, joints_of_events=False) as recorder, RobotRecording(arm, recorder, "arm-1"):
+        arm.attach_teleop(ScriptedLeader({"pan.pos": (0.0, 10.0, 1.0)}))
+        assert arm.teleoperate(duration=0.3)["status"] == "success"
+        eventually(lambda: recorder.counts["/arm-1/taskComplete"] == 1)
+    first = next(item for item in read_items(path) if isinstance(item, Entry) and item.event == "streamStep")
+    assert set(first.payload["action"]) == {"pan.pos"}
+
+
+def test_a_camera_that_fails_is_told_once_and_the_joints_go_on(arm: HardwareRobot, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    arm.device.cameras["front"].broken = True
+    with (
+        Recorder(path, joints_of_events=False) as recorder,
+        RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
+    ):
+        eventually(lambda: arm.device.cameras["front"].looks > 5)
+        eventually(lambda: recorder.counts["/arm-1/joint_states"] >= 10)
+    assert events(path) == ["notRecorded"]
+
+
+def test_a_world_records_each_of_its_robots(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    world = Simulation("bench")
+    world.add_robot("left", "so100")
+    world.add_robot("right", "so100", position=(0.0, 0.5, 0.0))
+    try:
+        with Recorder(path, joints_of_events=False) as recorder, RobotRecording(world, recorder, "sim-1"):
+            world.start_policy("left", "wave", duration=20)
+            eventually(lambda: recorder.counts["/sim-1/streamStep"] > 5)
+            eventually(lambda: recorder.counts["/sim-1/right/joint_states"] > 5)
+            world.halt("test")
+            eventually(lambda: recorder.counts["/sim-1/policyComplete"] == 1)
+        with pytest.raises(ValidationError, match="overview"):
+            chosen_frames(world, ["nobody"])
+    finally:
+        world.cleanup()
+    assert recorder.counts["/sim-1/left/joint_states"] > 5
