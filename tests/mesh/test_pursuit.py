@@ -16,7 +16,9 @@ def cut_off(peers: Fleet) -> tuple[Mesh, Mesh, Arm]:
     arm = Arm()
     console, far = peers.join(None, "console"), peers.join(arm, "arm-1")
     peers.bus.partition(peers.transports["arm-1"])
+    peers.clock.pass_(1)
     console.emergency_stop()
+    peers.clock.pass_(1)
     assert far.lockout_epoch is None
     return console, far, arm
 

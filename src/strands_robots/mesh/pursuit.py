@@ -53,8 +53,9 @@ class Pursuit:
     def _run(
         self, over: threading.Event, epoch: str, left: set[str], held: Callable[[], bool], publish: Callable[[], None]
     ) -> None:
+        began = self._context.monotonic()
         while left and not over.wait(EVERY_S) and self._context.transport is not None and held():
-            back = sorted(peer for peer in left if self._in_reach(peer))
+            back = sorted(peer for peer in left if self._heard_since(began, peer))
             if back:
                 publish()
             for peer in back:
@@ -65,6 +66,6 @@ class Pursuit:
                     left.discard(peer)
                     logger.warning("%s was out of reach and has answered emergency stop %s now.", peer, epoch)
 
-    def _in_reach(self, peer: str) -> bool:
-        row = self._context.registry.get(peer)
+    def _heard_since(self, began: float, peer: str) -> bool:
+        row = self._context.registry.get(peer, self._context.monotonic() - began)
         return row is not None and bool(row["reachable"])
