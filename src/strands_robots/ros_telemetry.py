@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import logging
 import re
+import threading
+import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
+from strands_robots import settings
 from strands_robots.envelope import is_error, text_of
+from strands_robots.ros.link import Heard, Message, Unwatch
+from strands_robots.ros.names import node_name as checked_node_name
+from strands_robots.ros.rclpy_link import MAX_QOS_HISTORY_DEPTH, RclpyLink
 from strands_robots.utils import ValidationError, flag, number, shown, text, whole
+
+__all__ = ["MAX_QOS_HISTORY_DEPTH", "RosTelemetryBase", "RosTelemetryBridge", "checked_limits", "refuse_unsecured"]
 
 logger = logging.getLogger(__name__)
 
 DOMAIN_MAX = 232
+INSECURE = "STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 IMAGE = "sensor_msgs/msg/Image"
 
@@ -43,8 +52,40 @@ def checked_limits(limits: object) -> Limits:
     return checked
 
 
+class TelemetryLink(Protocol):
+    """What a bridge asks of the road to its graph."""
+
+    def tell(self, topic: str, kind: str, fields: Message) -> None:
+        """Publish for whoever cares."""
+
+    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+        """Tell ``heard`` of every message."""
+
+    def close(self) -> None:
+        """Leave the graph."""
+
+
+def refuse_unsecured(why: str | None) -> None:
+    """Refuse commands from a graph on which anybody could drive the robot, unless somebody insists.
+
+    Args:
+        why: what the graph lacks; None where it is secured.
+
+    Raises:
+        ValidationError: it is not secured, and ``STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE`` is not set.
+    """
+    if why is not None and not settings.boolean(INSECURE):
+        raise ValidationError(
+            f"enable_commands must be false on an unsecured ROS 2 graph, where anybody could drive the robot: {why} "
+            f"Set {INSECURE}=1 to take commands all the same."
+        )
+
+
 class RosTelemetryBase:
     """The transport-independent half of a bridge.
+
+    The newest command is taken once a period; older ones are dropped. A command is dropped whole when a joint is out of
+    its range, when lengths differ, when a joint is named twice, or when a value is no number.
 
     Args:
         robot: drives on inbound commands by its ``send_action``; None for a bridge that only publishes.
@@ -52,6 +93,7 @@ class RosTelemetryBase:
         enable_commands: whether inbound commands are taken at all.
         command_robot_name: whose ``joint_command`` is taken; the robot's own name by default.
         period: seconds between two looks for a command, above 0; ``period_name`` is the caller's word for it.
+        joint_limits: ``{"<motor>.pos": (min, max)}`` in the robot's unit; what is not named is not limited here.
 
     Raises:
         ValidationError: an argument outside its domain, before anything else has happened.
@@ -66,6 +108,7 @@ class RosTelemetryBase:
         command_robot_name: str | None,
         period: float,
         period_name: str,
+        joint_limits: dict[str, tuple[float, float]] | None = None,
     ) -> None:
         self._takes_commands = flag("enable_commands", enable_commands) and robot is not None
         self.domain_id = whole("domain_id", domain_id, low=0, high=DOMAIN_MAX)
@@ -75,7 +118,44 @@ class RosTelemetryBase:
         self._robot = robot
         own = str(getattr(robot, "tool_name_str", "") or "robot")
         self.command_topic = f"/{segment(own if command_robot_name is None else command_robot_name)}/joint_command"
-        self._limits: Limits = {}
+        self._limits = checked_limits(joint_limits)
+        self._latest: Message | None = None
+        self._done = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._link: TelemetryLink | None = None
+
+    def publish_joint_states(self, robot: str, names: list[str], positions: list[float]) -> None:
+        """Publish joint positions in the robot's own unit; lists of different length are dropped with a warning."""
+        if len(names) != len(positions):
+            logger.warning("%d names and %d positions of %s are not published.", len(names), len(positions), robot)
+            return
+        fields = {"header": _header(), "name": list(names), "position": [float(each) for each in positions]}
+        self._tell(self.joint_states_topic(robot), JOINT_STATE, fields)
+
+    def publish_image(self, robot: str, camera: str, image: Any) -> None:
+        """Publish one RGB picture of shape (height, width, 3) and type uint8; any other is dropped with a warning."""
+        shape = tuple(getattr(image, "shape", ()))
+        if len(shape) != 3 or shape[2] != 3 or str(getattr(image, "dtype", "")) != "uint8":
+            logger.warning("An image of %s must have shape (height, width, 3) and type uint8; not published.", camera)
+            return
+        fields = {
+            "header": _header(camera),
+            "height": int(shape[0]),
+            "width": int(shape[1]),
+            "encoding": "rgb8",
+            "step": 3 * int(shape[1]),
+            "data": image.tobytes(),
+        }
+        self._tell(self.image_topic(robot, camera), IMAGE, fields)
+
+    def shutdown(self) -> None:
+        """Take no more commands and leave the graph. A second call does nothing."""
+        self._done.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
 
     @staticmethod
     def joint_states_topic(robot: str) -> str:
@@ -120,3 +200,85 @@ class RosTelemetryBase:
             logger.warning("%s was refused: %s", self.command_topic, text_of(answer))
             return False
         return True
+
+    def _begin(self, link: TelemetryLink, name: str) -> None:
+        """Use this link from now on, and take commands from it on a thread of this name where that is wanted."""
+        self._link = link
+        if self._takes_commands:
+            link.watch(self.command_topic, JOINT_STATE, self._keep)
+            self._thread = threading.Thread(target=self._poll, name=name, daemon=True)
+            self._thread.start()
+
+    def _tell(self, topic: str, kind: str, fields: Message) -> None:
+        link = self._link
+        if link is None:
+            logger.warning("Nothing is published on %s: the bridge was shut down.", topic)
+        else:
+            link.tell(topic, kind, fields)
+
+    def _keep(self, command: Message) -> None:
+        self._latest = command
+
+    def _poll(self) -> None:
+        while not self._done.wait(self._period_s):
+            command, self._latest = self._latest, None
+            if command is not None:
+                self.apply(command)
+
+
+class RosTelemetryBridge(RosTelemetryBase):
+    """Publishes joints and images through rclpy; the base of the bridges of real robots and of simulations.
+
+    Args:
+        domain_id: ROS 2 domain, 0 to 232. The node has a context of its own, so no environment variable is written.
+        node_name: of the node; each subclass has its own default.
+        qos_depth: KEEP_LAST history of each endpoint, 1 to :data:`MAX_QOS_HISTORY_DEPTH`.
+
+    Raises:
+        ValidationError: an argument outside its domain, before anything else has happened.
+        RosError: no ROS 2 is sourced, or it did not start.
+    """
+
+    default_node_name = "strands_telemetry"
+
+    def __init__(
+        self,
+        robot: Any = None,
+        *,
+        domain_id: int = 0,
+        node_name: str | None = None,
+        qos_depth: int = 10,
+        enable_commands: bool = False,
+        command_robot_name: str | None = None,
+        spin_period: float = 0.02,
+        joint_limits: dict[str, tuple[float, float]] | None = None,
+    ) -> None:
+        super().__init__(
+            robot,
+            domain_id=domain_id,
+            enable_commands=enable_commands,
+            command_robot_name=command_robot_name,
+            period=spin_period,
+            period_name="spin_period",
+            joint_limits=joint_limits,
+        )
+        depth = whole("qos_depth", qos_depth, low=1, high=MAX_QOS_HISTORY_DEPTH)
+        name = checked_node_name("node_name", self.default_node_name if node_name is None else node_name)
+        if self._takes_commands:
+            refuse_unsecured(self.lacking_security())
+        link = RclpyLink(self.domain_id, name=name, depth=depth)
+        try:
+            link.open()
+            self._begin(link, f"{name}-commands")
+        except BaseException:
+            link.close()
+            raise
+
+    def lacking_security(self) -> str | None:
+        """What the graph lacks to be one whose commands are taken, a sentence; None where it is secured."""
+        return None
+
+
+def _header(frame_id: str = "") -> dict[str, Any]:
+    sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}

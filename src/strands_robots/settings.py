@@ -96,6 +96,9 @@ _declare(
     ),
     Setting("ROS_DOMAIN_ID", "integer", "0", "DDS domain of ROS 2 robots.", 0, 232),
     Setting("ROS_LOCALHOST_ONLY", "boolean", "false", "Keep DDS on this machine, unless CYCLONEDDS_URI is set."),
+    Setting("ROS_SECURITY_ENABLE", "text", "", "ROS 2's own switch of its security: exactly true."),
+    Setting("ROS_SECURITY_STRATEGY", "text", "", "ROS 2's own word for what it does without keys: Enforce refuses."),
+    Setting("ROS_SECURITY_KEYSTORE", "path", "", "ROS 2's own folder of keys and permissions."),
     Setting("CYCLONEDDS_URI", "text", "", "Configuration of Cyclone DDS, which the library reads itself."),
     Setting("BYPASS_TOOL_CONSENT", "boolean", "false", "Approve every motion verb on real hardware."),
     Setting("STRANDS_DC_PORT", "integer", "7447", "Loopback port where local robots meet.", 1, 65535),
@@ -199,6 +202,11 @@ def declared() -> tuple[Setting, ...]:
 def raw(name: str) -> str:
     """The variable's text, stripped; the declared default when unset or blank."""
     return os.environ.get(name, "").strip() or _TABLE[name].default
+
+
+def verbatim(name: str) -> str:
+    """The variable letter by letter, "" when unset: for a word that another program compares so."""
+    return os.environ.get(_TABLE[name].name, "")
 
 
 def put(name: str, value: str) -> None:

@@ -9,8 +9,9 @@ import pytest
 from fixtures.waiting import eventually
 
 from strands_robots.envelope import error, success
-from strands_robots.hardware_rtps_bridge import INSECURE, HardwareRtpsBridge
+from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
 from strands_robots.ros.dds import DdsLink
+from strands_robots.ros_telemetry import INSECURE
 from strands_robots.utils import ValidationError
 
 DOMAIN = 94

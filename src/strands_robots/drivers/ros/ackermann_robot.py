@@ -9,10 +9,10 @@ from typing import Any
 
 from strands_robots.drivers.ros.mobile_base import UNREACHABLE, MobileBaseRobot
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name, interface
+from strands_robots.ros.roads import Ros2Link
 from strands_robots.safety.gate import MotionRefused, Permit
 from strands_robots.utils import ValidationError, mapping, number, shown
 
@@ -36,8 +36,9 @@ class AckermannRosRobot(MobileBaseRobot):
         max_steering_rad: steering angle at full deflection, above 0 and below pi/2.
         max_duration: longest drive in seconds. ``publish_rate``: Hz of a drive that is held.
         init_services: the handshake, in order: ``{"service", "type", "fields"}``. It runs once, before the first drive.
-        link: the road to the graph; it has to carry services where there is a handshake. Bare DDS by default,
-            which carries none and knows no servo message: a DeepRacer is reached through a ``RosbridgeLink``.
+        link: the road to the graph; it has to carry services where there is a handshake. By default rclpy, where a
+            ROS 2 is sourced; bare DDS carries no services and knows no servo message, so that without a ROS 2 a
+            DeepRacer is reached through a ``RosbridgeLink``.
         command_gate: asks the operator's leave; that of the settings by default.
 
     Raises:
@@ -69,7 +70,7 @@ class AckermannRosRobot(MobileBaseRobot):
         self._enabling = threading.Lock()
         super().__init__(
             node_name,
-            link or DdsLink(),
+            link or Ros2Link(),
             servo_topic,
             servo_type,
             scan_topic=scan_topic,

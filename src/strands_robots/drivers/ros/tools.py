@@ -15,6 +15,7 @@ except ModuleNotFoundError as exc:
 
 if TYPE_CHECKING:
     from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+    from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 
 
 def tools_of(robot: MobileBaseRobot) -> list[Any]:
@@ -69,3 +70,33 @@ def tools_of(robot: MobileBaseRobot) -> list[Any]:
 
     reads = {"get_pose": get_pose, "get_scan": get_scan}
     return [drive, stop, status, *(reads[verb] for verb in robot.reads)]
+
+
+def navigate_tool(robot: RosBridgedRobot) -> Any:
+    """``navigate_<name>``: a goal for the robot's own navigation stack, waited for."""
+
+    @tool(
+        name=f"navigate_{robot.node_name.replace('.', '_')}",
+        description=f"Let {robot.node_name} navigate to a place around obstacles; returns when it arrived or gave up.",
+        context=True,
+    )
+    def navigate(  # noqa: PLR0917 - the goal's own parts
+        x: float,
+        y: float,
+        tool_context: ToolContext,
+        yaw: float = 0.0,
+        frame_id: str = "map",
+        timeout: float = 120.0,
+    ) -> dict[str, Any]:
+        """Navigate.
+
+        Args:
+            x: Position of the goal in metres, along the frame's x axis.
+            y: Position of the goal in metres, along the frame's y axis.
+            yaw: Heading at the goal in radians; positive is to the left.
+            frame_id: Frame in which the goal is given, such as map or odom.
+            timeout: Seconds after which the goal is cancelled, above 0.
+        """
+        return robot.navigate_to(x, y, yaw, frame_id, timeout, tool_context)
+
+    return navigate

@@ -1,0 +1,116 @@
+"""One goal given to a robot's own navigation stack, from its sending to what is known of its end."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.ros.goals import GoalReport, run_goal, said
+from strands_robots.ros.link import Message, RosError, RosLink
+from strands_robots.safety.gate import Permit
+from strands_robots.utils import MissingExtraError
+
+FEEDBACK_KEPT = 5
+"""How many samples of feedback an answer carries: the last ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """A checked goal: metres and radians in a frame, and how long the way may take."""
+
+    x: float
+    y: float
+    yaw: float
+    frame_id: str
+    timeout_s: float
+
+    def fields(self) -> dict[str, Any]:
+        """The goal of ``nav2_msgs/NavigateToPose``; a heading is a rotation about the vertical axis."""
+        return {
+            "pose": {
+                "header": {"frame_id": self.frame_id},
+                "pose": {
+                    "position": {"x": self.x, "y": self.y, "z": 0.0},
+                    "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(self.yaw / 2), "w": math.cos(self.yaw / 2)},
+                },
+            }
+        }
+
+
+class Navigation:
+    """Sends one goal under a permit and waits; a void permit cancels it. :meth:`run` once."""
+
+    def __init__(self, link: RosLink, action: str, kind: str, to: Destination, permit: Permit) -> None:
+        self.to = to
+        self.state = "running"
+        self.ended = threading.Event()
+        self.report: GoalReport | None = None
+        self.feedback: list[Mapping[str, Any]] = []
+        self.heard = 0
+        self._link = link
+        self._target = (action, kind)
+        self._permit = permit
+        self._began = time.monotonic()
+        self._took_s: float | None = None
+
+    @property
+    def instruction(self) -> str:
+        """The goal in a few words."""
+        return f"navigate to x {self.to.x:g} m, y {self.to.y:g} m in {self.to.frame_id}"
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the goal was ordered; once it has ended, how long it took."""
+        return time.monotonic() - self._began if self._took_s is None else self._took_s
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the robot may still be on its way, or None: it is known not to be."""
+        if not self.ended.is_set():
+            return "the goal is being cancelled, and its server has not told its end"
+        return None if self.report is None or self.report.over else said(self.report)
+
+    def run(self) -> Envelope:
+        """Send, wait, and answer how it went."""
+        try:
+            self.report = run_goal(
+                self._link,
+                *self._target,
+                self.to.fields(),
+                self.to.timeout_s,
+                feedback=self._hear,
+                given_up=lambda: not self._permit.valid,
+            )
+        except (RosError, MissingExtraError) as exc:
+            self.state = "error"
+            return error(f"The goal was not begun: {exc}", goal_state="not sent")
+        finally:
+            self._took_s = time.monotonic() - self._began
+            self.ended.set()
+        return self._answered(self.report)
+
+    def _hear(self, message: Message) -> None:
+        self.heard += 1
+        self.feedback = [*self.feedback[1 - FEEDBACK_KEPT :], dict(message)]
+
+    def _answered(self, report: GoalReport) -> Envelope:
+        fields: dict[str, Any] = {
+            "goal_status": report.status,
+            "goal_state": report.state,
+            "result": report.values,
+            "feedback": list(self.feedback),
+            "feedback_count": self.heard,
+            "ended_by": report.cut or None,
+        }
+        if report.state == "succeeded":
+            self.state = "completed"
+            return success(f"Arrived at x {self.to.x:g} m, y {self.to.y:g} m in {self.to.frame_id}.", **fields)
+        stopped = report.over and report.cut and not self._permit.valid
+        self.state = "stopped" if stopped else "error"
+        sentence = said(report)
+        return error(f"{sentence[0].upper()}{sentence[1:]}", **fields)
