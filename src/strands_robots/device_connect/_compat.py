@@ -100,6 +100,8 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._messaging_backend = link.transport
         self._d2d_mode = discovery != "registry"
         self.link = link
+        self.problem = ""
+        """Why the last attempt to connect failed."""
         self._before_live = before_live
         self._started = asyncio.Event()
         self._ready = asyncio.Event()
@@ -176,6 +178,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
                 refusals += isinstance(error, AuthenticationError)
                 if refusals == MAX_REFUSALS:
                     raise
+                self.problem = str(error)
                 _log.warning("%s: %s; trying again in %g s", self.device_id, error, CONNECT_AGAIN_S)
             await asyncio.sleep(CONNECT_AGAIN_S)
         await self._notify_conn_state(True)

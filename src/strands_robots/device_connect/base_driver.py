@@ -26,7 +26,7 @@ from strands_robots.device_connect.workers import Lane, LaneFullError
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
-from strands_robots.safety.gate import MotionRefused
+from strands_robots.safety.gate import Asked, MotionRefused
 from strands_robots.safety.stopping import StopVerdict, explain, grade
 from strands_robots.utils import ValidationError, shown
 
@@ -103,17 +103,18 @@ class RobotDriver(LiveDriver):
         refusal = self.authorization.motion(caller, verb)
         if refusal is not None:
             return error(refusal)
-        call, asked = prepare(), self.robot.gate.generation
+        call, asked = prepare(), self.robot.gate.asked()
         try:
             answer = await self.moves.run(lambda: self._start(verb, call, asked), MOVE_DEADLINE_S)
         except TimeoutError:
-            self.robot.gate.revoke()
+            # This call alone: to revoke the gate without a halt would leave what moves with its last command.
+            asked.give_up()
             raise
         logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb, shown(caller))
         self.changed.set()
         return answer
 
-    def _start(self, verb: str, call: Call, asked: int) -> object:
+    def _start(self, verb: str, call: Call, asked: Asked) -> object:
         """The part of a motion that may touch a disk or a device: lockout, approval, the robot's verb."""
         with self.robot.gate.asked_at(asked):
             return self._permitted(verb, call)

@@ -119,9 +119,8 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         await asyncio.shield(_put_down(runtime, task))
         if isinstance(exc, TimeoutError):
             where = ", ".join(reach.connect) or "the network"
-            raise TimeoutError(
-                f"{name} was not up on {where} within {bringup_timeout:g} s. {said.last}".strip()
-            ) from exc
+            why = (runtime.problem or said.last).rstrip(".") + "."
+            raise TimeoutError(f"{name} was not up on {where} within {bringup_timeout:g} s: {why}") from exc
         raise
     _hosts[runtime] = Host(asyncio.get_running_loop(), task)
     # Again with each device, because what is registered last runs first: the link must still be open then.
@@ -197,7 +196,9 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
     try:
         runtime = came_up.result(bringup_timeout + LOOP_JOIN_TIMEOUT_S)
     except FutureTimeoutError as exc:
-        came_up.cancel()
+        if not came_up.cancel():
+            thread.join(LOOP_JOIN_TIMEOUT_S)
+            raise
         if loops:
             _cancel_everything(loops[0])
         thread.join(LOOP_JOIN_TIMEOUT_S)

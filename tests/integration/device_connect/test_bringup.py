@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -189,6 +190,13 @@ def test_a_driver_that_cannot_be_announced_says_so(link: LinkConfig) -> None:
 
     with pytest.raises((ValidationError, ValueError)):
         init_device_connect_sync(Box(), link=link)
+
+
+def test_a_bring_up_that_times_out_says_what_the_last_attempt_met(world: ToyWorld) -> None:
+    taken = socket.create_server(("127.0.0.1", 0))
+    with taken, pytest.raises(TimeoutError, match=r"arm-1 was not up on the network within 2 s: no Zenoh link at tcp/"):
+        link = LinkConfig(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",))
+        init_device_connect_sync(world, peer_id="arm-1", link=link, bringup_timeout=2.0)
 
 
 def test_twenty_start_and_stop_cycles_leave_nothing(link: LinkConfig, world: ToyWorld) -> None:

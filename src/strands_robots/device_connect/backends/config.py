@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlparse
 
 from ... import settings
 from ...utils import ValidationError, choice, device_id, port
+from .endpoints import check_nats, check_zenoh, endpoints, host_of
 
 LOOPBACK = "127.0.0.1"
 
@@ -28,6 +28,9 @@ MAX_MESSAGE_BYTES = 64 * 2**20
 WAIT_BEFORE_DROP_US = 500
 WAIT_BEFORE_DROP_FRAGMENTS_US = 1_000_000
 WAIT_BEFORE_CLOSE_US = 1_000_000
+
+# For which a far side that accepted a connection may keep silent; a session does not close while it waits for that.
+HANDSHAKE_MS = 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,10 @@ class LinkConfig:
         choice("mode", self.mode, ("auto", "peer", "client"))
         # A wildcard here would make one link of every tenant.
         device_id("tenant", self.tenant)
+        check = check_nats if self.transport == "nats" else check_zenoh
+        for name, stated in (("connect", self.connect), ("listen", self.listen)):
+            for endpoint in stated:
+                check(name, endpoint)
         if self.meet_port is not None:
             port("meet_port", self.meet_port)
         if bool(self.cert) != bool(self.key):
@@ -96,7 +103,7 @@ class LinkConfig:
         """True when nothing outside this machine is reached or let in."""
         if self.is_peer and (self.uses_multicast or not self.listeners):
             return False
-        return all(_host(endpoint) in (LOOPBACK, "localhost", "::1") for endpoint in self.connect + self.listeners)
+        return all(host_of(endpoint) in (LOOPBACK, "localhost", "::1") for endpoint in self.connect + self.listeners)
 
     @property
     def uses_multicast(self) -> bool:
@@ -112,7 +119,7 @@ class LinkConfig:
             return self.listen
         scheme = "tls" if self.cert else "tcp"
         local = self.meet_port is not None or (
-            not self.uses_multicast and all(_host(endpoint) == LOOPBACK for endpoint in self.connect)
+            not self.uses_multicast and all(host_of(endpoint) == LOOPBACK for endpoint in self.connect)
         )
         return (f"{scheme}/{LOOPBACK}:0" if local else f"{scheme}/[::]:0",)
 
@@ -172,6 +179,7 @@ class LinkConfig:
                 "gossip": {"enabled": peer, "autoconnect": {"peer": ["router", "peer"]}},
             },
             "transport": {
+                "unicast": {"open_timeout": HANDSHAKE_MS},
                 "link": {
                     "tx": {
                         "queue": {
@@ -254,26 +262,6 @@ def link_from_environment(tenant: str = "default", transport: str | None = None)
         cert=tls["cert"],
         key=tls["key"],
     )
-
-
-def endpoints(servers: Sequence[str]) -> tuple[str, ...]:
-    """Zenoh endpoints for URLs in any of the framework's spellings; ``zenoh://`` alone means none."""
-    found = []
-    for server in (each.strip() for each in servers):
-        scheme, _, rest = server.partition("://")
-        if rest and scheme in ("zenoh", "zenoh+tls"):
-            url = urlparse(server)
-            found.append(f"{'tls' if scheme.endswith('tls') else 'tcp'}/{url.hostname}:{url.port or 7447}")
-        elif server and "://" not in server:
-            found.append(server if "/" in server else f"tcp/{server}")
-        elif rest:
-            found.append(server)
-    return tuple(found)
-
-
-def _host(endpoint: str) -> str:
-    address = endpoint.partition("://")[2] or endpoint.partition("/")[2]
-    return address.rpartition("@")[2].rpartition(":")[0].strip("[]")
 
 
 def _first_set(*names: str) -> tuple[str, ...]:

@@ -84,10 +84,10 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
         if link.ca:
             options["tls"] = _tls_context(link)
         refused: list[str] = []
+        failed: list[str] = []
 
         async def on_error(error: Exception) -> None:
-            if "authorization" in str(error).lower():
-                refused.append(str(error))
+            (refused if "authorization" in str(error).lower() else failed).append(str(error))
             self._log.warning("NATS: %s", error)
 
         options |= {
@@ -105,7 +105,8 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
                 await self._client.connect(**options)
         except (TimeoutError, OSError, nats.errors.Error) as error:
             await self._abandon()
-            reason = refused[-1] if refused else str(error) or f"no answer within {link.connect_timeout_s:g} s"
+            said = [*failed, *refused]
+            reason = said[-1] if said else str(error) or f"no answer within {link.connect_timeout_s:g} s"
             kind = AuthenticationError if "authorization" in reason.lower() else MessagingConnectionError
             raise kind(f"no NATS connection to {where}: {reason}") from error
         except asyncio.CancelledError:

@@ -17,6 +17,7 @@ from strands_robots.mesh.transport.posture import Posture
 
 RETRY_MS = 250
 LEASE_MS = 4000
+HANDSHAKE_MS = 2000
 WAIT_BEFORE_DROP_US = 10_000
 HOW_TO_ACL = "STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"
 
@@ -70,7 +71,11 @@ def _base(posture: Posture, session: str | None) -> dict[str, Any]:
             "gossip": {"enabled": True},
         },
         "adminspace": {"enabled": False},
-        "transport": {"unicast": {"max_sessions": posture.max_sessions}, "link": link},
+        "transport": {
+            # A session does not close while it waits for the first word of a far side that is no Zenoh.
+            "unicast": {"max_sessions": posture.max_sessions, "open_timeout": HANDSHAKE_MS},
+            "link": link,
+        },
         "downsampling": _downsampling(prefix),
         "low_pass_filter": _low_pass(prefix),
     }
