@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import time
 
+import pytest
 from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
+from strands_robots.mesh import safety
 from strands_robots.mesh.core import Mesh
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Collect answers for a moment only."""
+    monkeypatch.setattr(safety, "COLLECT_S", 0.2)
 
 
 def cut_off(peers: Fleet) -> tuple[Mesh, Mesh, Arm]:

@@ -19,6 +19,9 @@ logger = logging.getLogger(__name__)
 
 TOKEN_PATIENCE_S = 0.3
 SAME_LOSS_S = 0.5
+RETURN_S = 2.0
+"""After our own link is back, within which the tokens of those who live are back as well."""
+
 LEAVING_MAX = 4096
 
 
@@ -39,6 +42,7 @@ class Herald:
         self.described = threading.Event()
         self._leaving: dict[tuple[str, str], float] = {}
         self._judged_later = False
+        self._anchored_at: float | None = None
         self._held: list[Subscription] = []
         self._host = socket.gethostname()
 
@@ -141,17 +145,21 @@ class Herald:
     def judge_tokens(self, patience: float = TOKEN_PATIENCE_S) -> None:
         """Take a peer whose token went for gone, unless it went because our own link did.
 
-        When a hub dies every token goes at once, and none of the sessions need have ended.
+        When a hub dies every token goes at once, and none of the sessions need have ended. Those that live show their
+        tokens again on the next hub; what has not come back a while after our own link did is gone.
         """
         now, transport = time.monotonic(), self._context.transport
         anchored, lost_link = getattr(transport, "anchored", None), getattr(transport, "lost_link_at", None)
+        if callable(anchored) and not anchored():
+            self._anchored_at = None
+            return
+        self._anchored_at = self._anchored_at if self._anchored_at is not None else now
         for mark, went in list(self._leaving.items()):
-            if now - went < patience:
+            ours = isinstance(lost_link, float) and abs(went - lost_link) < SAME_LOSS_S
+            since = max(went, lost_link or went, self._anchored_at) if ours else went
+            if now - since < (RETURN_S if ours else patience):
                 continue
             self._leaving.pop(mark, None)
-            ours = isinstance(lost_link, float) and abs(went - lost_link) < SAME_LOSS_S
-            if ours or (callable(anchored) and not anchored()):
-                continue
             if self._context.registry.lost(*mark):
                 logger.info("%s left.", mark[0])
 

@@ -1,0 +1,114 @@
+"""Two and five peers in processes of their own, and what befalls them: killed, restarted, suspended."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Sequence
+
+from fixtures.mesh_peer import MeshPeer
+from fixtures.waiting import accepts, eventually
+from tests.integration.mesh.conftest import Join
+
+
+def meet(peers: Sequence[MeshPeer], within: float = 10.0) -> None:
+    """Wait until each has all the others in reach."""
+    for peer in peers:
+        peer.sees(*(other.peer_id for other in peers if other is not peer), within=within)
+
+
+def everybody_answers_everybody(peers: Sequence[MeshPeer]) -> None:
+    for peer in peers:
+        for other in peers:
+            if other is not peer:
+                eventually(
+                    lambda peer=peer, other=other: peer.ask("ping", other.peer_id, 0.5)["status"] == "ok",
+                    within=4,
+                    what=f"{other.peer_id} answers {peer.peer_id}",
+                )
+
+
+def test_two_peers_outlive_a_restart_of_the_other_and_of_their_own_session(join: Join) -> None:
+    hub, child = join("hub", "none"), join("child")
+    meet([hub, child])
+    child.close()
+    eventually(lambda: hub.ask("reachable") == [], within=2)
+    child = join("child")
+    meet([hub, child])
+    for each in (child, hub):
+        assert each.ask("restart") is True
+        meet([hub, child])
+        everybody_answers_everybody([hub, child])
+
+
+def test_five_peers_lose_their_hub_and_get_it_back(join: Join, port: int) -> None:
+    hub = join("hub", "none")
+    others = [join("console", "none"), join("arm-1", "arm"), join("sim-1"), join("sim-2")]
+    meet([hub, *others])
+    everybody_answers_everybody([hub, *others])
+    sessions = {each.peer_id: others[0].ask("zid", each.peer_id) for each in others[1:]}
+    hub.kill()
+    eventually(lambda: accepts(port), within=2, what="a survivor takes the port")
+    everybody_answers_everybody(others)
+    replies = others[0].ask("broadcast", {"action": "ping"}, 0.7)
+    assert sorted(reply["responder_id"] for reply in replies) == ["arm-1", "sim-1", "sim-2"]
+    # No session was reopened: every peer is still bound to the one that it announced itself from.
+    assert {each.peer_id: others[0].ask("zid", each.peer_id) for each in others[1:]} == sessions
+    back = join("hub", "none")
+    meet([back, *others])
+    everybody_answers_everybody([back, *others])
+    # The relay that took over ends as well, and those that are left find each other once more.
+    for each in list(others):
+        each.kill()
+        left = [other for other in [back, *others] if other is not each]
+        if accepts(port):
+            continue
+        eventually(lambda: accepts(port), within=2, what="the next survivor takes the port")
+        others.remove(each)
+        everybody_answers_everybody(left)
+        break
+    else:
+        raise AssertionError("none of the four held the port")
+
+
+def test_a_suspended_robot_is_told_as_silent_and_stops_when_it_goes_on(join: Join) -> None:
+    console, arm = join("console", "none"), join("arm-1", "arm")
+    meet([console, arm])
+    arm.ask("start", "wave")
+    arm.signal(signal.SIGSTOP)
+    answers = console.ask("estop")[1]
+    assert [answer["responder_id"] for answer in answers] == ["console"]
+    arm.signal(signal.SIGCONT)
+    eventually(lambda: arm.ask("epoch") == console.ask("epoch"), within=6)
+    assert arm.ask("moving") is False
+
+
+def test_a_suspended_hub_holds_the_mesh_up_and_a_stop_arrives_when_it_goes_on(join: Join, port: int) -> None:
+    hub = join("hub", "none")
+    console, arm = join("console", "none"), join("arm-1", "arm")
+    meet([hub, console, arm])
+    arm.ask("start", "wave")
+    hub.signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    assert console.ask("ping", "arm-1", 0.5)["status"] == "timeout"
+    # Beyond the link's lease of 4 s, so that nothing waits in the hub's buffers.
+    time.sleep(max(0.0, 5.0 - (time.monotonic() - stopped)))
+    answers = console.ask("estop")[1]
+    assert [answer["responder_id"] for answer in answers] == ["console"]
+    assert arm.ask("epoch") is None
+    hub.signal(signal.SIGCONT)
+    eventually(lambda: arm.ask("epoch") == console.ask("epoch"), within=6)
+    assert arm.ask("moving") is False
+    meet([hub, console, arm])
+    everybody_answers_everybody([hub, console, arm])
+
+
+def test_a_suspended_hub_that_is_killed_is_replaced(join: Join, port: int) -> None:
+    hub = join("hub", "none")
+    console, sim = join("console", "none"), join("sim-1")
+    meet([hub, console, sim])
+    hub.signal(signal.SIGSTOP)
+    assert console.ask("ping", "sim-1", 0.3)["status"] == "timeout"
+    hub.kill()
+    eventually(lambda: accepts(port), within=2, what="a survivor takes the port")
+    everybody_answers_everybody([console, sim])
