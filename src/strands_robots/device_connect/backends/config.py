@@ -194,7 +194,7 @@ class LinkConfig:
                         }
                     },
                     "rx": {"max_message_size": MAX_MESSAGE_BYTES},
-                }
+                },
             },
         }
         if self.ca:
