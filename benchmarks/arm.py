@@ -27,6 +27,7 @@ from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.recording import Recorder, read_entries
 from strands_robots.robot import Robot
 from strands_robots.safety.lane import lane
+from strands_robots.safety.plane import plane
 
 HZ = 50.0
 SECONDS, SECONDS_QUICK = 60.0, 5.0
@@ -132,8 +133,7 @@ def last_write(stops: int) -> Row:
             assert controller.wait_link(10)
             eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
             for _ in range(stops):
-                # An operator would lift the lock of the last stop; here a latch that locks nothing takes its place.
-                robot.gate.attach(_Clear())
+                plane().clear_local("the benchmark")
                 robot.start_task("wave", duration=30.0)
                 eventually(lambda: robot.get_task_status()["step_count"] > 10)
                 called = time.monotonic()
@@ -189,10 +189,3 @@ def reading(read: Callable[[], object]) -> Iterator[None]:
     yield
     ended.set()
     reader.join()
-
-
-class _Clear:
-    """A latch that locks nothing."""
-
-    def refusal(self, verb: str) -> None:
-        return None

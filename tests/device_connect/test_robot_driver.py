@@ -225,6 +225,19 @@ async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, mon
     assert robot.writes == []
 
 
+async def test_a_motion_that_is_not_started_in_time_takes_nothing_else_with_it(
+    robot: ToyRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(base_driver, "MOVE_DEADLINE_S", 0.1)
+    let_go, moving = threading.Event(), robot.gate.permit("a local motion")
+    robot.before["start_task"] = let_go.wait
+    async with DriverBench(drive(robot)) as bench:
+        assert "in time" in (await bench.call("execute", instruction="wave"))["reason"]
+        assert moving.valid, "a permit that is revoked without a halt leaves a base with its last velocity"
+        let_go.set()
+        await bench.until(lambda: len(robot.answers) == 1)
+
+
 async def test_a_stop_reaches_the_motion_that_has_not_begun_yet(robot: ToyRobot) -> None:
     let_go, entered = threading.Event(), threading.Event()
 

@@ -41,16 +41,17 @@ def test_a_withdrawn_permit_is_void_alone() -> None:
 
 def test_a_locked_gate_gives_no_permit_and_says_why() -> None:
     gate = MotionGate()
-    gate.attach(Latch())
+    latch = Latch()
+    gate.attach(latch)
     with pytest.raises(MotionRefused, match="start is locked") as refused:
         gate.permit("start")
     assert refused.value.envelope["status"] == "error"
     assert gate.refusal("step") is not None
-    gate.attach(Latch(locked=False))
+    latch.locked = False
     assert gate.permit("start").valid
 
 
-def test_a_lock_that_engages_while_a_permit_is_given_voids_it() -> None:
+def test_a_halt_that_comes_while_a_permit_is_given_refuses_it() -> None:
     gate = MotionGate()
 
     class Racing(Latch):
@@ -59,7 +60,8 @@ def test_a_lock_that_engages_while_a_permit_is_given_voids_it() -> None:
             return None
 
     gate.attach(Racing())
-    assert not gate.permit("start").valid
+    with pytest.raises(MotionRefused, match="halted after it was asked for"):
+        gate.permit("start")
 
 
 def test_generations_rise_whoever_revokes() -> None:
@@ -83,7 +85,7 @@ def test_generations_rise_whoever_revokes() -> None:
 
 def test_a_motion_asked_for_before_a_halt_is_refused_when_its_turn_comes_after() -> None:
     gate = MotionGate()
-    asked = gate.generation
+    asked = gate.asked()
     gate.revoke()
     with gate.asked_at(asked), pytest.raises(MotionRefused, match="halted after it was asked for"):
         gate.permit("start")
@@ -92,17 +94,60 @@ def test_a_motion_asked_for_before_a_halt_is_refused_when_its_turn_comes_after()
 
 def test_a_motion_asked_for_at_this_generation_is_given_its_permit() -> None:
     gate = MotionGate()
-    with gate.asked_at(gate.generation):
+    with gate.asked_at(gate.asked()):
         permit = gate.permit("start")
     assert permit.valid
 
 
 def test_the_moment_of_asking_belongs_to_one_thread() -> None:
     gate, seen = MotionGate(), []
-    asked = gate.generation
+    asked = gate.asked()
     gate.revoke()
     with gate.asked_at(asked):
         other = threading.Thread(target=lambda: seen.append(gate.refusal("start")))
         other.start()
         other.join(5)
     assert seen == [None]
+
+
+def test_every_latch_of_a_robot_has_to_be_free_before_it_moves() -> None:
+    gate = MotionGate()
+    first, second = Latch(), Latch(locked=False)
+    gate.attach(first)
+    gate.attach(second)
+    assert gate.refusal("start") is not None, "a second network does not unlock what the first one locked"
+    gate.detach(second)
+    assert gate.refusal("start") is not None
+    gate.detach(first)
+    assert gate.permit("start").valid
+
+
+def test_giving_up_a_call_voids_what_it_began_and_nothing_else() -> None:
+    gate = MotionGate()
+    other, asked = gate.permit("wave"), gate.asked()
+    with gate.asked_at(asked):
+        begun = gate.permit("start")
+    asked.give_up()
+    assert (begun.valid, begun.revoked, other.valid) == (False, False, True)
+    with gate.asked_at(asked), pytest.raises(MotionRefused):
+        gate.permit("start")
+
+
+def test_a_call_inside_a_call_is_as_old_as_the_outer_one() -> None:
+    gate = MotionGate()
+    old = gate.asked()
+    gate.revoke()
+    with gate.asked_at(old):
+        with gate.asked_at(gate.asked()):
+            assert gate.refusal("start") is not None
+        assert gate.refusal("start") is not None, "the outer call goes on being old"
+    assert gate.refusal("start") is None
+
+
+def test_a_permit_that_waited_says_so_when_it_is_void() -> None:
+    gate = MotionGate()
+    permit = gate.permit("start")
+    permit.check()
+    gate.revoke()
+    with pytest.raises(MotionRefused, match="halted after it was asked for"):
+        permit.check()

@@ -192,7 +192,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         return (desk.get(command["action"]) or dispatcher)(command)
 
     def asked() -> AbstractContextManager[None]:
-        return nullcontext() if robot is None else robot.gate.asked_at(robot.gate.generation)
+        return nullcontext() if robot is None else robot.gate.asked_at(robot.gate.asked())
 
     approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
     assembled: Assembled

@@ -36,26 +36,45 @@ class PermitVoidError(RuntimeError):
     """The permit was void when the write came: the motion was stopped in between, and nothing was written."""
 
 
+class Asked:
+    """A call that asks for motion, since when: a halt after it voids what the call begins, and so does giving it up."""
+
+    __slots__ = ("generation", "given_up")
+
+    def __init__(self, generation: int) -> None:
+        self.generation = generation
+        self.given_up = False
+
+    def give_up(self) -> None:
+        """Nobody waits for the call any more: what it began or may still begin is void, and nothing else is."""
+        self.given_up = True
+
+
 class Permit:
     """Leave to move, until the next halt or until whoever started the motion withdraws it."""
 
-    __slots__ = ("_gate", "_generation", "_withdrawn", "verb")
+    __slots__ = ("_asked", "_gate", "_withdrawn", "verb")
 
-    def __init__(self, gate: MotionGate, generation: int, verb: str) -> None:
+    def __init__(self, gate: MotionGate, asked: Asked, verb: str) -> None:
         self._gate = gate
-        self._generation = generation
+        self._asked = asked
         self._withdrawn = False
         self.verb = verb
 
     @property
     def valid(self) -> bool:
-        """False for ever once the robot was halted or locked, or this permit withdrawn."""
-        return not (self._withdrawn or self.revoked)
+        """False for ever once the robot was halted or locked, this permit withdrawn, or its call given up."""
+        return not (self._withdrawn or self._asked.given_up or self.revoked)
 
     @property
     def revoked(self) -> bool:
         """True for ever once the whole robot was halted or locked: whoever did that also freezes it."""
-        return self._gate.generation != self._generation
+        return self._gate.generation != self._asked.generation
+
+    def check(self) -> None:
+        """For a motion that had to wait for its turn. Raises :class:`MotionRefused` when this permit is void."""
+        if not self.valid:
+            raise MotionRefused(error(_LATE.format(self.verb)))
 
     def withdraw(self) -> None:
         """Void this permit alone: one motion stops, the robot stays free."""
@@ -66,43 +85,61 @@ class MotionGate:
     """The gate of one robot. Thread-safe without a lock: the generation is one reference, replaced whole."""
 
     def __init__(self, latch: Latch | None = None) -> None:
-        self._latch = latch
+        self._latches: tuple[Latch, ...] = () if latch is None else (latch,)
+        self._attaching = threading.Lock()
         self._numbers = count(1)
         self._generation = 0
-        self._asked = threading.local()
+        self._here = threading.local()
 
     @property
     def generation(self) -> int:
         """Rises with every halt; permits of an older one are void."""
         return self._generation
 
+    @property
+    def latches(self) -> tuple[Latch, ...]:
+        """Everything that decides whether motion is locked."""
+        return self._latches
+
     def attach(self, latch: Latch) -> None:
-        """Let ``latch`` decide from now on whether motion is locked."""
-        self._latch = latch
+        """Let ``latch`` decide from now on, beside those there are, whether motion is locked."""
+        with self._attaching:
+            if latch not in self._latches:
+                self._latches = (*self._latches, latch)
+
+    def detach(self, latch: Latch) -> None:
+        """Ask ``latch`` no more."""
+        with self._attaching:
+            self._latches = tuple(each for each in self._latches if each is not latch)
+
+    def asked(self) -> Asked:
+        """A call that asks for motion now; for :meth:`asked_at` when its turn comes."""
+        return Asked(self._generation)
 
     @contextmanager
-    def asked_at(self, generation: int) -> Iterator[None]:
-        """For this thread: motions begun inside were asked for at ``generation``; a halt since then refuses them.
+    def asked_at(self, asked: Asked) -> Iterator[None]:
+        """For this thread: motions begun inside were asked for then; a halt since then refuses them.
 
-        A call that waited for a thread or a connection is thus older than the stop that came meanwhile.
+        A call that waited for a thread or a connection is thus older than the stop that came meanwhile. Of two
+        around one another the outer one counts, which is the older.
         """
-        self._asked.generation = generation
+        before: Asked | None = getattr(self._here, "asked", None)
+        self._here.asked = before or asked
         try:
             yield
         finally:
-            del self._asked.generation
+            self._here.asked = before
 
     def refusal(self, verb: str) -> Envelope | None:
         """The answer to ``verb`` while locked, or when the robot was halted since it was asked for; else None."""
-        if getattr(self._asked, "generation", self._generation) != self._generation:
-            return error(f"{verb} is refused: the robot was halted after it was asked for; nothing was started.")
-        return self._latch.refusal(verb) if self._latch is not None else None
+        return self._refusal(verb, self._asked_here())
 
     def permit(self, verb: str) -> Permit:
         """Leave to move. Raises :class:`MotionRefused` while locked, and when halted since it was asked for."""
-        # The generation is read before the latch, so that a lock engaged in between voids this permit.
-        permit = Permit(self, getattr(self._asked, "generation", self._generation), verb)
-        refusal = self.refusal(verb)
+        # The generation is read before the latches, so that a lock engaged in between voids this permit.
+        asked = self._asked_here()
+        permit = Permit(self, asked, verb)
+        refusal = self._refusal(verb, asked)
         if refusal is not None:
             raise MotionRefused(refusal)
         return permit
@@ -110,3 +147,17 @@ class MotionGate:
     def revoke(self) -> None:
         """Void every permit given so far."""
         self._generation = next(self._numbers)
+
+    def _asked_here(self) -> Asked:
+        return getattr(self._here, "asked", None) or Asked(self._generation)
+
+    def _refusal(self, verb: str, asked: Asked) -> Envelope | None:
+        for latch in self._latches:
+            locked = latch.refusal(verb)
+            if locked is not None:
+                return locked
+        late = asked.given_up or asked.generation != self._generation
+        return error(_LATE.format(verb)) if late else None
+
+
+_LATE = "{} is refused: the robot was halted after it was asked for; nothing was started."
