@@ -1,10 +1,14 @@
-"""The one place that uses private members of cyclonedds, which is pinned to 11.0 for it."""
+"""The one place that uses private members of cyclonedds: of 11.0, which is pinned for it, and of 0.10.5."""
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any
 
 from cyclonedds.idl._machinery import BytesMachine
+
+# Which of the first two there is depends on the version.
+_MACHINES = ("v0_machine", "v1_machine", "v2_machine")
 
 
 def pack_as_bytes(struct: Any, *members: str) -> None:
@@ -16,6 +20,14 @@ def pack_as_bytes(struct: Any, *members: str) -> None:
     machine: Any = BytesMachine
     idl = struct.__idl__
     idl.populate()
-    for member in members:
-        idl.v1_machine.members_machines[member] = machine()
-        idl.v2_machine.members_machines[member] = machine()
+    for version in _MACHINES:
+        members_machines = getattr(getattr(idl, version, None), "members_machines", {})
+        for member in members:
+            members_machines[member] = machine()
+
+
+def subscribed(writer: Any) -> bool:
+    """True while a subscription matches this writer, which 0.10.5 can tell in C only."""
+    if hasattr(writer, "get_matched_subscriptions"):
+        return bool(writer.get_matched_subscriptions())
+    return int(writer._dll_handle.dds_get_matched_subscriptions(writer._ref, None, ctypes.c_size_t(0))) > 0

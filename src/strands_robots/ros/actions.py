@@ -1,4 +1,4 @@
-"""``ros_action``: look at a ROS graph, read it and write to it, over bare DDS or a rosbridge server."""
+"""``ros_action``: look at a ROS graph, read it and write to it, by rclpy, over bare DDS or a rosbridge server."""
 
 from __future__ import annotations
 
@@ -13,15 +13,18 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.goals import run_goal, said
 from strands_robots.ros.link import Message, RosError, RosLink
 from strands_robots.ros.names import graph_name, interface
+from strands_robots.ros.rclpy_link import RclpyLink
+from strands_robots.ros.roads import nearest_backend
 from strands_robots.ros.rosbridge import RosbridgeLink
 from strands_robots.utils import MissingExtraError, ValidationError, choice, mapping, number, whole
 
-BACKENDS = ("auto", "dds", "rosbridge")
+BACKENDS = ("auto", "rclpy", "dds", "rosbridge")
 ACTIONS = (
     "status",
     "list_topics",
     "list_nodes",
     "list_services",
+    "list_actions",
     "info",
     "echo",
     "publish",
@@ -46,17 +49,32 @@ class Browsable(Protocol):
     def services(self) -> list[str]:
         """Names of the services."""
 
+    def actions(self) -> list[str]:
+        """Names of the actions."""
+
 
 _links: dict[tuple[Any, ...], RosLink] = {}
 _links_lock = threading.Lock()
 
 
 def link_for(backend: str, host: str, port: int, domain_id: int | None) -> RosLink:
-    """The process's link to a graph, made at its first use and kept. Raises :class:`ValidationError`."""
+    """The process's link to a graph, made at its first use and kept; ``auto`` is the nearest to a ROS 2 graph.
+
+    Raises:
+        ValidationError: an address or a domain that cannot be.
+        RosError: ``auto``, and there is no road at all.
+    """
+    makers: dict[str, Callable[[], RosLink]] = {
+        "rclpy": lambda: RclpyLink(domain_id),
+        "dds": lambda: DdsLink(domain_id),
+        "rosbridge": lambda: RosbridgeLink(host, port),
+    }
+    if backend == "auto":
+        backend = nearest_backend()
     with _links_lock:
-        key = ("rosbridge", host, port) if backend == "rosbridge" else ("dds", domain_id)
+        key = (backend, host, port) if backend == "rosbridge" else (backend, domain_id)
         if key not in _links:
-            _links[key] = RosbridgeLink(host, port) if backend == "rosbridge" else DdsLink(domain_id)
+            _links[key] = makers[backend]()
         return _links[key]
 
 
@@ -97,7 +115,8 @@ def ros_action(
         fields: of the message, request or goal; what is left out is zero.
         count: messages to read or publish, 1 to 1000. ``rate``: Hz of several, above 0 and at most 100.
         timeout: seconds to wait for each message, answer or end, above 0 and at most 600.
-        backend: ``dds`` (topics alone), ``rosbridge``, or ``auto``, which is bare DDS.
+        backend: ``rclpy``, ``dds`` (topics alone), ``rosbridge``, or ``auto``: rclpy where a ROS 2 is sourced,
+            else bare DDS.
         host: of the rosbridge server, with its ``port``. ``domain_id``: of DDS, ``ROS_DOMAIN_ID`` by default.
     """
     try:
@@ -149,11 +168,17 @@ def _services(link: RosLink) -> Envelope:
     return success("\n".join(found) or "No services.", services=found)
 
 
+def _actions(link: RosLink) -> Envelope:
+    found = _browsable(link).actions()
+    return success("\n".join(found) or "No actions.", actions=found)
+
+
 _LOOKS: dict[str, Callable[[RosLink], Envelope]] = {
     "status": _status,
     "list_topics": _topics,
     "list_nodes": _nodes,
     "list_services": _services,
+    "list_actions": _actions,
 }
 
 

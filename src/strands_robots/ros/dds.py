@@ -93,7 +93,7 @@ class DdsLink:
     def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
         """Refused: bare DDS carries topics alone here."""
         del kind, fields, within_s
-        raise RosError(f"{service} is a service, and bare DDS carries topics only; use rosbridge.")
+        raise RosError(f"{service} is a service, and bare DDS carries topics only; use rclpy or rosbridge.")
 
     def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
         sub, qos, core = _dds("sub"), _dds("qos"), _dds("core")
@@ -164,11 +164,15 @@ class DdsLink:
 
     def nodes(self) -> list[str]:
         """Refused: nodes are a notion of ROS that bare DDS does not carry here."""
-        raise RosError("Bare DDS does not tell of nodes; use rosbridge.")
+        raise RosError("Bare DDS does not tell of nodes; use rclpy or rosbridge.")
 
     def services(self) -> list[str]:
         """Refused: bare DDS carries topics alone here."""
-        raise RosError("Bare DDS carries topics only; use rosbridge for services.")
+        raise RosError("Bare DDS carries topics only; use rclpy or rosbridge for services.")
+
+    def actions(self) -> list[str]:
+        """Refused: bare DDS carries topics alone here."""
+        raise RosError("Bare DDS carries topics only; use rclpy or rosbridge for actions.")
 
     def close(self) -> None:
         # The watchers end first: what they wait on goes with the participant.

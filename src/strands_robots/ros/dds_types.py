@@ -9,9 +9,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, byte, float32, float64, int32, sequence, uint32
+from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint32
 
 from strands_robots.ros._compat import pack_as_bytes
+
+try:
+    from cyclonedds.idl.types import byte
+except ImportError:  # Cyclone DDS 0.10 means by uint8 what 11 means by byte
+    from cyclonedds.idl.types import uint8 as byte
 
 KINDS: dict[str, type[Any]] = {}
 """The IDL type of each ``pkg/Name`` that this bundle carries."""

@@ -24,7 +24,8 @@ SLICE_S = 0.01
 class GoalReport:
     """How a goal went. ``state``: a word of :data:`STATUS_WORDS`, ``rejected``, or ``lost`` where its end is not known.
 
-    ``over`` is true when the server told its end, so that nothing goes on; ``cut`` says who ended it, "" nobody.
+    ``over`` is true when the server told its end, so that nothing goes on; ``cut`` says who ended it, "" nobody;
+    ``sent`` is a lost goal itself, whose end may still come.
     """
 
     state: str
@@ -33,6 +34,7 @@ class GoalReport:
     status: int | None = None
     values: Any = field(default_factory=dict)
     problem: str = ""
+    sent: Goal | None = None
 
 
 def run_goal(
@@ -71,9 +73,11 @@ def run_goal(
     if sent.rejected:
         return GoalReport("rejected", True, cut, problem=sent.problem)
     if sent.status is None:
-        return GoalReport("lost", False, cut, problem=problem or sent.problem)
-    known = SUCCEEDED <= sent.status < len(STATUS_WORDS)
-    return GoalReport(STATUS_WORDS[sent.status] if known else "lost", known, cut, sent.status, sent.values)
+        return GoalReport("lost", False, cut, problem=problem or sent.problem, sent=sent)
+    if not SUCCEEDED <= sent.status < len(STATUS_WORDS):
+        problem = f"its server told status {sent.status}, which ends nothing"
+        return GoalReport("lost", False, cut, sent.status, sent.values, problem)
+    return GoalReport(STATUS_WORDS[sent.status], True, cut, sent.status, sent.values)
 
 
 def _cancelled(sent: Goal) -> str:

@@ -19,13 +19,18 @@ NO_ROAD = (
 )
 
 
-def nearest(domain_id: int | None = None) -> RclpyLink | DdsLink:
-    """A link by rclpy where one is sourced, else over bare DDS. Raises :class:`RosError` where there is neither."""
+def nearest_backend() -> str:
+    """``rclpy`` where a ROS 2 is sourced, else ``dds``. Raises :class:`RosError` where there is neither."""
     if sourced():
-        return RclpyLink(domain_id)
+        return "rclpy"
     if find_spec("cyclonedds") is None:
         raise RosError(NO_ROAD)
-    return DdsLink(domain_id)
+    return "dds"
+
+
+def nearest(domain_id: int | None = None) -> RclpyLink | DdsLink:
+    """A link by the nearest road. Raises :class:`RosError` where there is none."""
+    return RclpyLink(domain_id) if nearest_backend() == "rclpy" else DdsLink(domain_id)
 
 
 class Ros2Link:

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from strands_robots.tools.robot_mesh import robot_mesh
+    from strands_robots.tools.use_ros import use_ros
     from strands_robots.tools.use_rosbridge import use_rosbridge
     from strands_robots.tools.use_rtps import use_rtps
 
-__all__ = ["robot_mesh", "use_rosbridge", "use_rtps"]
+__all__ = ["robot_mesh", "use_ros", "use_rosbridge", "use_rtps"]
 
 
 def __getattr__(name: str) -> Any:

@@ -32,7 +32,8 @@ def use_rosbridge(
     """Look at, read and write the ROS graph behind a rosbridge server. Commands that move a robot ask the operator.
 
     Args:
-        action: status, list_topics, list_nodes, list_services, info, echo, publish, service_call or action_goal.
+        action: status, list_topics, list_nodes, list_services, list_actions, info, echo, publish, service_call or
+            action_goal.
         name: Topic, service or action, such as /odom.
         type: Its interface, such as geometry_msgs/Twist; needed to publish, call or send a goal.
         fields: Fields of the message, request or goal; what is left out is zero.

@@ -31,7 +31,7 @@ def use_rtps(
     """Look at, read and write ROS 2 topics over bare DDS. Commands that move a robot ask the operator.
 
     Args:
-        action: status, list_topics, info, echo or publish; services and actions need rosbridge.
+        action: status, list_topics, info, echo or publish; services and actions need use_ros or use_rosbridge.
         name: Topic, such as /odom.
         type: Its interface, such as geometry_msgs/msg/Twist; needed to publish.
         fields: Fields of the message; what is left out is zero.

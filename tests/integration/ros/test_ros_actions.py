@@ -13,7 +13,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.ros import ros_action
 from strands_robots.ros.actions import close_links
-from strands_robots.tools import use_rosbridge, use_rtps
+from strands_robots.tools import use_ros, use_rosbridge, use_rtps
 
 DOMAIN = 93
 ROOT = Path(__file__).resolve().parents[3]
@@ -125,7 +125,7 @@ def test_a_goal_tells_its_end(server: RosbridgeServer) -> None:
         ("publish", {"name": "/a"}, "type"),
         ("publish", {"name": "/a", "type": "p/T", "fields": [1]}, "fields"),
         ("publish", {"name": "/a", "type": "p/T", "rate": 0}, "rate"),
-        ("status", {"backend": "rclpy"}, "backend"),
+        ("status", {"backend": "ros1"}, "backend"),
         ("status", {"backend": "rosbridge", "host": "a b"}, "host"),
         ("status", {"backend": "dds", "domain_id": 300}, "domain_id"),
     ],
@@ -156,7 +156,7 @@ def test_a_graph_over_dds_is_looked_at_and_read(tmp_path: Path) -> None:
         assert "rosbridge" in ros_action(action, domain_id=DOMAIN, **options)["reason"]
 
 
-@pytest.mark.parametrize("tool", [use_rosbridge, use_rtps])
+@pytest.mark.parametrize("tool", [use_ros, use_rosbridge, use_rtps])
 def test_the_tools_describe_every_parameter(tool: Any) -> None:
     schema = tool.tool_spec["inputSchema"]["json"]
     assert schema["required"] == ["action"]

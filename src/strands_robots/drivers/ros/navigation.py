@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -14,6 +15,8 @@ from strands_robots.ros.goals import GoalReport, run_goal, said
 from strands_robots.ros.link import Message, RosError, RosLink
 from strands_robots.safety.gate import Permit
 from strands_robots.utils import MissingExtraError
+
+logger = logging.getLogger(__name__)
 
 FEEDBACK_KEPT = 5
 """How many samples of feedback an answer carries: the last ones."""
@@ -73,7 +76,19 @@ class Navigation:
         """Why the robot may still be on its way, or None: it is known not to be."""
         if not self.ended.is_set():
             return "the goal is being cancelled, and its server has not told its end"
-        return None if self.report is None or self.report.over else said(self.report)
+        report = self.report
+        if report is None or report.over or (report.sent is not None and report.sent.status is not None):
+            return None
+        return said(report)
+
+    def cancel_again(self) -> None:
+        """Ask once more for the end of a goal that nobody knows to be over."""
+        lost = None if self.report is None else self.report.sent
+        if lost is not None and not lost.done.is_set():
+            try:
+                lost.cancel()
+            except RosError as exc:
+                logger.warning("The %s could not be cancelled: %s", self.instruction, exc)
 
     def run(self) -> Envelope:
         """Send, wait, and answer how it went."""

@@ -149,6 +149,8 @@ class RosBridgedRobot(MobileBaseRobot):
         began = time.monotonic()
         going = self._navigation
         was_going = going is not None and going.doubt is not None
+        if going is not None and was_going:
+            going.cancel_again()
         # Revoking the permits, the first thing there, is what cancels the goal.
         verdict = super().halt(reason)
         if going is None or not was_going:

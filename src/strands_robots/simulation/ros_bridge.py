@@ -1,0 +1,97 @@
+"""A simulated world's joints and cameras on a ROS 2 graph, as a real robot's are."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from strands_robots.ros.link import RosError
+from strands_robots.ros_telemetry import RosTelemetryBridge
+from strands_robots.utils import ValidationError, number, text
+
+logger = logging.getLogger(__name__)
+
+RATE_MAX_HZ = 200.0
+
+
+class SimRosBridge(RosTelemetryBridge):
+    """Publishes; a simulation takes no commands from a graph, it is driven by its own verbs.
+
+    ``publish_joint_states`` and ``publish_image`` are those of a real robot's bridge. With a simulation,
+    :meth:`publish` tells all its robots at once, and :meth:`start` does so at a rate.
+
+    Args:
+        simulation: the world whose robots are told; None to publish by hand.
+        domain_id: ROS 2 domain, 0 to 232.
+        node_name: of the node, ``strands_sim`` by default.
+        qos_depth: KEEP_LAST history of each endpoint, 1 to ``MAX_QOS_HISTORY_DEPTH``.
+
+    Raises:
+        ValidationError: an argument outside its domain, before anything else has happened.
+        RosError: no ROS 2 is sourced, or it did not start.
+    """
+
+    default_node_name = "strands_sim"
+
+    def __init__(
+        self, simulation: Any = None, *, domain_id: int = 0, node_name: str | None = None, qos_depth: int = 10
+    ) -> None:
+        super().__init__(domain_id=domain_id, node_name=node_name, qos_depth=qos_depth)
+        self._simulation = simulation
+        self._ended = threading.Event()
+        self._teller: threading.Thread | None = None
+
+    def publish(self, cameras: Sequence[str] = (), *, width: int = 320, height: int = 240) -> None:
+        """Tell the joints of every robot (rad, or m for a sliding joint) and one picture of each of these cameras.
+
+        Raises:
+            ValidationError: no simulation, or no such camera.
+        """
+        world = self._world()
+        for name in world.list_robots():
+            # A joint's key is its own name; what else a robot observes, such as its base's pose, is no joint.
+            joints = world.get_features()["robots"][name]["joints"]
+            seen = world.get_observation(name)
+            told = [joint for joint in joints if joint in seen]
+            self.publish_joint_states(name, told, [seen[joint] for joint in told])
+        for camera in cameras:
+            picture, _ = world.picture(camera, width, height)
+            self.publish_image(world.tool_name_str, camera, picture)
+
+    def start(self, rate_hz: float = 20.0, cameras: Sequence[str] = ()) -> None:
+        """:meth:`publish` at ``rate_hz``, above 0 and at most 200, on a thread, until :meth:`shutdown`.
+
+        Raises:
+            ValidationError: a rate outside its domain, no simulation, or started already.
+        """
+        period_s = 1 / number("rate_hz", rate_hz, above=0, high=RATE_MAX_HZ)
+        names = [text("cameras", each) for each in cameras]
+        self._world()
+        if self._teller is not None:
+            raise ValidationError("start was called before; shutdown ends it.")
+        self._teller = threading.Thread(target=self._tell_on, args=(period_s, names), name="sim-ros", daemon=True)
+        self._teller.start()
+
+    def shutdown(self) -> None:
+        """Publish no more and take the node off the graph. A second call does nothing."""
+        self._ended.set()
+        if self._teller is not None and self._teller is not threading.current_thread():
+            self._teller.join(2.0)
+        super().shutdown()
+
+    def _world(self) -> Any:
+        if self._simulation is None:
+            raise ValidationError("simulation must be given to publish all of it at once, not None.")
+        return self._simulation
+
+    def _tell_on(self, period_s: float, cameras: list[str]) -> None:
+        due = time.monotonic()
+        while not self._ended.wait(max(0.0, due - time.monotonic())):
+            due = max(due + period_s, time.monotonic())
+            try:
+                self.publish(cameras)
+            except (RosError, ValidationError) as exc:
+                logger.warning("The simulation was not told to the graph: %s", exc)

@@ -1,0 +1,249 @@
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.contract import TaskRobot
+from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
+from strands_robots.envelope import Envelope, error
+from strands_robots.ros import goals, roads
+from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.link import Goal, Heard, MemoryLink, Message
+from strands_robots.utils import ValidationError
+
+NAV = "/navigate_to_pose"
+OPEN = CommandGate(lambda _: ("cmd_vel", "navigate_to_pose"), lambda: False)
+SHUT = CommandGate(lambda _: ("cmd_vel",), lambda: False)
+
+
+class Stack:
+    """A navigation stack in memory: keeps what it was asked, ends goals as the test says."""
+
+    def __init__(self) -> None:
+        self.asked: list[Message] = []
+        self.goals: list[Goal] = []
+        self.cancels = 0
+        self.feedback: Heard = lambda message: None
+        self.obeys = True
+        self.at_once: int | None = None
+
+    def begun(self, goal: Message, feedback: Heard, sent: Goal) -> None:
+        def cancel() -> None:
+            self.cancels += 1
+            if self.obeys:
+                sent.end(5, {})
+
+        self.asked.append(goal)
+        self.feedback = feedback
+        sent.cancel = cancel
+        self.goals.append(sent)
+        if self.at_once is not None:
+            sent.end(self.at_once, {"error_code": 0})
+
+
+class Lock:
+    """A lockout."""
+
+    def refusal(self, verb: str) -> Envelope | None:
+        return error(f"{verb} is locked")
+
+
+Made = Callable[..., RosBridgedRobot]
+
+
+@pytest.fixture
+def stack() -> Stack:
+    return Stack()
+
+
+@pytest.fixture
+def made(stack: Stack, monkeypatch: pytest.MonkeyPatch) -> Iterator[Made]:
+    monkeypatch.setattr(goals, "CANCEL_S", 0.2)
+    robots: list[RosBridgedRobot] = []
+
+    def make(**options: Any) -> RosBridgedRobot:
+        link = MemoryLink()
+        link.serve(NAV, stack.begun)
+        options = {"publish_rate": 200.0, "command_gate": OPEN, "nav_action": NAV, "link": link, **options}
+        robots.append(RosBridgedRobot("rover", "/cmd_vel", "/odom", **options))
+        standing = {"twist": {"twist": {"linear": {"x": 0.0}, "angular": {"z": 0.0}}}}
+        link.watch("/cmd_vel", None, lambda _: link.publish("/odom", "nav_msgs/msg/Odometry", standing))
+        return robots[-1]
+
+    yield make
+    for robot in robots:
+        robot.disconnect()
+
+
+def going(robot: RosBridgedRobot, stack: Stack, **options: Any) -> tuple[threading.Thread, list[Envelope]]:
+    """A navigation on a thread of its own, begun."""
+    answers: list[Envelope] = []
+    thread = threading.Thread(target=lambda: answers.append(robot.navigate_to(1.0, 2.0, **options)))
+    thread.start()
+    eventually(lambda: stack.goals)
+    return thread, answers
+
+
+def test_a_goal_that_is_reached_tells_what_was_asked_and_felt(made: Made, stack: Stack) -> None:
+    robot = made()
+    thread, answers = going(robot, stack, yaw=math.pi / 2, frame_id="odom")
+    for left in range(8):
+        stack.feedback({"distance_remaining": left})
+    assert robot.get_task_status()["task_status"] == "running"
+    stack.goals[0].end(4, {"error_code": 0})
+    thread.join(5)
+    answer = answers[0]
+    assert (answer["status"], answer["goal_state"], answer["goal_status"]) == ("success", "succeeded", 4)
+    assert (answer["result"], answer["feedback_count"], len(answer["feedback"])) == ({"error_code": 0}, 8, 5)
+    assert answer["feedback"][-1] == {"distance_remaining": 7}
+    pose = stack.asked[0]["pose"]
+    assert pose["header"]["frame_id"] == "odom"
+    assert pose["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
+    assert pose["pose"]["orientation"]["z"] == pytest.approx(math.sqrt(0.5))
+    status = robot.get_task_status()
+    assert (status["task_status"], status["step_count"]) == ("completed", 8)
+    assert status["instruction"] == "navigate to x 1 m, y 2 m in odom"
+
+
+@pytest.mark.parametrize(("status", "state"), [(6, "aborted"), (5, "canceled"), (99, "lost")])
+def test_every_other_end_is_an_error(made: Made, stack: Stack, status: int, state: str) -> None:
+    stack.at_once = status
+    answer = made().navigate_to(1.0, 2.0)
+    assert (answer["status"], answer["goal_state"], answer["goal_status"]) == ("error", state, status)
+
+
+def test_a_goal_that_takes_too_long_is_cancelled(made: Made, stack: Stack) -> None:
+    robot = made()
+    answer = robot.navigate_to(1.0, 2.0, timeout=0.05)
+    assert (answer["goal_state"], answer["ended_by"], stack.cancels) == ("canceled", "its time of 0.05 s", 1)
+    assert robot.get_task_status()["task_status"] == "error"
+
+
+def test_a_goal_that_does_not_obey_its_cancel_is_lost_and_no_stop_says_otherwise(made: Made, stack: Stack) -> None:
+    robot, stack.obeys = made(), False
+    answer = robot.navigate_to(1.0, 2.0, timeout=0.05)
+    assert (answer["status"], answer["goal_state"]) == ("error", "lost")
+    assert "nobody knows whether the goal still goes on" in answer["reason"]
+    verdict = robot.halt("test")
+    assert verdict.stopped is False
+    assert "nobody knows" in verdict.not_stopped["navigation"]
+    assert stack.cancels == 2
+    stack.goals[0].end(5, {})
+    assert robot.halt("test").stopped is True
+
+
+def test_a_stop_cancels_the_goal_and_says_so(made: Made, stack: Stack) -> None:
+    robot = made()
+    thread, answers = going(robot, stack)
+    verdict = robot.stop()
+    assert (verdict["stopped"], verdict["halted"], stack.cancels) == (True, ["navigation"], 1)
+    thread.join(5)
+    assert (answers[0]["goal_state"], answers[0]["ended_by"]) == ("canceled", "a stop")
+    assert robot.get_task_status()["task_status"] == "stopped"
+    assert robot.stop()["halted"] == []
+
+
+def test_a_stop_whose_goal_does_not_end_in_time_did_not_stop(
+    made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    robot, stack.obeys = made(), False
+    thread, _ = going(robot, stack)
+    verdict = robot.halt("test")
+    assert verdict.stopped is False
+    assert "being cancelled" in verdict.not_stopped["navigation"]
+    stack.goals[0].end(5, {})
+    thread.join(5)
+
+
+@pytest.mark.parametrize("argument", ["x", "y", "yaw"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), True, "1", None])
+def test_a_place_that_is_no_number_is_refused(made: Made, stack: Stack, argument: str, bad: Any) -> None:
+    answer = made().navigate_to(**{"x": 1.0, "y": 2.0, argument: bad})
+    assert argument in answer["reason"]
+    assert stack.asked == []
+
+
+@pytest.mark.parametrize("bad", [0, -1, float("nan"), float("inf"), True])
+def test_a_time_that_cannot_be_waited_out_is_refused(made: Made, stack: Stack, bad: Any) -> None:
+    assert "timeout" in made().navigate_to(1.0, 2.0, timeout=bad)["reason"]
+    assert "frame_id" in made().navigate_to(1.0, 2.0, frame_id="")["reason"]
+    assert stack.asked == []
+
+
+def test_a_goal_needs_a_stack_leave_and_no_lock(made: Made, stack: Stack) -> None:
+    assert "nav_action" in made(nav_action=None).navigate_to(1.0, 2.0)["reason"]
+    assert "needs operator approval" in made(command_gate=SHUT).navigate_to(1.0, 2.0)["reason"]
+    locked = made()
+    locked.gate.attach(Lock())
+    assert "locked" in locked.navigate_to(1.0, 2.0)["reason"]
+    alone = made(link=MemoryLink())
+    answer = alone.navigate_to(1.0, 2.0)
+    assert (answer["goal_state"], "Nobody serves" in answer["reason"]) == ("not sent", True)
+    assert stack.asked == []
+
+
+def test_a_drive_and_a_goal_exclude_each_other(made: Made, stack: Stack) -> None:
+    robot = made()
+    thread, _ = going(robot, stack)
+    assert "stop it first" in robot.drive(0.1, duration=0.1)["reason"]
+    assert "stop it first" in robot.navigate_to(3.0, 3.0)["reason"]
+    robot.stop()
+    thread.join(5)
+    assert robot.drive(0.1, duration=0.02)["status"] == "success"
+    assert robot.get_task_status()["instruction"].startswith("drive")
+
+
+def test_leaving_the_graph_cancels_the_goal_first(made: Made, stack: Stack) -> None:
+    robot = made()
+    thread, answers = going(robot, stack)
+    robot.disconnect()
+    thread.join(5)
+    assert (stack.cancels, answers[0]["goal_state"]) == (1, "canceled")
+
+
+def test_its_tools_are_named_by_it_and_describe_every_parameter(made: Made, stack: Stack) -> None:
+    robot = made(scan_topic="/scan")
+    names = [each.tool_name for each in robot.tools]
+    assert names == [
+        "drive_rover",
+        "stop_rover",
+        "status_rover",
+        "get_pose_rover",
+        "get_scan_rover",
+        "navigate_rover",
+    ]
+    for each in robot.tools:
+        for name, parameter in each.tool_spec["inputSchema"]["json"]["properties"].items():
+            assert len(parameter["description"]) > 10, (each.tool_name, name)
+    assert "navigate_rover" not in [each.tool_name for each in made(nav_action=None).tools]
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"nav_action": "not a name"}, "nav_action"),
+        ({"nav_action_type": "x"}, "nav_action_type"),
+        ({"publish_rate": 0}, "publish_rate"),
+        ({"max_linear": -1}, "max_linear"),
+        ({"domain_id": 233}, "domain_id"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_refused(options: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValidationError, match=named):
+        RosBridgedRobot("rover", "/cmd_vel", "/odom", **options)
+
+
+def test_it_is_made_without_any_ros_and_says_what_is_missing_when_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(roads, "sourced", lambda: False)
+    monkeypatch.setattr(roads, "find_spec", lambda name: None)
+    robot = RosBridgedRobot.from_ros("rover", cmd_vel_topic="/cmd_vel", odom_topic="/odom", command_gate=OPEN)
+    assert isinstance(robot, TaskRobot)
+    for answer in (robot.drive(0.1), robot.get_pose(), robot.stop()):
+        assert "source a ROS 2 installation, or install the [ros2] extra" in answer["reason"]
+    robot.disconnect()
