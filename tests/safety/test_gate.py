@@ -46,7 +46,7 @@ def test_a_locked_gate_gives_no_permit_and_says_why() -> None:
     with pytest.raises(MotionRefused, match="start is locked") as refused:
         gate.permit("start")
     assert refused.value.envelope["status"] == "error"
-    assert gate.refusal("step") is not None
+    assert gate.refusal("step")
     latch.locked = False
     assert gate.permit("start").valid
 

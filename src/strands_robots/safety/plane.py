@@ -18,7 +18,7 @@ from strands_robots.safety.clearance import ClearanceDesk
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.halting import HaltWorker
 from strands_robots.safety.latch import LockoutLatch
-from strands_robots.safety.lockout import Cleared, Hold
+from strands_robots.safety.lockout import Cleared, Hold, LockoutState
 from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
 from strands_robots.safety.persistence import Kept, LockoutStore
 from strands_robots.safety.reporting import OnReport, Reporter, StopRun
@@ -78,11 +78,23 @@ class Registered:
     def adopt(self, key: str, kept: Kept) -> None:
         """Keep this robot under ``key`` from now on, and hold what was kept there."""
         self.key = key
-        for hold in kept.state.all:
+        self.inherit(kept.state)
+
+    def inherit(self, state: LockoutState) -> None:
+        """Hold what was held elsewhere, except what was resumed here since."""
+        for hold in state.all:
             self.latch.engage(hold.epoch, hold.source, hold.reason)
-        if self.locked:
-            for gate in self.gates:
-                gate.revoke()
+
+    def come_up_locked(self) -> None:
+        """Halt what moved before anybody knew that it is locked. Returns at once."""
+        for gate in self.gates:
+            gate.revoke()
+        logger.warning("%s comes up locked: epochs %s.", self.robot_id, ", ".join(self.epochs))
+        self.worker.halt("it comes up locked", self._came_up)
+
+    def _came_up(self, verdict: StopVerdict) -> None:
+        if verdict.stopped is not True:
+            logger.critical("%s comes up locked and DID NOT STOP: %s", self.robot_id, verdict.envelope().get("reason"))
 
     def remember(self, report: RobotReport) -> None:
         """Keep the report for whoever asks about this stop again."""
@@ -146,18 +158,20 @@ class SafetyPlane:
                     known.gates = (*known.gates, robot.gate)
                 if key and known.key is None:
                     known.adopt(key, self.store.load(key))
+                    if known.locked:
+                        known.come_up_locked()
+                        self._kept([known])
                 return known
             kept = self.store.load(key) if key else Kept()
             entry = Registered(self, robot_id, robot, key=key, kept=kept, wire_id=wire_id or robot_id)
             robot.gate.attach(entry.latch)
+            self._inherit(entry)
             if not self._robots:
                 self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
                 self._reporter = Reporter(self._tick)
             self._robots = {**self._robots, robot_id: entry}
         if entry.locked:
-            # A permit given before the latch was attached is void.
-            robot.gate.revoke()
-            logger.warning("%s comes up locked: epochs %s.", robot_id, ", ".join(entry.epochs))
+            entry.come_up_locked()
         return entry
 
     def unregister(self, entry: Registered) -> None:
@@ -167,10 +181,28 @@ class SafetyPlane:
             if entry.users or self._robots.get(entry.robot_id) is not entry:
                 return
             self._robots = {name: each for name, each in self._robots.items() if each is not entry}
+            self._bequeath(entry)
             reporter, self._reporter = self._reporter, None if not self._robots else self._reporter
         if not self._robots and reporter is not None:
             reporter.close()
         entry.worker.close()
+
+    def _inherit(self, entry: Registered) -> None:
+        """What a robot was locked by when it left the plane holds it here, though it is on no disk."""
+        living = [each.latch for each in self._robots.values()]
+        for latch in entry.robot.gate.latches:
+            if isinstance(latch, LockoutLatch) and latch is not entry.latch and latch not in living:
+                entry.inherit(latch.state)
+                entry.robot.gate.detach(latch)
+
+    def _bequeath(self, entry: Registered) -> None:
+        """The lock of a robot that leaves goes on: in the entry of its other name, else in its gate."""
+        for gate in entry.gates:
+            heirs = [each for each in self._robots.values() if gate in each.gates]
+            for heir in heirs:
+                heir.inherit(entry.latch.state)
+            if heirs or not entry.locked:
+                gate.detach(entry.latch)
 
     def begin(self, order: StopOrder, on_report: OnReport = lambda report: None) -> StopRun | None:
         """Lock every robot at once and set every halt going; returns before any of them has answered.
