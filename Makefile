@@ -28,6 +28,7 @@ system:
 	@./scripts/reachy-daemon.sh 1.13.0
 	@./scripts/reachy-daemon.sh 1.4.1
 	@./scripts/real-arm.sh
+	@./scripts/rosbridge.sh
 
 test-all: venv system  ## What needs Debian or npm packages besides
 	@$(BIN)/python -m pytest -m system $(ARGS)
