@@ -159,13 +159,14 @@ class LeaderPolicy:
         if self._sink is None:
             return
         try:
-            self._sink.publish(self._device, self._method, numbers(frame), self._events())
+            self._sink.publish(self._device, self._method, numbers(frame), self.events())
         except Exception:
             self.sink_errors += 1
             if self.sink_errors == 1:
                 logger.exception("The frames of %s do not reach the network; the follower goes on.", self._device)
 
-    def _events(self) -> dict[str, Any] | None:
+    def events(self) -> dict[str, Any] | None:
+        """What the leader tells besides its targets; None where it tells nothing, or the reading failed."""
         read = getattr(self._leader, "get_teleop_events", None)
         if not callable(read):
             return None

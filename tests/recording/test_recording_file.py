@@ -94,6 +94,21 @@ def test_actions_lead_and_a_device_is_named_where_there_are_several(tmp_path: Pa
         recorded_actions(path, "arm-3")
 
 
+def test_an_arm_that_was_moved_by_hand_leads_with_its_joints(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        for step in range(5):
+            recorder.take_joints("arm-1", {"pan.pos": float(step)})
+            recorder.take_joints("arm-2", {"pan.pos": 7.0})
+        recorder.take("arm-2", "streamStep", {"step": 0, "action": {"pan.pos": 9.0}})
+    assert [action["pan.pos"] for _, action in recorded_actions(path, "arm-1")] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert [action["pan.pos"] for _, action in recorded_actions(path)] == [9.0], "who was driven comes first"
+    with Recorder(tmp_path / "none.mcap") as recorder:
+        recorder.take("arm-1", "taskStarted", {})
+    with pytest.raises(ValidationError, match="nothing in it can lead"):
+        recorded_actions(tmp_path / "none.mcap")
+
+
 def test_a_recording_is_never_overwritten_and_other_files_are_refused(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", 1, "arm-1")
     with pytest.raises(ValidationError, match="there already"):

@@ -84,7 +84,7 @@ def serve_on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> 
     """Put ``body`` on the native mesh until Ctrl-C or SIGTERM, which stops the robot first."""
     from strands_robots.device_connect.signals import StopSignal  # noqa: PLC0415 - loads nothing of the framework
 
-    with StopSignal() as asked, _joined(body, peer_id, mode) as mesh:
+    with StopSignal() as asked, joined(body, peer_id, mode) as mesh:
         screen.data({"event": "serving", "peer_id": mesh.peer_id, "network": "mesh", "pid": os.getpid()})
         screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: strands-robots peers --mesh", "green")
         screen.say("Ctrl-C stops the robot, then takes it off the mesh.")
@@ -102,7 +102,7 @@ def serve_on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> 
 
 def peers_on_mesh(screen: Screen, timeout: float) -> None:
     """List the peers that announce themselves within ``timeout`` seconds."""
-    with _joined(None, f"console-{secrets.token_hex(4)}", "tool") as mesh:
+    with joined(None, f"console-{secrets.token_hex(4)}", "tool") as mesh:
         time.sleep(timeout)
         rows = [row for row in mesh.peers if row["reachable"]]
     if not rows:
@@ -113,7 +113,8 @@ def peers_on_mesh(screen: Screen, timeout: float) -> None:
 
 
 @contextmanager
-def _joined(body: Any, peer_id: str | None, mode: str) -> Iterator[Mesh]:
+def joined(body: Any, peer_id: str | None, mode: str) -> Iterator[Mesh]:
+    """A peer of the mesh while the block runs. Raises :class:`Failure` where there is no mesh to join."""
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - loaded when it is used
 
     try:

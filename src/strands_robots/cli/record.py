@@ -14,7 +14,7 @@ from strands_robots.cli.fleet import reached
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Failure, Screen
 from strands_robots.cli.recorded import lossless, told
-from strands_robots.cli.teleop import arm_options, drive, recorded
+from strands_robots.cli.teleop import arm_options, drive, recording
 from strands_robots.recording import Recorder
 from strands_robots.utils import number
 
@@ -55,15 +55,15 @@ def record(
 def replay(
     screen: Screen,
     *,
-    file: Annotated[Path, typer.Argument(help="A recording: .mcap or .csv.")],
-    to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, or a model in simulation.")],
+    file: Annotated[Path, typer.Argument(help="A recording: .mcap, .csv or .parquet.")],
+    to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, a model, or mesh:PEER.")],
     device: Annotated[str | None, typer.Option("--device", help="Whose actions, where several are recorded.")] = None,
     follower_id: Annotated[str | None, typer.Option("--id", help="Whose calibration the follower has.")] = None,
     calibration: Annotated[Path | None, typer.Option("--calibration", help="A calibration file.")] = None,
     speed: Annotated[float, typer.Option("--speed", help="Times as fast, at most 10.")] = 1.0,
 ) -> None:
-    """Play the recorded actions of a device to a follower on this machine, and stop it at the end."""
-    leader = recorded(file, device, speed)
+    """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""
+    leader = recording(file, device, speed)
 
     def led(robot: Any) -> contextlib.AbstractContextManager[Any]:
         return contextlib.nullcontext(leader)

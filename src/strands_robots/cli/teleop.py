@@ -7,16 +7,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strands_robots.cli.command import command
+from strands_robots.cli.far import MESH, lead_far
 from strands_robots.cli.output import Failure, Screen, table
+from strands_robots.cli.recorded import recorded
 from strands_robots.envelope import is_error, text_of
+from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleop import FULL_RANGES_PER_S
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, identifier
 
 if TYPE_CHECKING:
     from strands_robots.hardware.calibrating import Reach
@@ -36,9 +40,12 @@ def teleop(
     screen: Screen,
     *,
     leader: Annotated[
-        str, typer.Argument(help="keyboard, gamepad, a recording (.csv, .mcap), or TYPE@PORT of a leader arm.")
+        str,
+        typer.Argument(help="keyboard, gamepad, a recording (.csv, .parquet, .mcap), or TYPE@PORT of a leader arm."),
     ],
-    follower: Annotated[str, typer.Argument(help="TYPE@PORT of a real arm, such as so101@/dev/ttyACM0, or a model.")],
+    follower: Annotated[
+        str, typer.Argument(help="TYPE@PORT of a real arm, a model in simulation, or mesh:PEER elsewhere.")
+    ],
     leader_id: Annotated[str | None, typer.Option("--leader-id", help="Whose calibration the leader has.")] = None,
     follower_id: Annotated[str | None, typer.Option("--id", help="Whose calibration the follower has.")] = None,
     leader_calibration: Annotated[
@@ -50,6 +57,10 @@ def teleop(
     max_speed: Annotated[
         float, typer.Option("--max-speed", help="Whole joint ranges a second that the follower may cross.")
     ] = FULL_RANGES_PER_S,
+    publish: Annotated[
+        str | None, typer.Option("--publish", help="Also let others follow, on the mesh as this PEER.", metavar="PEER")
+    ] = None,
+    record: Annotated[Path | None, typer.Option("--record", help="Also record the follower: a new .mcap.")] = None,
 ) -> None:
     """Let a leader drive a follower until it ends or Ctrl-C, which stops the follower first."""
     drive(
@@ -62,6 +73,8 @@ def teleop(
         seconds=seconds,
         hz=hz,
         max_speed=max_speed,
+        publish=publish,
+        record=record,
     )
 
 
@@ -76,37 +89,50 @@ def drive(
     seconds: float | None = None,
     hz: float = 50.0,
     max_speed: float = FULL_RANGES_PER_S,
+    publish: str | None = None,
+    record: Path | None = None,
 ) -> None:
     """Make the follower, let the leader that ``led`` gives for it drive it to the end, and stop it whatever happens.
 
     Raises:
         Failure: it was refused, it failed, or the follower did not confirm its stop.
     """
+    if follower.startswith(MESH):
+        if publish is not None or record is not None:
+            raise ValidationError("--publish and --record are for a follower of this machine, not of the mesh.")
+        peer = identifier("follower", follower.removeprefix(MESH))
+        waits = partial(_until, screen)
+        lead_far(screen, leader, peer, led, waits, method=method, seconds=seconds, hz=hz, max_speed=max_speed)
+        return
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
-    robot = Robot(kind, mode="real" if at else "sim", **({**options, "port": port} if at else {}))
+    place = None if publish is None else identifier("--publish", publish)
+    given = {**options, "port": port} if at else {}
+    robot = Robot(kind, mode="real" if at else "sim", peer_id=place, mesh=True if place else None, **given)
     try:
-        with led(robot) as source:
+        with recorded(screen, robot, publish or robot.tool_name_str, record), led(robot) as source:
             for answer in (
                 robot.attach_teleop(source, _NAME, method=method, max_speed=max_speed),
-                robot.teleoperate(_NAME, duration=seconds, hz=hz),
+                robot.teleoperate(_NAME, duration=seconds, hz=hz, publish=publish is not None),
             ):
                 if is_error(answer):
                     raise Failure(text_of(answer))
             screen.say(f"{leader} leads {follower}. Ctrl-C stops the follower.")
+            if publish is not None:
+                screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
             for name, up, down in getattr(source, "help", []):
                 screen.say(f"  {up} and {down} move {name}")
-            row = _followed(screen, robot, source)
+            row, verdict = _followed(screen, robot, source)
     finally:
-        verdict = robot.halt("teleop ended")
+        robot.halt("teleop ended")
         robot.cleanup()
     screen.data({"event": "ended", **row, "stopped": verdict.stopped})
     if row["state"] == "error":
         raise Failure(f"The teleoperation failed: {row['error']}", **row)
     screen.say(f"{row['state'].capitalize()} after {row['step']} frames, {row['errors']} of them unusable.", "green")
     if not verdict.stopped:
-        raise Failure("The follower did not confirm its stop.")
+        raise Failure(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
 
 
 def calibrate(
@@ -152,7 +178,7 @@ def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
         return
     kind, at, port = leader.partition("@")
     if not at:
-        yield recorded(Path(leader))
+        yield recording(Path(leader))
         return
     from strands_robots.hardware import DeviceBody  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
@@ -165,31 +191,54 @@ def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
         arm.disconnect()
 
 
-def recorded(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
-    """A recording as a leader: ``.csv``, or ``.mcap`` of one device.
+def recording(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
+    """A recording as a leader: ``.csv``, a LeRobot ``.parquet``, or ``.mcap`` of one device.
+
+    Args:
+        path: the file.
+        device: whose actions, where an ``.mcap`` has those of several; the episode of a ``.parquet``.
+        speed: times as fast.
 
     Raises:
         ValidationError: it cannot be read, or it has no actions of that device.
+        MissingExtraError: what reads it is not installed.
     """
-    from strands_robots.leaders import RecordedLeader, read_frames  # noqa: PLC0415 - as above
+    from strands_robots.leaders import RecordedLeader, read_episode, read_frames  # noqa: PLC0415 - as above
     from strands_robots.recording import recorded_actions  # noqa: PLC0415
 
-    frames = recorded_actions(path, device) if path.suffix == ".mcap" else read_frames(path)
+    if path.suffix == ".mcap":
+        frames = recorded_actions(path, device)
+    else:
+        frames = read_episode(path, device) if path.suffix == ".parquet" else read_frames(path)
     return RecordedLeader(frames, speed)
 
 
-def _followed(screen: Screen, robot: Any, source: Any) -> dict[str, Any]:
-    """Wait for the end, with a bar where the leader knows how long it leads; the leader's row."""
-    duration = getattr(source, "duration", None)
-    with following(screen, None if duration is None else float(duration)) as moved:
+def _followed(screen: Screen, robot: Any, source: Any) -> tuple[dict[str, Any], StopVerdict]:
+    """Wait for the end, with a bar where the leader knows how long it leads, and stop: its row, the verdict."""
+
+    def over() -> str:
+        return "" if _NAME in robot.teleoperating() else "It has ended."
+
+    _until(screen, over, getattr(source, "duration", None) or 0.0)
+    screen.say("Stopping the follower...")
+    verdict: StopVerdict = robot.halt("teleop ended")
+    if verdict.stopped:
+        screen.say("The follower stands still.", "green")
+    row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
+    return row, verdict
+
+
+def _until(screen: Screen, over: Callable[[], str], duration: float) -> str:
+    """Wait until ``over`` says why, with a bar where the leader knows how long it leads."""
+    began = time.monotonic()
+    with following(screen, duration or None) as moved:
         try:
-            while _NAME in robot.teleoperating():
-                moved(getattr(source, "position", 0.0))
+            while not (why := over()):
+                moved(time.monotonic() - began)
                 time.sleep(_LOOK_S)
         except KeyboardInterrupt:
-            robot.halt("Ctrl-C")
-    row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
-    return row
+            return "Ctrl-C."
+    return why
 
 
 @contextmanager

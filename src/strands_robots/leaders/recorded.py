@@ -88,7 +88,7 @@ def read_frames(path: Path) -> list[Frame]:
         ValidationError: no such file, another kind of file, or a line that is none; the sentence names the line.
     """
     if path.suffix != ".csv":
-        raise ValidationError(f"a recording must be a .csv or .mcap file, not {shown(str(path))}.")
+        raise ValidationError(f"a recording must be a .csv, .parquet or .mcap file, not {shown(str(path))}.")
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.reader(file)

@@ -1,0 +1,104 @@
+"""A recording leads a follower of another process over the mesh, and does no more than the follower allows."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.mesh_peer import MeshPeer
+from fixtures.waiting import eventually
+
+from strands_robots.leaders import write_csv
+
+Join = Callable[..., MeshPeer]
+
+COMMAND = [sys.executable, "-m", "strands_robots.cli"]
+
+
+@pytest.fixture
+def wave(tmp_path: Path) -> Path:
+    """Twenty seconds of a joint that the followers here have."""
+    frames = [(0.1 * step, {"shoulder.pos": 0.1 * step}) for step in range(200)]
+    write_csv(tmp_path / "wave.csv", frames)
+    return tmp_path / "wave.csv"
+
+
+@pytest.fixture
+def replay(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setenv("STRANDS_MESH_PORT", str(port))
+    monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
+
+    def start(*words: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [*COMMAND, "replay", *words, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    return start
+
+
+def ended(replaying: subprocess.Popen[str]) -> tuple[int, list[dict[str, Any]]]:
+    out, problems = replaying.communicate(timeout=30)
+    assert "Traceback" not in problems, problems
+    return replaying.returncode, [json.loads(line) for line in out.splitlines()]
+
+
+def followed(arm: MeshPeer, least: int) -> None:
+    eventually(lambda: len(arm.ask("actions")) >= least, within=15, what="the follower is led")
+
+
+def test_an_approved_arm_is_led_to_the_end_and_stopped(join: Join, replay: Any, wave: Path) -> None:
+    arm = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive")
+    code, [told] = ended(replay(str(wave), "--to", "mesh:arm-1", "--speed", "10"))
+    assert (code, told["stopped"], told["errors"]) == (0, True, 0), told
+    actions = [action["shoulder.pos"] for action in arm.ask("actions")]
+    assert actions == sorted(actions)
+    assert actions[-1] == pytest.approx(19.9, abs=1.5)
+    assert len(arm.ask("halts")[0]) == 1
+
+
+def test_without_approval_nothing_moves_and_the_command_that_approves_is_named(
+    join: Join, replay: Any, wave: Path
+) -> None:
+    arm = join("arm-1", "arm")
+    code, [told] = ended(replay(str(wave), "--to", "mesh:arm-1"))
+    assert code == 1
+    assert "teleop_receive" in told["reason"]
+    assert "grant" in told["reason"]
+    assert arm.ask("actions") == []
+
+
+def test_an_emergency_stop_ends_the_replay_and_nothing_follows(join: Join, replay: Any, wave: Path) -> None:
+    arm = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive")
+    console = join("console-1", "none")
+    console.sees("arm-1")
+    replaying = replay(str(wave), "--to", "mesh:arm-1")
+    followed(arm, 10)
+    console.ask("estop")
+    count = len(arm.ask("actions"))
+    code, lines = ended(replaying)
+    assert code == 1
+    assert "follows no more: it was halted or locked" in lines[-1]["reason"]
+    assert lines[0]["stopped"] is True
+    assert len(arm.ask("actions")) == count
+
+
+def test_ctrl_c_stops_the_follower_first(join: Join, replay: Any, wave: Path) -> None:
+    arm = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive")
+    replaying = replay(str(wave), "--to", "mesh:arm-1")
+    followed(arm, 10)
+    replaying.send_signal(signal.SIGINT)
+    code, [told] = ended(replaying)
+    assert (code, told["why"], told["stopped"]) == (0, "Ctrl-C.", True)
+    assert len(arm.ask("halts")[0]) == 1
+
+
+def test_a_follower_that_is_not_there_is_one_sentence(replay: Any, wave: Path) -> None:
+    code, [told] = ended(replay(str(wave), "--to", "mesh:nobody-1"))
+    assert code == 3
+    assert "nobody-1" in told["reason"]
