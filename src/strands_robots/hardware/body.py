@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 import time
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Literal
 
 from strands_robots.bus_access import action_ranges, bus_lock, read_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
+from strands_robots.policies.actions import numbers
 from strands_robots.policies.base import Action
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.utils import ValidationError, number, shown
@@ -69,6 +70,7 @@ class DeviceBody:
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         self._latest: tuple[float, dict[str, float]] | None = None
         self._lost = False
+        self._stops = 0
 
     @property
     def lost(self) -> bool:
@@ -116,14 +118,18 @@ class DeviceBody:
 
     def get_observation(self) -> dict[str, Any]:
         with self.lock:
-            return dict(self.device.get_observation())
+            began = time.monotonic()
+            observation = dict(self.device.get_observation())
+            self._latest = (began, numbers(observation))
+            return observation
 
-    def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
-        """The joints now. An answer that is lost is asked for again. Raises what the device raises."""
+    def get_joints(self) -> dict[str, float]:
+        """The joints now. An answer that is lost is asked for again, unless a stop waits for the bus.
+
+        Raises what the device raises.
+        """
         with self.lock:
-            joints = self._read(tries)
-            self._latest = (time.monotonic(), joints)
-            return dict(joints)
+            return self._joints(READ_TRIES)
 
     def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
         with self.lock:
@@ -137,6 +143,20 @@ class DeviceBody:
             if permit is None or not permit.revoked:
                 self._hold()
 
+    @contextmanager
+    def stopping(self) -> Iterator[None]:
+        """The bus for whoever stops the body: others give it up after the exchange that is under way.
+
+        It is waited for without end; who may not wait so long does this on a thread.
+        """
+        # Halts take turns on the freezer's thread, so that nobody else counts here.
+        self._stops += 1
+        try:
+            with self.lock:
+                yield
+        finally:
+            self._stops -= 1
+
     def stop(self) -> None:
         """Freeze, or let go, as the stop level says.
 
@@ -144,30 +164,37 @@ class DeviceBody:
             ConnectionError: the port is gone, or some motors did not confirm that they let go.
             Exception: what else the device raises.
         """
-        with self.lock:
+        with self.stopping():
             if self.lost:
                 raise ConnectionError("its port is gone; a servo goes on to its last goal")
             if self.stop_level == "release":
                 self._release()
             else:
-                self._hold()
+                self._hold(urgent=True)
 
     def running(self) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def _read(self, tries: int) -> dict[str, float]:
+    def _joints(self, tries: int, *, urgent: bool = False) -> dict[str, float]:
         for left in reversed(range(tries)):
             # An answer that came late would be taken for this one's, and every read after it be old.
             forget_input(self.device)
             try:
-                return read_joints(self.device)
+                joints = read_joints(self.device)
             except ConnectionError:
-                if not left:
+                if not left or (self._stops and not urgent):
                     raise
+                continue
+            self._latest = (time.monotonic(), joints)
+            return dict(joints)
         raise AssertionError  # the last try returns or raises
 
-    def _hold(self) -> None:
-        """The device's own ``hold()``, else the present position as the target and every velocity zero."""
+    def _hold(self, *, urgent: bool = False) -> None:
+        """The device's own ``hold()``, else the present position as the target and every velocity zero.
+
+        Args:
+            urgent: nobody who stops the body is waited for: this is the stop.
+        """
         own = getattr(self.device, "hold", None)
         if callable(own):
             own()
@@ -178,15 +205,15 @@ class DeviceBody:
             return
         age, known = self.latest_joints or (math.inf, {})
         try:
-            present = self.get_joints(1)
+            present = self._joints(1)
         except ConnectionError:
             # One silent motor must not leave the others running to their goals while it is asked again.
             if age <= HOLD_FRESH_S:
                 self._send_still(dict(still), known)
-            present = self.get_joints()
+            present = self._joints(READ_TRIES, urgent=urgent)
         self._send_still(still, present)
         # A bus does not confirm targets; what it answers after them shows that it took them.
-        self.get_joints()
+        self._joints(READ_TRIES, urgent=urgent)
 
     def _send_still(self, still: dict[str, float], present: Mapping[str, float]) -> None:
         still |= {key: present[key] for key in self.bounds if key in present and key not in still}

@@ -72,6 +72,7 @@ class HardwareRobot(Tasks):
         Raises what the device raises.
         """
         self._body.connect()
+        self._freezer.ready()
 
     def get_features(self) -> Envelope:
         """``observation_features`` and ``action_features`` as data (``float``, or an image's shape), with ranges."""
@@ -85,7 +86,7 @@ class HardwareRobot(Tasks):
     def get_state(self) -> Envelope:
         """``joints`` by name in the device's unit, ``joints_age_s``, and ``task``.
 
-        While a loop drives the robot the joints are those of its last read, which is not a control period old. The
+        While a loop drives the robot the joints are those of its last read, at most two control periods old. Else the
         read waits its turn on the bus for at most a control period; then the joints are those of the last read, and
         ``joints_error`` says why. A camera that fails does not touch them.
         """
@@ -113,6 +114,7 @@ class HardwareRobot(Tasks):
         """Set targets once; ``sent`` is what the device really took. Refused while a task or a leader drives it."""
         try:
             with self.starting:
+                self._freezer.ready()
                 permit = self.gate.permit("send_action")
                 self._free()
                 targets = checked_action(dict(action) if isinstance(action, Mapping) else action, self._body.bounds)
@@ -159,6 +161,7 @@ class HardwareRobot(Tasks):
         verdict = self.halt("cleanup")
         if not verdict.stopped:
             return verdict.envelope()
+        self._freezer.close()
         if self._body.is_connected:
             try:
                 with self._body.lock:
@@ -174,7 +177,8 @@ class HardwareRobot(Tasks):
         if self._body.lost:
             return "The device's port is gone; these are the joints of the last read."
         age, _ = self._body.latest_joints or (math.inf, {})
-        if age < within_s and (self.teleoperating() or (self._task is not None and self._task.running)):
+        # Two, because at one the loop itself is about to read, and would be held up.
+        if age <= 2 * within_s and (self.teleoperating() or (self._task is not None and self._task.running)):
             return ""
         if not self._body.lock.acquire(timeout=within_s):
             return f"The bus was busy for {within_s:g} s; these are the joints of the last read."

@@ -140,6 +140,7 @@ class Tasks(TeleopMixin):
         whole("policy_port", options["policy_port"], low=0, high=65535)
         name = resolve_provider(provider)
         with self.starting:
+            self._freezer.ready()
             permit = self.gate.permit("start_task")
             self._free()
             self._reconnect()
