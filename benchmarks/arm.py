@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from fixtures.feetech_bus import MOTORS, FeetechBus, Write, arm_servos, write_calibration
+from fixtures.feetech_bus import MOTORS, Write, write_calibration
+from fixtures.feetech_bus.process import BusProcess
 from fixtures.waiting import eventually, free_port
 
 from benchmarks.arm_leading import leading
@@ -30,7 +31,8 @@ from strands_robots.safety.lane import lane
 from strands_robots.safety.plane import plane
 
 HZ = 50.0
-SECONDS, SECONDS_QUICK = 60.0, 5.0
+SECONDS, SECONDS_QUICK = 60.0, 10.0
+TURN_S = 5.0
 STOPS, STOPS_QUICK = 20, 3
 STATE_HZ = 10.0
 JITTER_MS = 1.0
@@ -56,9 +58,9 @@ def run(*, quick: bool = False) -> list[Row]:
 
 
 @contextmanager
-def arm() -> Iterator[tuple[FeetechBus, Any]]:
-    """An arm on an emulated bus."""
-    with tempfile.TemporaryDirectory(prefix="bench-arm-") as folder, FeetechBus(arm_servos()) as bus:
+def arm() -> Iterator[tuple[BusProcess, Any]]:
+    """An arm on an emulated bus, whose servos take no interpreter time from what is measured here."""
+    with tempfile.TemporaryDirectory(prefix="bench-arm-") as folder, BusProcess(Path(folder) / "arm") as bus:
         calibration = write_calibration(Path(folder) / "calibration.json")
         robot = Robot("so101", mode="real", port=bus.port, calibration=calibration, calibration_dir=folder)
         try:
@@ -102,26 +104,45 @@ def recording(seconds: float) -> Row:
 
 
 def jitter(seconds: float) -> Row:
-    """How far the writes of a rollout stray from their period while its state is read, beside a plain loop."""
+    """How far the writes of a rollout stray from their period while its state is read, beside a plain loop.
+
+    Both take turns of a few seconds, so that what else the machine does meets both.
+    """
+    turns = max(2, round(seconds / TURN_S))
+    plain: list[float] = []
+    ours: list[float] = []
+    lost = steps = 0
     with arm() as (bus, robot):
-        began = time.monotonic()
-        lost = plain_loop(robot.device, seconds)
-        plain = strays(bus.written_after(began))
-        with served(robot), reading(robot.get_state):
-            began = time.monotonic()
-            started = robot.start_task("wave", duration=seconds)
-            assert started["status"] == "success", started
-            eventually(lambda: robot.get_task_status()["task_status"] != "running", within=seconds + 30)
-        status = robot.get_task_status()
-        ours = strays(bus.written_after(began))
+        for turn in range(2 * turns):
+            # Plain, ours, ours, plain: neither has the better half of a turn.
+            if turn % 4 in (0, 3):
+                bus.forget()
+                lost += plain_loop(robot.device, TURN_S)
+                plain += strays(bus.written_after())
+            else:
+                bus.forget()
+                steps += ours_loop(robot, TURN_S)
+                ours += strays(bus.written_after())
+    mine, bare = percentile(ours), percentile(plain)
     return Row(
-        what=f"jitter of the writes at 50 Hz, p99 of {seconds:.0f} s, with 10 Hz getState and publishing",
-        ours=f"{ours:.2f} ms, {status['step_count']} steps",
-        against=f"{plain:.2f} ms, LeRobot's calls in a plain loop, {lost} beats lost",
-        ratio=ours / plain,
+        what=f"jitter of the writes at 50 Hz, p99 of {turns * TURN_S:.0f} s, with 10 Hz getState and publishing",
+        ours=f"{mine:.2f} ms, {steps} steps",
+        against=f"{bare:.2f} ms, LeRobot's calls in a plain loop, {lost} beats lost",
+        ratio=mine / bare,
         must=f"at most {JITTER_MS:g} ms more",
-        ok=status["task_status"] == "completed" and ours <= plain + JITTER_MS,
+        ok=mine <= bare + JITTER_MS,
     )
+
+
+def ours_loop(robot: Any, seconds: float) -> int:
+    """A rollout of so long on the network, its state read ten times a second; the steps that it took."""
+    with served(robot), reading(robot.get_state):
+        started = robot.start_task("wave", duration=seconds)
+        assert started["status"] == "success", started
+        eventually(lambda: robot.get_task_status()["task_status"] != "running", within=seconds + 30)
+    status = robot.get_task_status()
+    assert status["task_status"] == "completed", status
+    return int(status["step_count"])
 
 
 def last_write(stops: int) -> Row:
@@ -140,7 +161,7 @@ def last_write(stops: int) -> Row:
                 report = controller.stop(["arm-1"], "benchmark")
                 assert report.ok, report
                 time.sleep(0.1)
-                took.append((max(write.at for write in bus.writes) - called) * 1000)
+                took.append((bus.last_write() - called) * 1000)
         finally:
             controller.close()
     took.sort()
@@ -168,11 +189,15 @@ def plain_loop(device: Any, seconds: float) -> int:
     return lost
 
 
-def strays(writes: list[Write]) -> float:
-    """99th percentile of how far the gaps between the first servo's goals are from the period, ms."""
+def strays(writes: list[Write]) -> list[float]:
+    """How far the gaps between the first servo's goals are from the period, ms; the hold at the end is no beat."""
     times = [write.at for write in writes if write.servo == 1]
-    gaps = sorted(abs(after - before - 1 / HZ) * 1000 for before, after in pairwise(times))
-    return gaps[int(len(gaps) * 0.99)]
+    return [abs(after - before - 1 / HZ) * 1000 for before, after in pairwise(times[:-1])]
+
+
+def percentile(gaps: list[float]) -> float:
+    """The 99th."""
+    return sorted(gaps)[int(len(gaps) * 0.99)]
 
 
 @contextmanager
