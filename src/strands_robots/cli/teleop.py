@@ -242,7 +242,7 @@ def _until(screen: Screen, over: Callable[[], str], duration: float) -> str:
 
 
 @contextmanager
-def following(screen: Screen, seconds: float | None) -> Iterator[Callable[[float], None]]:
+def following(screen: Screen, seconds: float | None, what: str = "playing") -> Iterator[Callable[[float], None]]:
     """A bar over so many seconds, where somebody looks; moved by the seconds that are over."""
     if seconds is None or screen.machine or not screen.out.is_terminal:
         yield lambda _: None
@@ -250,7 +250,7 @@ def following(screen: Screen, seconds: float | None) -> Iterator[Callable[[float
     from rich.progress import Progress  # noqa: PLC0415 - Rich is loaded when something is shown
 
     with Progress(console=screen.out, transient=True) as progress:
-        task = progress.add_task("playing", total=seconds)
+        task = progress.add_task(what, total=seconds)
         yield lambda done: progress.update(task, completed=done)
 
 

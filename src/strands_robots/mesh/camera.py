@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import base64
+import math
+import time
 from typing import Any
 
 from strands_robots import settings
 from strands_robots.cameras import Frames, jpeg
+from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.topics import camera as camera_topic
 from strands_robots.utils import identifier
+
+SPACING_S = 1.5 / (topics.BY_NAME["camera"].ceiling_hz or math.inf)
+"""Between the frames of two cameras: the transport drops what comes closer on any of them."""
 
 
 def enabled() -> bool:
@@ -40,9 +46,11 @@ def publish_frames(context: Context, frames: Frames) -> int:
     """Publish one frame of each camera; how many. None is built while the privacy switch is on."""
     if not enabled():
         return 0
-    count = 0
+    count, sent = 0, 0.0
     for name, pixels in frames().items():
         message = frame_message(context.peer_id, identifier("camera", name), context.clock(), pixels)
+        time.sleep(max(0.0, sent + SPACING_S - time.monotonic()))
+        sent = time.monotonic()
         context.put(camera_topic(context.peer_id, name), message)
         count += 1
     return count

@@ -13,6 +13,7 @@ from __future__ import annotations
 from strands_robots.recording.actions import recorded_actions
 from strands_robots.recording.file import (
     CHUNK_BYTES,
+    STEP,
     Entry,
     Joints,
     Picture,
@@ -24,6 +25,7 @@ from strands_robots.recording.sampling import RobotRecording
 
 __all__ = [
     "CHUNK_BYTES",
+    "STEP",
     "Entry",
     "Joints",
     "Picture",

@@ -30,7 +30,7 @@ PICTURES_WAITING_BYTES = 64_000_000
 STEP = "streamStep"
 """The event that carries a robot's actions."""
 
-STEADY = frozenset({STEP, "observationUpdate", "stateUpdate", "heartbeat"})
+STEADY = frozenset({STEP, "observationUpdate", "stateUpdate", "state"})
 """Events at a steady rate, which write no log line."""
 
 JOINTS, CAMERA, LOG = "joint_states", "camera", "log"
@@ -161,7 +161,7 @@ class Recorder:
         elif self._joints_of_events:
             joints = entry.payload.get("joints") or entry.payload.get("observation")
             if isinstance(joints, Mapping):
-                _joints(channels, entry.at, whose(entry), numbers(joints))
+                _joints(channels, entry.at, whose(entry), numbers({key: _position(at) for key, at in joints.items()}))
 
 
 class _Channels:
@@ -241,6 +241,11 @@ def _item(schema: str, channel: Any, message: Any) -> Item | None:
 def _joints(channels: _Channels, at: float, device: str, joints: Mapping[str, float]) -> None:
     if joints:
         channels.write(f"/{device}/{JOINTS}", schemas.JOINT_STATE, _ns(at), schemas.joint_state(_ns(at), joints))
+
+
+def _position(joint: Any) -> Any:
+    """A joint that is told with its velocity counts by its position."""
+    return joint.get("position") if isinstance(joint, Mapping) else joint
 
 
 def _level(entry: Entry) -> int:

@@ -1,0 +1,60 @@
+"""Peers of the mesh are recorded from elsewhere: joints, pictures where they publish any, and the fleet's stops."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.mesh_peer import MeshPeer
+from fixtures.waiting import eventually
+
+from strands_robots.recording import Entry, Joints, Picture, read_items
+
+pytest.importorskip("mcap")
+
+COMMAND = [sys.executable, "-m", "strands_robots.cli"]
+
+
+@pytest.fixture
+def settings(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("PORT", str(port)), ("CAMERA_HZ", "10")):
+        monkeypatch.setenv(f"STRANDS_MESH_{name}", value)
+    monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
+
+
+def started(*words: str) -> Any:
+    return subprocess.Popen([*COMMAND, *words, "--json"], stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.usefixtures("settings")
+def test_states_pictures_and_stops_of_a_served_world_are_recorded(
+    tmp_path: Path, join: Callable[..., MeshPeer]
+) -> None:
+    run = tmp_path / "run.mcap"
+    console = join("console-1", "none")
+    serving = started("serve", "so100", "--mesh", "--peer-id", "arm-1")
+    try:
+        assert json.loads(serving.stdout.readline())["peer_id"] == "arm-1"
+        console.sees("arm-1")
+        recording = started("record", "arm-1", "--out", str(run), "--mesh", "--for", "6")
+        eventually(lambda: run.exists() and run.stat().st_size > 20_000, within=20)
+        console.ask("estop")
+        out = recording.communicate(timeout=30)[0]
+    finally:
+        serving.kill()
+        serving.communicate()
+    assert recording.returncode == 0, out
+    assert json.loads(out.splitlines()[-1])["lost"] == 0
+    items = list(read_items(run))
+    joints = next(item for item in items if isinstance(item, Joints))
+    assert joints.device == "arm-1"
+    assert "shoulder_pan" in joints.joints
+    pictures = [item for item in items if isinstance(item, Picture)]
+    assert {item.camera for item in pictures} == {"overview", "front", "side", "top", "so100.wrist"}
+    assert all(item.jpeg[:2] == b"\xff\xd8" for item in pictures)
+    assert "emergencyStop" in {item.event for item in items if isinstance(item, Entry)}
