@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import threading
 from collections.abc import Callable, Mapping
@@ -184,7 +185,7 @@ class MemoryLink:
             self._watchers.setdefault(topic, []).append(heard)
 
         def unwatch() -> None:
-            with self._lock:
+            with self._lock, contextlib.suppress(ValueError):  # a second call has nothing left to take out
                 self._watchers[topic].remove(heard)
 
         return unwatch

@@ -1,0 +1,146 @@
+"""What every link to a ROS graph promises, asked of the one in memory, of bare DDS and of rclpy's stand-in."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.nav2_process import nav2
+from fixtures.waiting import eventually
+
+from fixtures import rclpy_stand_in
+from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.goals import run_goal
+from strands_robots.ros.link import Goal, Heard, MemoryLink, Message, RosError, RosLink
+from strands_robots.ros.rclpy_link import RclpyLink
+
+DOMAIN = 95
+TWIST = "geometry_msgs/msg/Twist"
+NAV, NAV_KIND = "/navigate_to_pose", "nav2_msgs/action/NavigateToPose"
+ARM_KIND = "std_srvs/srv/SetBool"
+
+
+@pytest.fixture(autouse=True)
+def confined(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+
+
+@pytest.fixture(params=["memory", "rclpy", "dds"])
+def ends(request: pytest.FixtureRequest) -> Iterator[tuple[RosLink, RosLink]]:
+    """Two links on one graph."""
+    if request.param == "memory":
+        link = MemoryLink()
+        yield link, link
+        return
+    with rclpy_stand_in.installed():
+        kind: Any = RclpyLink if request.param == "rclpy" else DdsLink
+        # The far end is bare DDS, so that no link is only ever tried against itself.
+        links = kind(DOMAIN, match_s=5.0), DdsLink(DOMAIN, match_s=5.0)
+        yield links
+        for each in links:
+            each.close()
+            each.close()
+
+
+def served(goal: Message, feedback: Heard, sent: Goal) -> None:
+    """Reaches what is near; what is far takes until it is cancelled."""
+    feedback({"distance_remaining": 0.0})
+    if goal["pose"]["pose"]["position"]["x"] < 1:
+        sent.end(4, {"error_code": 0})
+
+
+@pytest.fixture(params=["memory", "rclpy"])
+def stacked(request: pytest.FixtureRequest) -> Iterator[RosLink]:
+    """A link to a graph with a service and an action."""
+    if request.param == "memory":
+        link = MemoryLink({"/arm": lambda request: {"success": request["data"], "message": "armed"}})
+        link.serve(NAV, served)
+        yield link
+        return
+    with rclpy_stand_in.installed(), nav2(DOMAIN, "reach"):
+        over = RclpyLink(DOMAIN)
+        # Discovery is over once the service answers, so that the short times below are the goals' own.
+        over.call("/arm", ARM_KIND, {"data": True}, 10.0)
+        eventually(lambda: NAV in over.actions())
+        yield over
+        over.close()
+
+
+def place(x: float) -> dict[str, Any]:
+    return {"pose": {"header": {"frame_id": "map"}, "pose": {"position": {"x": x}}}}
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_what_is_published_reaches_whoever_watches_until_they_do_not(ends: tuple[RosLink, RosLink], back: bool) -> None:
+    near, far = reversed(ends) if back else ends
+    heard: list[Message] = []
+    unwatch = far.watch("/cmd_vel", TWIST, heard.append)
+    near.publish("/cmd_vel", TWIST, {"linear": {"x": 0.25}})
+    assert eventually(lambda: heard)[0]["linear"]["x"] == 0.25
+    unwatch()
+    unwatch()
+    again: list[Message] = []
+    far.watch("/cmd_vel", TWIST, again.append)
+    near.publish("/cmd_vel", TWIST, {"linear": {"x": 0.5}})
+    eventually(lambda: again)
+    assert len(heard) == 1
+
+
+def test_a_read_gets_the_next_message_and_silence_is_named(ends: tuple[RosLink, RosLink]) -> None:
+    near, far = ends
+    done = threading.Event()
+
+    def talk() -> None:
+        while not done.is_set():
+            far.tell("/chatter", "std_msgs/msg/String", {"data": "hi"})  # type: ignore[attr-defined]
+            done.wait(0.01)
+
+    talker = threading.Thread(target=talk)
+    talker.start()
+    try:
+        assert near.read("/chatter", "std_msgs/msg/String", 5.0)["data"] == "hi"
+    finally:
+        done.set()
+        talker.join()
+    with pytest.raises(RosError, match=r"Nothing arrived on /silence within 0.05 s"):
+        near.read("/silence", "std_msgs/msg/String", 0.05)
+
+
+def test_a_closed_link_opens_anew_when_it_is_used(ends: tuple[RosLink, RosLink]) -> None:
+    near, far = ends
+    near.close()
+    heard: list[Message] = []
+    far.watch("/cmd_vel", TWIST, heard.append)
+    near.publish("/cmd_vel", TWIST, {"linear": {"x": 1.0}})
+    eventually(lambda: heard)
+
+
+def test_a_service_answers_and_one_that_nobody_offers_is_named(stacked: RosLink) -> None:
+    assert stacked.call("/arm", ARM_KIND, {"data": True}, 5.0) == {"success": True, "message": "armed"}
+    with pytest.raises(RosError, match="Nobody offers the service /disarm"):
+        stacked.call("/disarm", ARM_KIND, {"data": True}, 0.1)
+
+
+def test_a_goal_that_is_reached_tells_its_feedback_and_its_end(stacked: RosLink) -> None:
+    felt: list[Message] = []
+    report = run_goal(stacked, NAV, NAV_KIND, place(0.05), 10.0, feedback=felt.append)
+    assert (report.state, report.over, report.status, report.values["error_code"]) == ("succeeded", True, 4, 0)
+    eventually(lambda: "distance_remaining" in felt[-1])
+
+
+def test_a_goal_is_cancelled_when_its_time_is_over_or_when_it_is_given_up(stacked: RosLink) -> None:
+    report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 0.3)
+    assert (report.state, report.over, report.cut) == ("canceled", True, "its time of 0.3 s")
+    felt: list[Message] = []
+    report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 30.0, feedback=felt.append, given_up=lambda: bool(felt))
+    assert (report.state, report.over, report.cut) == ("canceled", True, "a stop")
+
+
+def test_a_goal_that_nobody_serves_or_that_was_given_up_before_never_begins(stacked: RosLink) -> None:
+    with pytest.raises(RosError, match="Nobody serves the action /elsewhere"):
+        run_goal(stacked, "/elsewhere", NAV_KIND, place(0.0), 0.1)
+    with pytest.raises(RosError, match=r"given up before|Nobody serves"):
+        run_goal(stacked, NAV, NAV_KIND, place(0.0), 5.0, given_up=lambda: True)
