@@ -1,8 +1,11 @@
-.PHONY: help demo test test-all lint bench serve api system venv clean real-arm
+.PHONY: help demo test test-all lint bench serve api system venv clean real-arm dds-security
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
 REAL_ARM := .venv-lerobot/bin
+DDS_SECURITY := .venv-dds-security/bin
+DDS_TESTS := tests/integration/ros/test_dds.py tests/integration/ros/test_dds_security.py \
+  tests/integration/ros/test_rtps_bridge.py tests/ros/test_dds_types.py tests/ros/test_dds_security.py
 # Most tests wait for another process; a file stays on one worker, so that its own tests never meet.
 WORKERS := --numprocesses 4 --dist loadfile
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
@@ -29,10 +32,17 @@ system:
 	@./scripts/reachy-daemon.sh 1.4.1
 	@./scripts/real-arm.sh
 	@./scripts/rosbridge.sh
+	@./scripts/dds-peers.sh
+	@./scripts/dds-security.sh
 
 test-all: venv system  ## What needs Debian or npm packages besides
 	@$(BIN)/python -m pytest -m system $(ARGS)
 	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
+	@$(DDS_SECURITY)/python -m pytest $(DDS_TESTS) $(ARGS)
+
+dds-security:  ## DDS Security on a Cyclone DDS that has it, in .venv-dds-security, and its tests
+	@./scripts/dds-security.sh
+	@$(DDS_SECURITY)/python -m pytest $(DDS_TESTS) $(ARGS)
 
 real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot, and its tests
 	@./scripts/real-arm.sh

@@ -1,0 +1,164 @@
+"""Against DDS of other vendors and versions: Fast DDS in C++, which many ROS 2 nodes use, and Cyclone DDS 0.10 in C."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.dds_peer import CYCLONE_C, FAST_DDS, DdsPeer, Vendor
+from fixtures.waiting import eventually
+
+from strands_robots.drivers.ros.rtps_robot import RtpsRobot
+from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
+from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.gate import CommandGate
+
+pytestmark = pytest.mark.system
+
+OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
+DOMAIN = 94
+PICTURE = bytes(at % 251 for at in range(320 * 240 * 3))
+
+
+@pytest.fixture(autouse=True)
+def loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.setenv("STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE", "1")
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+
+
+Built = Callable[[Vendor], Path]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """A vendor's program, built once."""
+
+    @cache
+    def build(vendor: Vendor) -> Path:
+        if why := vendor.missing():
+            (pytest.fail if os.environ.get("CI") else pytest.skip)(why)
+        return vendor.build(tmp_path_factory.mktemp(vendor.name))
+
+    return build
+
+
+@pytest.fixture(params=[FAST_DDS, CYCLONE_C], ids=lambda vendor: vendor.name)
+def program(request: pytest.FixtureRequest, built: Built) -> Path:
+    return built(request.param)
+
+
+@pytest.fixture
+def peer(program: Path) -> Iterator[DdsPeer]:
+    with DdsPeer(program, DOMAIN) as running:
+        yield running
+
+
+@pytest.fixture
+def link() -> Iterator[DdsLink]:
+    made = DdsLink(DOMAIN, match_s=5.0)
+    yield made
+    made.close()
+
+
+class Arm:
+    """Takes what it is sent."""
+
+    tool_name_str = "arm"
+
+    def __init__(self) -> None:
+        self.taken: list[Mapping[str, float]] = []
+        self.moved = threading.Event()
+
+    def send_action(self, action: Mapping[str, float]) -> None:
+        self.taken.append(action)
+        self.moved.set()
+
+
+def test_it_hears_our_velocities_and_the_zero_after_them(peer: DdsPeer) -> None:
+    robot = RtpsRobot("rover", "/cmd_vel", domain_id=DOMAIN, publish_rate=50, command_gate=OPEN)
+    try:
+        robot.advertise()
+        eventually(lambda: robot.drive(0.25, -0.5, duration=0.2)["status"] == "success")
+        eventually(lambda: peer.heard[-1] == "twist 0 0")
+        assert "twist 0.25 -0.5" in peer.heard
+    finally:
+        robot.disconnect()
+
+
+def test_we_hear_its_velocities(peer: DdsPeer, link: DdsLink) -> None:
+    heard: list[Mapping[str, Any]] = []
+    link.watch("/other/cmd_vel", "geometry_msgs/msg/Twist", heard.append)
+
+    def told() -> bool:
+        peer.say("twist 0.5 -0.25")
+        return bool(heard)
+
+    eventually(told)
+    assert heard[0] == {"linear": {"x": 0.5, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": -0.25}}
+
+
+def test_it_commands_the_joints_of_our_robot_and_one_out_of_range_is_dropped_whole(peer: DdsPeer) -> None:
+    arm = Arm()
+    bridge = HardwareRtpsBridge(arm, domain_id=DOMAIN, joint_limits={"elbow.pos": (-1.0, 1.0)})
+    try:
+
+        def commanded() -> bool:
+            peer.say("joints shoulder.pos 0.5 elbow.pos -0.25")
+            return arm.moved.wait(0.05)
+
+        eventually(commanded)
+        assert arm.taken[0] == {"shoulder.pos": 0.5, "elbow.pos": -0.25}
+        taken = len(arm.taken)
+        peer.say("joints shoulder.pos 0.7 elbow.pos 1.5")
+        peer.say("joints shoulder.pos 0.1 elbow.pos 0.2")
+        eventually(lambda: arm.taken[-1] == {"shoulder.pos": 0.1, "elbow.pos": 0.2})
+        assert all(each["shoulder.pos"] != 0.7 for each in arm.taken[taken:])
+    finally:
+        bridge.shutdown()
+
+
+def test_a_picture_goes_both_ways_and_nobody_crashes(peer: DdsPeer, link: DdsLink) -> None:
+    fields = {"height": 240, "width": 320, "encoding": "rgb8", "step": 960, "data": PICTURE}
+
+    def shown() -> bool:
+        link.tell("/arm/front/image_raw", "sensor_msgs/msg/Image", fields)
+        return f"image 320 240 rgb8 {sum(PICTURE)}" in peer.heard
+
+    eventually(shown)
+    heard: list[Mapping[str, Any]] = []
+    link.watch("/camera/image_raw", "sensor_msgs/msg/Image", heard.append)
+
+    def seen() -> bool:
+        peer.say("image")
+        return bool(heard)
+
+    eventually(seen)
+    assert (heard[0]["width"], heard[0]["encoding"], heard[0]["data"]) == (320, "rgb8", PICTURE)
+    assert peer.alive
+
+
+def x_of(robot: RtpsRobot) -> float:
+    return float(robot.get_pose(5.0)["message"]["pose"]["pose"]["position"]["x"])
+
+
+def test_a_fast_dds_base_is_driven_stopped_and_seen_standing(built: Built) -> None:
+    robot = RtpsRobot("base", "/cmd_vel", odom_topic="/odom", domain_id=DOMAIN, publish_rate=20, command_gate=OPEN)
+    with DdsPeer(built(FAST_DDS), DOMAIN) as peer:
+        try:
+            began = x_of(robot)
+            answer = robot.drive(0.4, 0.0, duration=1.0)
+            assert (answer["status"], answer["messages"]) == ("success", 20)
+            assert robot.stop()["stopped"] is True
+            assert x_of(robot) - began == pytest.approx(0.4, abs=0.08)
+            assert robot.start_drive(1.0, 0.0, 30.0)["status"] == "success"
+            eventually(lambda: "twist 1 0" in peer.heard)
+            verdict = robot.halt("test")
+            assert (verdict.stopped, verdict.halted) == (True, ("drive",))
+        finally:
+            robot.disconnect()
