@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from pathlib import Path
 
 from fixtures.waiting import accepts, eventually
 from tests.integration.mesh.conftest import Join
@@ -102,12 +103,15 @@ def test_a_fleet_stops_right_after_its_hub_died(join: Join) -> None:
         assert robot.ask("halts")[1] - killed < 3.5
 
 
-def test_a_locked_robot_comes_back_locked_from_a_restart(join: Join) -> None:
+def test_a_locked_robot_comes_back_locked_from_a_restart(join: Join, tmp_path: Path) -> None:
     console, robot = join("console", "none"), join("arm-1", "arm")
     console.sees("arm-1")
     console.ask("estop")
     eventually(lambda: robot.ask("epoch"), within=2)
     epoch = robot.ask("epoch")
+    # It is locked at once and kept a moment later, because no disk may delay a halt.
+    kept = tmp_path / "arm-1" / "lockouts.json"
+    eventually(lambda: kept.exists() and epoch in kept.read_text(), within=2)
     robot.kill()
     assert join("arm-1", "arm").ask("epoch") == epoch
 
