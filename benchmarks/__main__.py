@@ -26,6 +26,7 @@ PARTS = {
     "safety": "From the controller's call to the last write",
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",
+    "recording": "Recording where robots are served",
     "arm": "A real arm (in the environment of `make real-arm`)",
 }
 

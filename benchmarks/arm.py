@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from fixtures.feetech_bus import MOTORS, Write, write_calibration
+from fixtures.feetech_bus import Write, write_calibration
 from fixtures.feetech_bus.process import BusProcess
 from fixtures.waiting import eventually, free_port
 
@@ -25,7 +25,6 @@ from benchmarks.arm_leading import leading
 from benchmarks.table import Row
 from strands_robots.device_connect import LinkConfig, init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.device_connect.safety_controller import safety_controller
-from strands_robots.recording import Recorder, read_entries
 from strands_robots.robot import Robot
 from strands_robots.safety.lane import lane
 from strands_robots.safety.plane import plane
@@ -37,20 +36,16 @@ STOPS, STOPS_QUICK = 20, 3
 STATE_HZ = 10.0
 JITTER_MS = 1.0
 LAST_WRITE_MS = 20.0
-RECORDED_S, RECORDED_S_QUICK = 20.0, 3.0
-RECORD_PERCENT = 15.0
-ARMS = 8
-KEYS = tuple(f"{motor}.pos" for motor in MOTORS)
 
 
 def run(*, quick: bool = False) -> list[Row]:
-    """Every row of this part; the recorder's alone where LeRobot's driver is not installed."""
+    """Every row of this part; none where LeRobot's driver is not installed."""
     # The lockouts of these stops are none of the user's.
     with (
         tempfile.TemporaryDirectory(prefix="bench-state-") as state,
         patch.dict(os.environ, {"STRANDS_STATE_DIR": state}),
     ):
-        rows = [recording(RECORDED_S_QUICK if quick else RECORDED_S)]
+        rows: list[Row] = []
         if importlib.util.find_spec("lerobot") is not None:
             rows += [jitter(SECONDS_QUICK if quick else SECONDS), last_write(STOPS_QUICK if quick else STOPS)]
             rows += leading(quick=quick)
@@ -78,29 +73,6 @@ def served(robot: Any) -> Iterator[LinkConfig]:
         yield link
     finally:
         stop_device_connect(runtime)
-
-
-def recording(seconds: float) -> Row:
-    """What it costs to record eight arms at 50 Hz, their steps and states; without images."""
-    payload = {"step": 0, "observation": dict.fromkeys(KEYS, 12.345678), "action": dict.fromkeys(KEYS, 12.345678)}
-    with tempfile.TemporaryDirectory(prefix="bench-record-") as folder:
-        with Recorder(Path(folder) / "run.mcap") as recorder:
-            cpu, began = time.process_time(), time.monotonic()
-            beats = int(seconds * HZ)
-            for beat in range(beats):
-                for number in range(ARMS):
-                    recorder.take(f"arm-{number}", "streamStep", {**payload, "step": beat})
-                time.sleep(max(0.0, began + (beat + 1) / HZ - time.monotonic()))
-        share = (time.process_time() - cpu) / (time.monotonic() - began) * 100
-        kept = sum(1 for _ in read_entries(Path(folder) / "run.mcap"))
-    return Row(
-        what=f"MCAP recording of {ARMS} arms at 50 Hz for {seconds:.0f} s, network and images not counted",
-        ours=f"{share:.1f} % of a core, {kept} events",
-        against=f"{beats * ARMS} events sent",
-        ratio=None,
-        must=f"under {RECORD_PERCENT:g} % of a core, none lost",
-        ok=share < RECORD_PERCENT and kept == beats * ARMS,
-    )
 
 
 def jitter(seconds: float) -> Row:

@@ -156,7 +156,8 @@ class Recorder:
         data = json.dumps(entry.payload, default=str)
         channels.write(f"/{entry.device}/{entry.event}", schemas.EVENT, at, data.encode())
         if entry.event not in STEADY:
-            line = schemas.log_line(at, _level(entry), entry.device, f"{entry.event} {data}")
+            words = f"{entry.event} {data}" if entry.payload else entry.event
+            line = schemas.log_line(at, _level(entry), entry.device, words)
             channels.write(f"/{entry.device}/{LOG}", schemas.LOG, at, line)
         elif self._joints_of_events:
             joints = entry.payload.get("joints") or entry.payload.get("observation")

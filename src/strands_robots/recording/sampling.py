@@ -18,7 +18,7 @@ from strands_robots.utils import number
 
 logger = logging.getLogger(__name__)
 
-JOINTS_HZ, CAMERAS_HZ, LOOKS_HZ = 50.0, 15.0, 50.0
+JOINTS_HZ, CAMERAS_HZ, LOOKS_HZ = 50.0, 15.0, 20.0
 """How often joints are read, pictures taken, and the gate is looked at for halts and locks."""
 
 
@@ -112,7 +112,7 @@ class RobotRecording:
         gate = self._robot.gate
         if gate.generation != self._generation:
             self._generation = gate.generation
-            self._recorder.take(self._device, "halted", {"generation": self._generation})
+            self._recorder.take(self._device, "halted", {})
         refusal = gate.refusal("motion")
         lock = "" if refusal is None else text_of(refusal)
         if lock != self._lock:

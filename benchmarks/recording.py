@@ -1,0 +1,137 @@
+"""What it costs to record where robots are served: eight arms and a camera, beside the same messages written bare."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fixtures.devices import RecordingDevice
+from mcap.writer import Writer
+
+from benchmarks.table import Row
+from strands_robots.cameras import jpeg
+from strands_robots.hardware import HardwareRobot
+from strands_robots.recording import Entry, Joints, Picture, Recorder, RobotRecording, read_items
+
+ARMS, HZ, CAMERA_HZ = 8, 50.0, 15.0
+WIDTH, HEIGHT = 320, 240
+SECONDS, SECONDS_QUICK = 30.0, 4.0
+PERCENT = 15.0
+
+
+class Camera:
+    """Gives pictures as a scene does: smooth, with some noise, another one each time."""
+
+    def __init__(self) -> None:
+        dice = np.random.default_rng(1)
+        rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+        scene = np.stack([rows, columns, rows + columns], axis=2) // 3
+        self._pictures = [(scene + dice.integers(0, 12, scene.shape)).astype(np.uint8) for _ in range(8)]
+        self.taken = 0
+
+    def read_latest(self) -> Any:
+        self.taken += 1
+        return self._pictures[self.taken % len(self._pictures)]
+
+
+class SeeingDevice(RecordingDevice):
+    """An arm of six joints, with a camera where one is given."""
+
+    def __init__(self, camera: Camera | None) -> None:
+        super().__init__()
+        self.positions = {f"joint_{number}.pos": 12.345678 * number for number in range(6)}
+        self.cameras = {} if camera is None else {"front": camera}
+
+
+def run(*, quick: bool = False) -> list[Row]:
+    """The one row of this part."""
+    seconds = SECONDS_QUICK if quick else SECONDS
+    with tempfile.TemporaryDirectory(prefix="bench-record-") as folder:
+        return [recorded(Path(folder), seconds)]
+
+
+def recorded(folder: Path, seconds: float) -> Row:
+    """Joints of idle arms read at 50 Hz, the steps of their tasks told at 50 Hz, pictures at 15 Hz."""
+    camera = Camera()
+    path = folder / "run.mcap"
+    robots = [HardwareRobot(SeeingDevice(None if number else camera), f"arm-{number}") for number in range(ARMS)]
+    for robot in robots:
+        robot.connect()
+    idle = beats(seconds / 4, lambda beat: None)
+    with ExitStack() as stack:
+        recorder = stack.enter_context(Recorder(path, joints_of_events=False))
+        for number, robot in enumerate(robots):
+            frames = robot.camera_frames if number == 0 else None
+            stack.enter_context(RobotRecording(robot, recorder, f"arm-{number}", frames=frames))
+        share = beats(seconds, lambda beat: steps(recorder, beat)) - idle
+    for robot in robots:
+        robot.cleanup()
+    items = list(read_items(path))
+    told = sum(isinstance(item, Entry) and item.event == "streamStep" for item in items)
+    joints = sum(isinstance(item, Joints) for item in items)
+    pictures = sum(isinstance(item, Picture) for item in items)
+    sent = int(seconds * HZ) * ARMS
+    bare = bare_share(folder / "bare.mcap", seconds, camera)
+    least = 0.98 * seconds
+    return Row(
+        what=f"{ARMS} arms at {HZ:g} Hz, one {WIDTH} x {HEIGHT} camera at {CAMERA_HZ:g} Hz, {seconds:g} s",
+        ours=f"{share:.1f} % of a core; {told} steps, {joints} joint states, {pictures} pictures",
+        against=f"{bare:.1f} %, steps, joints and pictures encoded and written in one loop",
+        ratio=share / bare,
+        must=f"under {PERCENT:g} % of a core, none lost",
+        ok=share < PERCENT
+        and recorder.lost == 0
+        and told == sent
+        and joints >= least * HZ * ARMS
+        and pictures >= least * CAMERA_HZ,
+    )
+
+
+def steps(recorder: Recorder, beat: int) -> None:
+    """What the observers of eight control loops do at one beat."""
+    for number in range(ARMS):
+        recorder.take(f"arm-{number}", "streamStep", step(beat))
+
+
+def step(beat: int) -> dict[str, Any]:
+    values = {f"joint_{number}.pos": 12.345678 * number for number in range(6)}
+    return {"step": beat, "observation": values, "action": values}
+
+
+def beats(seconds: float, act: Any) -> float:
+    """Act at 50 Hz for so long; the share of a core that the process took, in percent."""
+    cpu, began = time.process_time(), time.monotonic()
+    for beat in range(int(seconds * HZ)):
+        act(beat)
+        time.sleep(max(0.0, began + (beat + 1) / HZ - time.monotonic()))
+    return (time.process_time() - cpu) / (time.monotonic() - began) * 100
+
+
+def bare_share(path: Path, seconds: float, camera: Camera) -> float:
+    """The same messages with the mcap library alone, in the loop that makes them."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/any", "json", schema)
+
+        def write(data: bytes) -> None:
+            now = time.time_ns()
+            writer.add_message(channel, log_time=now, data=data, publish_time=now)
+
+        def act(beat: int) -> None:
+            for _ in range(ARMS):
+                told = step(beat)
+                write(json.dumps(told).encode())
+                write(json.dumps(told["action"]).encode())
+            if int((beat + 1) * CAMERA_HZ / HZ) > int(beat * CAMERA_HZ / HZ):
+                write(jpeg("front", camera.read_latest()))
+
+        share = beats(seconds, act)
+        writer.finish()
+    return share
