@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
+from fixtures.certificates import Authority
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually, free_port
 from tests.integration.mesh.conftest import Join
@@ -70,6 +72,40 @@ def test_who_is_not_of_the_fleet_gets_no_link(
     with pytest.raises(AssertionError):
         console.sees("sim-1", within=1.5)
     assert stranger.ask("reachable") == []
+
+
+def certified(authority: Authority, peer_id: str, seconds: float) -> dict[str, str]:
+    """Settings of a peer whose certificate lasts for so long from now on."""
+    made = authority.issue(peer_id, lasts=timedelta(seconds=seconds))
+    return {
+        "STRANDS_MESH_TLS_CA": str(made.ca),
+        "STRANDS_MESH_TLS_CERT": str(made.cert),
+        "STRANDS_MESH_TLS_KEY": str(made.key),
+    }
+
+
+def test_an_expired_certificate_gets_no_link(join: Join, tmp_path: Path, port: int) -> None:
+    authority = Authority(tmp_path / "fleet")
+    console = join("console", "none", **certified(authority, "console", 3600))
+    valid = join("sim-1", **certified(authority, "sim-1", 3600))
+    stated = {"ZENOH_CONNECT": f"tls/127.0.0.1:{port}"}
+    expired = join("sim-2", **certified(authority, "sim-2", -10), **stated)
+    console.sees("sim-1")
+    valid.sees("console")
+    with pytest.raises(AssertionError):
+        console.sees("sim-2", within=1.5)
+    assert expired.ask("reachable") == []
+
+
+def test_a_peer_whose_certificate_expires_is_cut_off_at_that_time(join: Join, tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "fleet")
+    console = join("console", "none", **certified(authority, "console", 3600))
+    sim = join("sim-1", **certified(authority, "sim-1", 7))
+    console.sees("sim-1", within=6)
+    assert console.ask("ping", "sim-1")["status"] == "ok"
+    eventually(lambda: console.ask("ping", "sim-1", 0.3)["status"] != "ok", within=8)
+    eventually(lambda: console.ask("reachable") == [], within=11)
+    assert sim.ask("alive") is not None
 
 
 def test_leaving_loopback_without_certificates_is_refused_by_name(tmp_path: Path) -> None:
