@@ -320,7 +320,7 @@ def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[A
             raise
         finally:
             decorators._rpc_source_device.reset(token)
-        if isinstance(answer, dict) and "error" in answer:
+        if isinstance(answer, dict) and answer.get("error"):
             decorators.logger.warning("%s of %s is partial: %s", name, source_device or "unknown", answer["error"])
         return answer
 
