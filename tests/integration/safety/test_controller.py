@@ -204,7 +204,7 @@ def test_a_controller_that_falls_silent_stops_the_robot_that_needs_it(
     assert not robot.refuses()
     controller.close()
     eventually(robot.refuses)
-    assert "safety-1" in robot.reasons[0]
+    assert "safety-1" in eventually(lambda: robot.reasons)[0]
 
 
 async def test_the_controller_as_a_device_answers_by_name(
