@@ -110,8 +110,8 @@ def test_a_robot_killed_while_locked_comes_back_locked_under_the_same_epoch(
     for _ in range(2):
         second = start("arm-1")
         # Whatever may have set it moving since, it is halted as it comes up locked.
-        told = eventually(lambda: (now := second.ask())["halts"] and now)
-        assert told == {"locked": True, "epochs": [report.estop_id], "moving": False, "writes": 0, "halts": 1}
+        eventually(lambda robot=second: robot.ask()["halts"])
+        assert second.ask() == {"locked": True, "epochs": [report.estop_id], "moving": False, "writes": 0, "halts": 1}
         second.signal(signal.SIGKILL)
     assert LockoutStore().load(hardware_key("recording", "arm-1")).state.epochs == (report.estop_id,)
 
