@@ -109,7 +109,7 @@ def test_a_camera_that_fails_is_told_once_and_the_joints_go_on(arm: HardwareRobo
         Recorder(path, joints_of_events=False) as recorder,
         RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
     ):
-        eventually(lambda: arm.device.cameras["front"].looks > 5)
+        eventually(lambda: arm.device.cameras["front"].looks > 15)
         eventually(lambda: recorder.counts["/arm-1/joint_states"] >= 10)
     assert events(path) == ["notRecorded"]
 

@@ -14,7 +14,7 @@ from strands_robots.envelope import is_error, text_of
 from strands_robots.policies.actions import numbers
 from strands_robots.policies.base import Ranges
 from strands_robots.teleop import LeaderPolicy
-from strands_robots.utils import number
+from strands_robots.utils import ValidationError, number
 
 if TYPE_CHECKING:
     from strands_robots.leaders import BoundedLeader
@@ -71,10 +71,25 @@ class FarBody:
         if reply.get("status") == "timeout":
             raise Failure(f"{self.peer} did not answer {action} within {_ANSWER_S:g} s.", Exit.SILENT)
         if not isinstance(result, dict):
-            raise Failure(f"{self.peer} refused {action}: {reply.get('error') or 'no reason given'}.")
+            why = str(reply.get("error") or "no reason given").rstrip(".")
+            raise Failure(f"{self.peer} refused {action}: {why}.")
         if action != "stop" and is_error(result):
             raise Failure(f"{self.peer} refused {action}: {text_of(result)}")
         return result
+
+
+def known_to(follower: str, leader: Any, bounds: Ranges) -> None:
+    """Refuse a leader that leads what the follower has not. Raises :class:`ValidationError`, before anything moves."""
+    unknown = [key for key in getattr(leader, "keys", ()) if key not in bounds]
+    if unknown:
+        raise ValidationError(f"{follower} has {', '.join(bounds)}, not {', '.join(unknown)}, which the leader leads.")
+
+
+def leads(screen: Screen, leader: str, follower: str, source: Any) -> None:
+    """Say who leads whom, and by which keys."""
+    screen.say(f"{leader} leads {follower}. Ctrl-C stops the follower.")
+    for name, up, down in getattr(source, "help", []):
+        screen.say(f"  {up} and {down} move {name}")
 
 
 def lead_far(
@@ -115,6 +130,7 @@ def lead_far(
             raise Failure(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
         far = FarBody(mesh, peer)
         with led(far) as source:
+            known_to(peer, source, far.bounds)
             policy = LeaderPolicy(source, device=LEADER, method=method, max_speed=speed, period=1 / rate)
             bounded = BoundedLeader(policy, far.get_joints(), far.bounds)
             publisher = InputPublisher(mesh, bounded, LEADER, method, rate)
@@ -122,7 +138,7 @@ def lead_far(
             told: dict[str, Any] = {}
             try:
                 publisher.start()
-                screen.say(f"{leader} leads {peer}. Ctrl-C stops the follower.")
+                leads(screen, leader, peer, source)
                 why = wait(_end(far, mesh.peer_id, bounded, seconds, told), getattr(source, "duration", None) or 0.0)
             finally:
                 stopped = _stop(screen, far)

@@ -16,7 +16,7 @@ from strands_robots.cli.command import command
 from strands_robots.cli.fleet import reached
 from strands_robots.cli.mesh import joined
 from strands_robots.cli.network import Network
-from strands_robots.cli.output import Failure, Screen
+from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.cli.recorded import lossless, told
 from strands_robots.cli.teleop import arm_options, drive, following, recording
 from strands_robots.recording import STEP, Recorder
@@ -64,10 +64,12 @@ def record(
         screen.say(f"Recording {', '.join(devices)} into {out}. Ctrl-C ends it.")
         with contextlib.suppress(KeyboardInterrupt):
             _wait(screen, recorder, longest)
+    if not recorder.counts:
+        out.unlink()
+        who = "anybody" if ANYBODY in devices else ", ".join(devices)
+        raise Failure(f"Nothing was heard of {who}; nothing was recorded.", Exit.SILENT)
     told(screen, recorder)
     lossless(recorder)
-    if not recorder.counts:
-        raise Failure(f"Nothing was heard of {', '.join(devices)}; {out} is empty.")
 
 
 def replay(

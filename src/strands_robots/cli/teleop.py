@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.far import MESH, lead_far
+from strands_robots.cli.far import MESH, known_to, lead_far, leads
 from strands_robots.cli.output import Failure, Screen, table
 from strands_robots.cli.recorded import recorded
 from strands_robots.envelope import is_error, text_of
@@ -112,17 +112,16 @@ def drive(
     robot = Robot(kind, mode="real" if at else "sim", peer_id=place, mesh=True if place else None, **given)
     try:
         with recorded(screen, robot, publish or robot.tool_name_str, record), led(robot) as source:
+            known_to(follower, source, robot.body().bounds)
             for answer in (
                 robot.attach_teleop(source, _NAME, method=method, max_speed=max_speed),
                 robot.teleoperate(_NAME, duration=seconds, hz=hz, publish=publish is not None),
             ):
                 if is_error(answer):
                     raise Failure(text_of(answer))
-            screen.say(f"{leader} leads {follower}. Ctrl-C stops the follower.")
+            leads(screen, leader, follower, source)
             if publish is not None:
                 screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
-            for name, up, down in getattr(source, "help", []):
-                screen.say(f"  {up} and {down} move {name}")
             row, verdict = _followed(screen, robot, source)
     finally:
         robot.halt("teleop ended")

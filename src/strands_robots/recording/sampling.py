@@ -22,11 +22,15 @@ JOINTS_HZ, CAMERAS_HZ, LOOKS_HZ = 50.0, 15.0, 20.0
 """How often joints are read, pictures taken, and the gate is looked at for halts and locks."""
 
 
+PATIENCE_S = 0.5
+"""How long something may fail before it is told: a busy bus is a beat that is missed, not a fault."""
+
+
 class RobotRecording:
     """Writes what a robot does to ``recorder`` while it is entered as a context.
 
-    What cannot be read is told once in the log and once in the recording, as the event ``notRecorded``, and is asked
-    for again at the next beat. A beat that is missed is left out.
+    What cannot be read for half a second is told once in the log and once in the recording, as the event
+    ``notRecorded``, and is asked for again at every beat. A beat that is missed is left out.
 
     Args:
         robot: behind the contract, or an object that :func:`~strands_robots.contract.adapt` makes fit.
@@ -55,7 +59,7 @@ class RobotRecording:
         self._device = device
         self._frames = frames
         self._ending = threading.Event()
-        self._problems: dict[str, str] = {}
+        self._failing: dict[str, tuple[float, bool]] = {}
         self._generation = self._robot.gate.generation
         self._lock = ""
         works: list[tuple[str, float, Callable[[], None]]] = [
@@ -91,7 +95,7 @@ class RobotRecording:
             except Exception as exc:  # noqa: BLE001 - a robot's read raises what it likes; the recording goes on
                 self._note(what, f"{type(exc).__name__}: {exc}")
             else:
-                self._problems.pop(what, None)
+                self._failing.pop(what, None)
             beat = max(beat + 1, int((time.monotonic() - began) * hz))
 
     def _joints(self) -> None:
@@ -120,10 +124,13 @@ class RobotRecording:
             self._recorder.take(self._device, "locked" if lock else "unlocked", {"reason": lock} if lock else {})
 
     def _note(self, what: str, problem: str) -> None:
-        if self._problems.get(what) != problem:
-            self._problems[what] = problem
-            logger.warning("%s: its %s are not recorded: %s", self._device, what, problem)
-            self._recorder.take(self._device, "notRecorded", {"what": what, "error": problem})
+        now = time.monotonic()
+        since, told = self._failing.setdefault(what, (now, False))
+        if told or now - since < PATIENCE_S:
+            return
+        self._failing[what] = (since, True)
+        logger.warning("%s: its %s are not recorded: %s", self._device, what, problem)
+        self._recorder.take(self._device, "notRecorded", {"what": what, "error": problem})
 
     def _tell(self, event: RolloutEvent) -> None:
         """Under the names and with the fields that the events of a device have on Device Connect."""

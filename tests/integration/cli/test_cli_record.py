@@ -77,4 +77,5 @@ def test_who_serves_an_arm_records_it_also_while_it_stands(tmp_path: Path) -> No
 def test_nothing_heard_is_a_failure_and_not_an_empty_success(tmp_path: Path) -> None:
     line = ["record", "nobody-1", "--out", str(tmp_path / "run.mcap"), "--for", "0.3", "--port", str(free_port())]
     done = CliRunner().invoke(build(), [*line, "--json"])
-    assert done.exit_code != 0
+    assert done.exit_code == 3
+    assert not (tmp_path / "run.mcap").exists()
