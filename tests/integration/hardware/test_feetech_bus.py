@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from fixtures.feetech_bus import REGISTERS, FeetechBus, Packet, Parser, arm_servos
 from fixtures.feetech_bus.packets import BROADCAST, OVERLOAD, PING, READ, SYNC_READ, SYNC_WRITE, WRITE
+from fixtures.feetech_bus.twin import ArmTwin
 from fixtures.waiting import eventually
 
 
@@ -165,6 +166,24 @@ def test_latency_holds_every_answer_up(line: Line, bus: FeetechBus) -> None:
     began = time.monotonic()
     line.ask(Packet(BROADCAST, PING), count=6)
     assert time.monotonic() - began >= 0.18
+
+
+def test_an_arm_without_torque_falls_and_one_with_it_is_held() -> None:
+    twin = ArmTwin("so101")
+    with FeetechBus(arm_servos(), plant=twin) as bus:
+        line = Line(bus.port)
+        try:
+            for servo in bus.servos:
+                line.write(servo, "torque_enable", 1)
+            eventually(lambda: abs(line.read(2, "present_position") - 2048) <= 10, within=10, what="the middle")
+            time.sleep(0.3)
+            assert abs(line.read(2, "present_position") - 2048) <= 10
+            for servo in bus.servos:
+                line.write(servo, "torque_enable", 0)
+            eventually(lambda: line.read(2, "present_position") > 2148, within=10, what="its fall")
+        finally:
+            line.close()
+            twin.close()
 
 
 def test_an_unplugged_port_vanishes_and_comes_back_under_the_same_name(tmp_path: Path) -> None:
