@@ -119,8 +119,13 @@ class InputReceiver:
     def on_frame(self, sample: Sample) -> None:
         """A frame on the transport's thread: queued for the stream's own."""
         lane = self._lane
-        if self._running and lane is not None:
-            lane.submit(lambda: self._take(sample))
+        if not self._running or lane is None:
+            return
+        if sample.session != self._session:
+            # Not queued, so that a stranger's flood displaces none of the leader's frames.
+            self._counts["source"] += 1
+            return
+        lane.submit(lambda: self._take(sample))
 
     def _open(self) -> str | None:
         session = self._mesh.peer_wire_zid(self._source)
@@ -156,9 +161,6 @@ class InputReceiver:
 
     def _take(self, sample: Sample) -> None:
         if not self._running:
-            return
-        if sample.session != self._session:
-            self._counts["source"] += 1
             return
         permit = self._permit
         if self._mesh.lockout_epoch is not None or (permit is not None and not permit.valid):
