@@ -21,7 +21,7 @@ from strands_robots.ros.gate import CommandGate
 pytestmark = pytest.mark.system
 
 OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
-DOMAIN = 94
+DOMAIN = 81
 PICTURE = bytes(at % 251 for at in range(320 * 240 * 3))
 
 
