@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from strands_robots.hardware._compat import forget_input
 from strands_robots.hardware.calibration import COUNTS, calibrate_from
 from strands_robots.utils import ValidationError
 
@@ -24,6 +25,10 @@ class Reach:
     low: int
     present: int
     high: int
+
+
+LOOK_TRIES = 5
+"""How often joints are asked for before the calibration is given up; LeRobot waits 50 ms for each answer."""
 
 
 class Calibrating:
@@ -57,9 +62,8 @@ class Calibrating:
         self._reaches = {}
 
     def look(self) -> dict[str, Reach]:
-        """Read the joints once; how far each was moved since :meth:`centre`."""
-        motors = [motor for motor in self._bus.motors if motor not in FULL_TURN]
-        for motor, position in self._bus.sync_read("Present_Position", motors, normalize=False).items():
+        """Read the joints once; how far each was moved since :meth:`centre`. Raises what the bus raises."""
+        for motor, position in self._positions().items():
             at = int(position)
             known = self._reaches.get(motor, Reach(at, at, at))
             self._reaches[motor] = Reach(min(known.low, at), at, max(known.high, at))
@@ -93,6 +97,18 @@ class Calibrating:
         """Disconnect; the torque stays off."""
         if self._bus.is_connected:
             self._bus.disconnect(disable_torque=False)
+
+    def _positions(self) -> dict[str, Any]:
+        """What the servos say. One lost answer of hundreds must not throw away a calibration by hand."""
+        motors = [motor for motor in self._bus.motors if motor not in FULL_TURN]
+        for left in reversed(range(LOOK_TRIES)):
+            forget_input(self._device)
+            try:
+                return dict(self._bus.sync_read("Present_Position", motors, normalize=False))
+            except ConnectionError:
+                if not left:
+                    raise
+        raise AssertionError  # the last try returns or raises
 
     def _entry(self, motor: str, number: int) -> dict[str, int]:
         reach = Reach(0, 0, COUNTS - 1) if motor in FULL_TURN else self._reaches[motor]
