@@ -117,13 +117,15 @@ class RclpyLink:
         client = self._cached("srv", service, kind, lambda: session.node.create_client(struct, _absolute(service)))
         if not self._comes(client.service_is_ready, within_s):
             raise RosError(f"Nobody offers the service {service}.")
-        answer = Goal(lambda: None)
+        answer, futures = Goal(lambda: None), list[Any]()
 
         def ask() -> None:
-            client.call_async(request).add_done_callback(lambda future: _settle(future, answer, plain))
+            futures.append(client.call_async(request))
+            futures[0].add_done_callback(lambda future: _settle(future, answer, plain))
 
         session.later(ask)
         if not answer.done.wait(max(0.0, deadline - time.monotonic())):
+            session.later(lambda: client.remove_pending_request(futures[0]))
             raise RosError(f"{service} did not answer within {within_s:g} s.")
         if answer.problem:
             raise RosError(f"{service} failed: {answer.problem}")
@@ -191,9 +193,7 @@ class RclpyLink:
         for goal in list(self._goals):
             goal.fail("the link was closed")
         if session is not None:
-            for each in actions:
-                each.destroy()
-            session.close()
+            session.close(actions)
 
     def _open(self) -> Session:
         with self._lock:

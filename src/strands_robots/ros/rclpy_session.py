@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
+from typing import Any
 
 from strands_robots.ros.link import RosError
 
@@ -51,7 +52,13 @@ class Session:
         self._context = contexts.Context()
         try:
             rclpy.init(context=self._context, domain_id=domain_id)
-            self.node = rclpy.create_node(name, context=self._context, use_global_arguments=False)
+            self.node = rclpy.create_node(
+                name,
+                context=self._context,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+            )
             self._executor = executors.SingleThreadedExecutor(context=self._context)
             self._executor.add_node(self.node)
         except Exception as exc:
@@ -76,10 +83,16 @@ class Session:
 
         self._executor.create_task(run)
 
-    def close(self) -> None:
-        """End the thread and take the node off the graph; not to be called by a callback of this node."""
+    def close(self, parts: Sequence[Any] = ()) -> None:
+        """End the thread and take the node off the graph; not to be called by a callback of this node.
+
+        Args:
+            parts: what the node does not destroy by itself, such as its action clients.
+        """
         self._done.set()
         self._thread.join(20 * SPIN_S)
+        for each in parts:
+            each.destroy()
         self._executor.shutdown(timeout_sec=SPIN_S)
         self.node.destroy_node()
         self._shut()
