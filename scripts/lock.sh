@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Rewrites the two lock files from pyproject.toml; both hold hashes and are valid on Python 3.11 to 3.13.
+# Rewrites the lock files from pyproject.toml; all hold hashes and are valid on Python 3.11 to 3.13.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 tool=$(mktemp -d)
@@ -9,3 +9,4 @@ python3 -m venv "$tool"
 compile=("$tool/bin/uv" pip compile --universal --python-version 3.11 --generate-hashes --no-header --quiet pyproject.toml)
 "${compile[@]}" --extra all --group dev --output-file requirements/dev.lock "$@"
 "${compile[@]}" --extra device-connect --extra sim --constraint requirements/dev.lock --output-file requirements/demo.lock
+"${compile[@]}" --group dds-security --output-file requirements/dds-security.lock

@@ -6,10 +6,10 @@ from importlib.util import find_spec
 from typing import Any
 
 from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.dds_security import Credentials, checked_credentials
+from strands_robots.ros.governance import opening
 from strands_robots.ros_telemetry import RosTelemetryBase, refuse_unsecured
-from strands_robots.utils import ValidationError, mapping, missing_extra, shown, text
-
-CREDENTIALS = ("identity_ca", "certificate", "private_key", "governance", "permissions")
+from strands_robots.utils import missing_extra
 
 
 class HardwareRtpsBridge(RosTelemetryBase):
@@ -24,13 +24,15 @@ class HardwareRtpsBridge(RosTelemetryBase):
         command_robot_name: whose command topic is taken; the robot's own name by default.
         poll_period: seconds between two looks for a command, above 0.
         joint_limits: ``{"<motor>.pos": (min, max)}`` in the robot's unit; what is not named is not limited here.
-        dds_security_config: paths or URIs of ``identity_ca``, ``certificate``, ``private_key``, ``governance``,
-            ``permissions`` and, optionally, ``permissions_ca``. The supported Cyclone DDS wheels have no DDS Security,
-            so that a well-formed one is refused too: nothing is started without what it asks for.
+        dds_security_config: paths, ``file:`` or ``data:,`` URIs of ``identity_ca``, ``certificate``, ``private_key``,
+            ``governance``, ``permissions`` and, where it is another, ``permissions_ca``. The participant presents them
+            or does not come up. Commands need a governance that closes the command topic to strangers.
 
     Raises:
-        ValidationError: an argument outside its domain, or commands on a graph that nobody secured.
+        ValidationError: an argument outside its domain, credentials that the installed library cannot honour, or
+            commands on a graph that nobody secured.
         MissingExtraError: the [ros2] extra is not installed.
+        RosError: the domain cannot be joined, or the permissions do not grant the command topic.
     """
 
     def __init__(
@@ -55,25 +57,21 @@ class HardwareRtpsBridge(RosTelemetryBase):
         )
         if find_spec("cyclonedds") is None:
             raise missing_extra("HardwareRtpsBridge", "ros2")
-        _refuse_security(dds_security_config)
+        credentials = checked_credentials(dds_security_config)
+        link = DdsLink(self.domain_id, dds_security_config=dds_security_config)
         if self._takes_commands:
-            refuse_unsecured("bare DDS is not secured here.")
-        self._begin(DdsLink(self.domain_id), "rtps-bridge")
+            refuse_unsecured(self._lacking(credentials))
+        try:
+            if credentials is not None:
+                # What the plugins refuse is told now, not at the first message.
+                link.open()
+            self._begin(link, "rtps-bridge")
+        except BaseException:
+            link.close()
+            raise
 
-
-def _refuse_security(config: object) -> None:
-    if config is None:
-        return
-    checked = mapping("dds_security_config", config)
-    missing = [key for key in CREDENTIALS if key not in checked]
-    unknown = sorted(set(checked) - {*CREDENTIALS, "permissions_ca"})
-    if missing or unknown:
-        raise ValidationError(
-            f"dds_security_config must have {', '.join(CREDENTIALS)} and may have permissions_ca, not {shown(checked)}."
-        )
-    for key, value in checked.items():
-        text(f"dds_security_config[{key!r}]", value)
-    raise ValidationError(
-        "dds_security_config cannot be honoured: the wheels of cyclonedds 11 have no DDS Security. Use a ROS 2 whose "
-        "middleware has it, behind a rosbridge server."
-    )
+    def _lacking(self, credentials: Credentials | None) -> str | None:
+        if credentials is None:
+            return "bare DDS is not secured without dds_security_config."
+        found = opening(credentials.document("governance"), self.domain_id, f"rt{self.command_topic}")
+        return None if found is None else f"the governance does not close it: {found}."

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.metadata
 import random
 import typing
 from typing import Any
@@ -15,6 +16,7 @@ from strands_robots.ros.dds_types import KINDS, Image, JointState, Odometry, Twi
 from strands_robots.ros.link import RosError
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+OLD = importlib.metadata.version("cyclonedds").startswith("0.10.")
 
 
 def sample(struct: type[Any], rng: random.Random) -> Any:
@@ -80,10 +82,12 @@ def test_every_type_is_written_as_an_independent_serializer_writes_it(kind: str)
 
 
 def test_a_small_image_is_packed_in_one_piece() -> None:
-    for machine in (Image.__idl__.v1_machine, Image.__idl__.v2_machine):
+    first = "v0_machine" if OLD else "v1_machine"
+    for machine in (getattr(Image.__idl__, first), Image.__idl__.v2_machine):
         assert isinstance(machine.members_machines["data"], BytesMachine)
 
 
+@pytest.mark.skipif(OLD, reason="by uint8 this Cyclone DDS means what others call byte")
 def test_no_field_is_declared_uint8() -> None:
     for kind, struct in KINDS.items():
         assert "uint8" not in str(typing.get_type_hints(struct, include_extras=True)), kind

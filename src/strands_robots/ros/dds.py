@@ -6,12 +6,14 @@ import contextlib
 import logging
 import threading
 import time
+from collections.abc import Mapping
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 from strands_robots import settings
 from strands_robots.ros.dds_fields import filled, plain
+from strands_robots.ros.dds_security import checked_credentials, policies, presenting
 from strands_robots.ros.link import Heard, Message, RosError, Unwatch
 from strands_robots.ros.names import bare_kind
 from strands_robots.utils import missing_extra, number, whole
@@ -42,19 +44,34 @@ class DdsLink:
     Args:
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
         match_s: how long a publish waits for a first subscription, and a read without a type for a publisher.
+        dds_security_config: credentials of :func:`~strands_robots.ros.dds_security.checked_credentials`; the
+            participant then presents them or does not come up. Without, it is one that nobody has to believe.
 
     Raises:
-        ValidationError: an argument outside its domain.
+        ValidationError: an argument outside its domain, or credentials that the installed library cannot honour.
+        MissingExtraError: credentials are given and the [ros2] extra is not installed.
     """
 
-    def __init__(self, domain_id: int | None = None, *, match_s: float = 0.5) -> None:
+    def __init__(
+        self,
+        domain_id: int | None = None,
+        *,
+        match_s: float = 0.5,
+        dds_security_config: Mapping[str, str] | None = None,
+    ) -> None:
         stated = settings.integer("ROS_DOMAIN_ID") if domain_id is None else domain_id
         self.domain_id = whole("domain_id", stated, low=0, high=DOMAIN_MAX)
         self._match_s = number("match_s", match_s, low=0, high=60)
+        self._credentials = checked_credentials(dds_security_config)
+        self._security = [] if self._credentials is None else policies(_dds("qos"), self._credentials)
         self._lock = threading.RLock()
         self._participant: Any = None
         self._writers: dict[tuple[str, str], Any] = {}
         self._unwatch: list[Unwatch] = []
+
+    def open(self) -> None:
+        """Join the domain now, rather than at the first use."""
+        self._open()
 
     def advertise(self, topic: str, kind: str) -> None:
         """Appear on the graph as a publisher of ``topic`` before there is anything to say."""
@@ -64,7 +81,8 @@ class DdsLink:
         message = filled(_struct(kind), fields)
         writer = self._writer(topic, kind)
         deadline = time.monotonic() + self._match_s
-        while not writer.get_matched_subscriptions():
+        subscribed = import_module("strands_robots.ros._compat").subscribed
+        while not subscribed(writer):
             if time.monotonic() >= deadline:
                 raise RosError(f"Nobody subscribes to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
             time.sleep(0.002)
@@ -99,11 +117,14 @@ class DdsLink:
         sub, qos, core = _dds("sub"), _dds("qos"), _dds("core")
         struct = _struct(kind or self._kind_of(topic))
         # Best effort takes what a sensor sends so as well as what is sent reliably.
-        policies = qos.Qos(qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepLast(DEPTH))
+        quality = qos.Qos(qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepLast(DEPTH))
         with self._lock:
             participant = self._open()
-            reader = sub.DataReader(participant, self._topic(topic, struct), qos=policies)
-            waitset = core.WaitSet(participant)
+            try:
+                reader = sub.DataReader(participant, self._topic(topic, struct), qos=quality)
+                waitset = core.WaitSet(participant)
+            except core.DDSException as exc:
+                raise RosError(f"{topic} cannot be read in domain {self.domain_id}: {exc}") from exc
         anything = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
         waitset.attach(core.ReadCondition(reader, anything))
         done = threading.Event()
@@ -185,13 +206,22 @@ class DdsLink:
     def _open(self) -> Any:
         with self._lock:
             if self._participant is None:
-                domain = _dds("domain")
-                try:
-                    confine(domain, self.domain_id)
-                    self._participant = domain.DomainParticipant(self.domain_id)
-                except _dds("core").DDSException as exc:
-                    raise RosError(f"DDS domain {self.domain_id} could not be joined: {exc}") from exc
+                with presenting(self.domain_id, self._credentials):
+                    self._participant = self._joined()
             return self._participant
+
+    def _joined(self) -> Any:
+        domain = _dds("domain")
+        try:
+            confine(domain, self.domain_id)
+            joined = domain.DomainParticipant(self.domain_id, qos=_dds("qos").Qos(*self._security))
+        except _dds("core").DDSException as exc:
+            secured = " with these credentials" if self._security else ""
+            raise RosError(f"DDS domain {self.domain_id} could not be joined{secured}: {exc}") from exc
+        # A library that took the credentials and forgot them would leave the graph open.
+        if not all(each in joined.get_qos().policies for each in self._security):
+            raise RosError(f"DDS domain {self.domain_id} was not joined: the library dropped the credentials.")
+        return joined
 
     def _topic(self, topic: str, struct: type[Any]) -> Any:
         return _dds("topic").Topic(self._open(), f"rt/{topic.lstrip('/')}", struct)
@@ -202,10 +232,10 @@ class DdsLink:
             if key not in self._writers:
                 qos = _dds("qos")
                 reliable = qos.Policy.Reliability.Reliable(max_blocking_time=_SLICE_MS * 1_000_000)
-                policies = qos.Qos(reliable, qos.Policy.History.KeepLast(DEPTH))
+                quality = qos.Qos(reliable, qos.Policy.History.KeepLast(DEPTH))
                 struct = _struct(kind)
                 try:
-                    made = _dds("pub").DataWriter(self._open(), self._topic(topic, struct), qos=policies)
+                    made = _dds("pub").DataWriter(self._open(), self._topic(topic, struct), qos=quality)
                 except _dds("core").DDSException as exc:
                     raise RosError(f"{topic} cannot be published as {bare_kind(kind)}: {exc}") from exc
                 self._writers[key] = made

@@ -23,9 +23,11 @@ class RtpsRobot(MobileBaseRobot):
         odom_topic: a ``nav_msgs/Odometry``; with it a stop waits to see the base still.
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
         command_gate: asks the operator's leave; that of the settings by default.
+        dds_security_config: credentials for a secured graph, as those of
+            :class:`~strands_robots.hardware_rtps_bridge.HardwareRtpsBridge`; without, the participant has none.
 
     Raises:
-        ValidationError: an argument outside its domain.
+        ValidationError: an argument outside its domain, or credentials that the installed library cannot honour.
     """
 
     link: DdsLink
@@ -45,8 +47,9 @@ class RtpsRobot(MobileBaseRobot):
         scan_topic: str | None = None,
         domain_id: int | None = None,
         command_gate: CommandGate | None = None,
+        dds_security_config: dict[str, str] | None = None,
     ) -> None:
-        link = DdsLink(domain_id)
+        link = DdsLink(domain_id, dds_security_config=dds_security_config)
         super().__init__(
             node_name,
             link,

@@ -1,0 +1,179 @@
+"""DDS Security of a participant: who it is, what it may do, and the plugins of Cyclone DDS that see to both.
+
+The names of the properties are those of the OMG's DDS Security 1.1; the plugins are the ones built with Cyclone DDS.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import ssl
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from strands_robots.ros.link import RosError
+from strands_robots.utils import ValidationError
+
+REQUIRED = ("identity_ca", "certificate", "private_key", "governance", "permissions")
+OPTIONAL = ("permissions_ca",)
+
+_FILE, _DATA = "file:", "data:,"
+_LONGEST = 100_000
+_PROPERTIES = {
+    "identity_ca": "dds.sec.auth.identity_ca",
+    "certificate": "dds.sec.auth.identity_certificate",
+    "private_key": "dds.sec.auth.private_key",
+    "permissions_ca": "dds.sec.access.permissions_ca",
+    "governance": "dds.sec.access.governance",
+    "permissions": "dds.sec.access.permissions",
+}
+_PLUGINS = (
+    ("auth", "libdds_security_auth.so", "authentication"),
+    ("access", "libdds_security_ac.so", "access_control"),
+    ("crypto", "libdds_security_crypto.so", "crypto"),
+)
+
+
+_presented: dict[int, Credentials] = {}
+_presenting = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """The checked credentials of one participant, as URIs. They may hold a private key and are never printed."""
+
+    uris: Mapping[str, str] = field(repr=False)
+
+    def document(self, name: str) -> bytes:
+        """What one of them says, such as the signed ``governance``."""
+        uri = self.uris[name]
+        return uri.removeprefix(_DATA).encode() if uri.startswith(_DATA) else Path(uri.removeprefix(_FILE)).read_bytes()
+
+    def properties(self) -> dict[str, str]:
+        """The properties of a participant that presents them to the plugins of the loaded library.
+
+        Raises:
+            ValidationError: the loaded Cyclone DDS has no DDS Security.
+        """
+        found = {_PROPERTIES[name]: uri for name, uri in self.uris.items()}
+        folder = _plugin_folder()
+        for role, file, called in _PLUGINS:
+            found[f"dds.sec.{role}.library.path"] = str(folder / file)
+            found[f"dds.sec.{role}.library.init"] = f"init_{called}"
+            found[f"dds.sec.{role}.library.finalize"] = f"finalize_{called}"
+        return found
+
+
+def checked_credentials(config: object) -> Credentials | None:
+    """The credentials of a ``dds_security_config``; None where there is none. Touches nothing but the named files.
+
+    Values are paths or ``file:`` or ``data:,`` URIs. The permissions CA is the identity CA unless it is given. No
+    message shows a value that may be a key.
+
+    Raises:
+        ValidationError: a key is missing or unknown, a value names no readable file and is no ``data:,`` URI, or the
+            private key is not that of the certificate.
+    """
+    if config is None:
+        return None
+    if not isinstance(config, dict):
+        raise ValidationError(f"dds_security_config must be an object of paths by name, not {type(config).__name__}.")
+    missing = [key for key in REQUIRED if key not in config]
+    unknown = sorted(str(key) for key in config if key not in REQUIRED + OPTIONAL)
+    if missing or unknown:
+        wrong = [f"no {key}" for key in missing] + [f"an unknown {key}" for key in unknown]
+        raise ValidationError(
+            f"dds_security_config must have {', '.join(REQUIRED)} and may have permissions_ca; it has "
+            f"{' and '.join(wrong)}."
+        )
+    uris = {key: _uri(f"dds_security_config[{key!r}]", value) for key, value in config.items()}
+    uris.setdefault("permissions_ca", uris["identity_ca"])
+    credentials = Credentials(uris)
+    _check_key(credentials)
+    return credentials
+
+
+@contextlib.contextmanager
+def presenting(domain_id: int, credentials: Credentials | None) -> Iterator[None]:
+    """Join a domain with ``credentials`` inside this, one thread at a time.
+
+    The access control of Cyclone DDS 0.10 keeps the governance and permissions of the first participant of a domain
+    for every later one of the process, so that other ones are refused here rather than not looked at there.
+
+    Raises:
+        RosError: this process has presented other credentials in this domain.
+    """
+    with _presenting:
+        if credentials is not None and _presented.get(domain_id, credentials) != credentials:
+            raise RosError(
+                f"This process has presented other credentials in DDS domain {domain_id}; use another process."
+            )
+        yield
+        if credentials is not None:
+            _presented[domain_id] = credentials
+
+
+def _check_key(credentials: Credentials) -> None:
+    # The plugins take a key that does not fit and then fail with every peer.
+    with contextlib.ExitStack() as files:
+        names = []
+        for name in ("certificate", "private_key"):
+            # In memory, because a key given as data has no business on a disk.
+            file = files.enter_context(os.fdopen(os.memfd_create(name), "wb"))
+            file.write(credentials.document(name))
+            file.flush()
+            names.append(f"/proc/self/fd/{file.fileno()}")
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(names[0], names[1], password=lambda: "")
+        except (ssl.SSLError, ValueError) as exc:
+            raise ValidationError(
+                "dds_security_config['private_key'] must be the PEM key of dds_security_config['certificate'], without "
+                "a passphrase; it is not."
+            ) from exc
+
+
+def policies(qos: Any, credentials: Credentials) -> list[Any]:
+    """The property policies of ``credentials``, made with the ``cyclonedds.qos`` module that is given."""
+    return [qos.Policy.Property(key, value) for key, value in credentials.properties().items()]
+
+
+def _uri(name: str, value: object) -> str:
+    domain = f"{name} must be a path, a file: URI or a data:, URI of 1 to {_LONGEST} characters"
+    if not isinstance(value, str):
+        raise ValidationError(f"{domain}, not {type(value).__name__}.")
+    if not value.strip() or len(value) > _LONGEST or "\0" in value:
+        raise ValidationError(f"{domain}, not one of {len(value)}.")
+    if value.startswith(_DATA) and value != _DATA:
+        return value
+    path = value.removeprefix(_FILE).removeprefix("//" if value.startswith("file:///") else "")
+    if not path.isprintable() or path.startswith(("data:", "pkcs11:", "//")):
+        raise ValidationError(f"{domain}; this one has another scheme, a host or control characters.")
+    file = Path(path).absolute()
+    if not (file.is_file() and os.access(file, os.R_OK)):
+        raise ValidationError(f"{name} must name a readable file, not {str(file)!r}.")
+    return f"{_FILE}{file}"
+
+
+def _plugin_folder() -> Path:
+    library = _loaded_library()
+    if library is not None:
+        # Upstream installs the plugins beside the library, Debian in a folder of the library's name.
+        for folder in (library.parent, *sorted(library.parent.glob("libddsc*/"))):
+            if all((folder / file).is_file() for _, file, _ in _PLUGINS):
+                return folder
+    raise ValidationError(
+        f"dds_security_config cannot be honoured: the Cyclone DDS of this process ({library or 'not found'}) has no "
+        "DDS Security plugins, and no wheel of cyclonedds 11 brings them; use cyclonedds 0.10.5 built on Debian's "
+        "cyclonedds-dev, which scripts/dds-security.sh of this project does."
+    )
+
+
+def _loaded_library() -> Path | None:
+    """The file of the Cyclone DDS that is loaded, which its binding finds in several places; for Linux."""
+    maps = Path("/proc/self/maps")
+    lines = maps.read_text().splitlines() if maps.exists() else []
+    paths = (Path(line.split(maxsplit=5)[5]) for line in lines if "/libddsc" in line)
+    return next((path for path in paths if path.name.startswith("libddsc")), None)

@@ -1,0 +1,285 @@
+"""Members, strangers and listeners of a secured DDS graph, each a process of its own on loopback."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.certificates import Authority
+from fixtures.child import Child
+from fixtures.dds_pki import DdsPki, governance
+from fixtures.waiting import eventually
+
+from strands_robots.drivers.ros.rtps_robot import RtpsRobot
+from strands_robots.envelope import success
+from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
+from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.gate import CommandGate
+from strands_robots.ros.link import RosError
+from strands_robots.ros_telemetry import INSECURE
+from strands_robots.utils import ValidationError
+
+HAS_PLUGINS = importlib.metadata.version("cyclonedds").startswith("0.10.")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(not HAS_PLUGINS, reason="needs a Cyclone DDS with DDS Security: make dds-security"),
+]
+
+DOMAIN = 90
+CMD, ODOM, ARM = "/cmd_vel", "/odom_of_ours", "/my_arm/joint_command"
+TWIST, ODOMETRY, JOINTS = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState"
+SPEED = {"linear": {"x": 0.25}}
+SECRET = "base_footprint_of_ours"
+OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
+
+Peer = Callable[[dict[str, str] | None], Child]
+
+
+class Arm:
+    """Takes actions and keeps them."""
+
+    tool_name_str = "my arm"
+
+    def __init__(self) -> None:
+        self.taken: list[dict[str, float]] = []
+
+    def send_action(self, action: dict[str, float]) -> dict[str, Any]:
+        self.taken.append(action)
+        return success("taken")
+
+
+def until_heard(speaker: Child, listener: Child, fields: dict[str, Any]) -> None:
+    """A first message may go out before the far end has the keys to read it."""
+    began = len(listener.ask("heard"))
+
+    def heard() -> bool:
+        speaker.ask("say", CMD, TWIST, fields)
+        return len(listener.ask("heard")) > began
+
+    eventually(heard)
+
+
+@pytest.fixture(autouse=True)
+def confined(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    monkeypatch.delenv(INSECURE, raising=False)
+
+
+@pytest.fixture(scope="module")
+def pki(tmp_path_factory: pytest.TempPathFactory) -> DdsPki:
+    return DdsPki(tmp_path_factory.mktemp("pki"), DOMAIN)
+
+
+@pytest.fixture(scope="module")
+def alice(pki: DdsPki) -> dict[str, str]:
+    """May say where to drive and listen to what she said."""
+    return pki.member("alice", publish=("rt/cmd_vel", "rt/my_arm/joint_command"), subscribe=("rt/cmd_vel",))
+
+
+@pytest.fixture(scope="module")
+def bob(pki: DdsPki) -> dict[str, str]:
+    """May listen to where to drive and tell where it is."""
+    return pki.member("bob", publish=("rt/odom_of_ours",), subscribe=("rt/cmd_vel", "rt/my_arm/joint_command"))
+
+
+@pytest.fixture(scope="module")
+def mallory(pki: DdsPki) -> dict[str, str]:
+    """Has a copy of the graph's documents and a certificate of an authority that nobody there knows."""
+    rogue = Authority(pki.folder, "rogue")
+    return pki.member("alice", publish=("rt/cmd_vel",), subscribe=("rt/cmd_vel", "rt/odom_of_ours"), identities=rogue)
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    made: list[Child] = []
+
+    def start(security: dict[str, str] | None) -> Child:
+        made.append(Child("fixtures.dds_member", {"domain_id": DOMAIN, "security": security}))
+        return made[-1]
+
+    yield start
+    for each in made:
+        each.close()
+
+
+@pytest.fixture(scope="module")
+def us(pki: DdsPki) -> dict[str, str]:
+    """The one identity of this process, which drives a base and has an arm."""
+    return pki.member("us", publish=("rt/cmd_vel",), subscribe=("rt/my_arm/joint_command",))
+
+
+def test_who_is_granted_a_topic_is_heard_on_it(peer: Peer, alice: dict[str, str], bob: dict[str, str]) -> None:
+    listener, speaker = peer(bob), peer(alice)
+    listener.ask("listen", CMD, TWIST)
+    until_heard(speaker, listener, SPEED)
+    assert listener.ask("heard")[0]["linear"]["x"] == 0.25
+
+
+def test_who_is_not_granted_a_topic_can_neither_write_nor_read_it(
+    peer: Peer, alice: dict[str, str], bob: dict[str, str]
+) -> None:
+    speaker, listener = peer(alice), peer(bob)
+    with pytest.raises(RuntimeError, match=r"/odom_of_ours cannot be published.*NOT_ALLOWED_BY_SECURITY"):
+        speaker.ask("say", ODOM, ODOMETRY, {})
+    with pytest.raises(RuntimeError, match=r"/odom_of_ours cannot be read.*NOT_ALLOWED_BY_SECURITY"):
+        speaker.ask("listen", ODOM, ODOMETRY)
+    with pytest.raises(RuntimeError, match=r"/cmd_vel cannot be published.*NOT_ALLOWED_BY_SECURITY"):
+        listener.ask("say", CMD, TWIST, SPEED)
+
+
+@pytest.mark.parametrize("who", ["mallory", "nobody"])
+def test_a_stranger_is_neither_heard_nor_told(
+    who: str, request: pytest.FixtureRequest, peer: Peer, alice: dict[str, str], bob: dict[str, str]
+) -> None:
+    listener, speaker = peer(bob), peer(alice)
+    stranger = peer(request.getfixturevalue(who) if who == "mallory" else None)
+    listener.ask("listen", CMD, TWIST)
+    until_heard(speaker, listener, SPEED)
+    # It waits for somebody to subscribe, for as long as the others took several times over.
+    with pytest.raises(RuntimeError, match="Nobody subscribes to /cmd_vel"):
+        stranger.ask("say", CMD, TWIST, {"linear": {"x": 9.0}})
+    for _ in range(20):
+        stranger.ask("tell", CMD, TWIST, {"linear": {"x": 9.0}})
+    stranger.ask("listen", CMD, TWIST)
+    until_heard(speaker, listener, {"linear": {"x": 0.5}})
+    assert {each["linear"]["x"] for each in listener.ask("heard")} == {0.25, 0.5}
+    assert stranger.ask("heard") == []
+
+
+@pytest.mark.parametrize("secured", [True, False])
+def test_a_listener_on_the_wire_reads_an_unsecured_graph_and_not_a_secured_one(
+    secured: bool, peer: Peer, pki: DdsPki, bob: dict[str, str]
+) -> None:
+    try:
+        wire = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.ntohs(3))
+    except PermissionError:
+        pytest.skip("needs root, to listen on the wire")
+    reader = pki.member("reader", subscribe=("rt/odom_of_ours",))
+    listener, base = peer(reader if secured else None), peer(bob if secured else None)
+    seen: list[bytes] = []
+    done = threading.Event()
+
+    def sniff() -> None:
+        while not done.is_set():
+            try:
+                seen.append(wire.recv(65535))
+            except TimeoutError:
+                continue
+
+    with wire:
+        wire.bind(("lo", 0))
+        wire.settimeout(0.1)
+        thread = threading.Thread(target=sniff, name="sniffer")
+        thread.start()
+        try:
+            listener.ask("listen", ODOM, ODOMETRY)
+
+            def told() -> bool:
+                base.ask("say", ODOM, ODOMETRY, {"child_frame_id": SECRET})
+                return len(listener.ask("heard")) >= 10
+
+            eventually(told)
+        finally:
+            done.set()
+            thread.join(5)
+    # Permissions are shown in the handshake, before there are keys; nothing else names the topic.
+    rtps = [packet.replace(b"<topic>rt/odom_of_ours</topic>", b"") for packet in seen if b"RTPS" in packet]
+    assert len(rtps) > 10
+    assert any(SECRET.encode() in packet for packet in rtps) is not secured
+    assert any(b"rt/odom_of_ours" in packet for packet in rtps) is not secured
+
+
+@pytest.mark.parametrize("harmed", ["governance", "permissions", "certificate", "identity_ca", "permissions_ca"])
+def test_credentials_that_do_not_hold_leave_no_participant(
+    harmed: str, peer: Peer, alice: dict[str, str], bob: dict[str, str], mallory: dict[str, str], tmp_path: Path
+) -> None:
+    config = {**alice, harmed: mallory["identity_ca"]}
+    if harmed in ("governance", "permissions"):
+        document = Path(alice[harmed].removeprefix("file:")).read_bytes()
+        tampered = tmp_path / "tampered"
+        tampered.write_bytes(document.replace(b"true", b"false").replace(b"rt/cmd_vel", b"*"))
+        config[harmed] = str(tampered)
+    if harmed == "certificate":
+        # Another member's, whom these permissions do not name.
+        config |= {key: bob[key] for key in ("certificate", "private_key")}
+    member = peer(config)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match=f"domain {DOMAIN} could not be joined with these credentials"):
+            member.ask("join")
+
+
+def test_a_process_presents_one_set_of_credentials_in_a_domain(us: dict[str, str], alice: dict[str, str]) -> None:
+    first, again, other = (DdsLink(DOMAIN, dds_security_config=each) for each in (us, dict(us), alice))
+    try:
+        first.open()
+        again.open()
+        with pytest.raises(RosError, match="has presented other credentials"):
+            other.open()
+    finally:
+        first.close()
+        again.close()
+
+
+def test_credentials_may_be_given_as_data(alice: dict[str, str], peer: Peer, bob: dict[str, str]) -> None:
+    given = {key: f"data:,{Path(value.removeprefix('file:')).read_text()}" for key, value in alice.items()}
+    listener, speaker = peer(bob), peer(given)
+    listener.ask("listen", CMD, TWIST)
+    until_heard(speaker, listener, SPEED)
+
+
+def test_a_base_on_a_secured_graph_is_driven_and_stopped(peer: Peer, us: dict[str, str], bob: dict[str, str]) -> None:
+    base = peer(bob)
+    base.ask("listen", CMD, TWIST)
+    rover = RtpsRobot("rover", CMD, domain_id=DOMAIN, publish_rate=20, command_gate=OPEN, dds_security_config=us)
+    try:
+        assert rover.advertise()["status"] == "success"
+        eventually(lambda: rover.drive(0.3, 0.0, duration=0.2)["status"] == "success")
+        assert rover.stop()["status"] == "success"
+        assert base.ask("heard")[-1]["linear"]["x"] == 0.0
+        assert any(each["linear"]["x"] == 0.3 for each in base.ask("heard"))
+    finally:
+        rover.disconnect()
+
+
+def test_an_arm_on_a_secured_graph_takes_commands_of_members_only(
+    peer: Peer, us: dict[str, str], alice: dict[str, str]
+) -> None:
+    arm = Arm()
+    command = {"name": ["a.pos"], "position": [0.5]}
+    bridge = HardwareRtpsBridge(arm, domain_id=DOMAIN, poll_period=0.005, dds_security_config=us)
+    try:
+        with pytest.raises(RuntimeError, match="Nobody subscribes"):
+            peer(None).ask("say", ARM, JOINTS, {"name": ["a.pos"], "position": [9.0]})
+        member = peer(alice)
+        eventually(lambda: member.ask("say", ARM, JOINTS, command) or arm.taken)
+        assert all(each == {"a.pos": 0.5} for each in arm.taken)
+    finally:
+        bridge.shutdown()
+
+
+def test_an_arm_whose_permissions_do_not_grant_the_command_topic_is_not_put_on_the_graph(us: dict[str, str]) -> None:
+    before = threading.active_count()
+    with pytest.raises(RosError, match="/another/joint_command cannot be read"):
+        HardwareRtpsBridge(Arm(), domain_id=DOMAIN, command_robot_name="another", dds_security_config=us)
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize(
+    ("laws", "open_because"),
+    [
+        (governance(DOMAIN, strangers=True), "allows unauthenticated participants"),
+        (governance(DOMAIN, written_by_all=True), "lets everybody write"),
+        (governance(DOMAIN, kind="NONE"), "neither signs nor encrypts"),
+        (governance(DOMAIN + 1), f"no rule for domain {DOMAIN}"),
+    ],
+)
+def test_commands_are_refused_where_the_governance_leaves_them_open(pki: DdsPki, laws: str, open_because: str) -> None:
+    config = pki.member("lax", subscribe=("rt/my_arm/joint_command",), laws=laws)
+    with pytest.raises(ValidationError, match=open_because):
+        HardwareRtpsBridge(Arm(), domain_id=DOMAIN, dds_security_config=config)
