@@ -1,0 +1,90 @@
+"""Device Connect and the mesh on one machine at the same loopback port, as both have it by default."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.bare_caller import Caller
+from fixtures.echo_device import EchoDevice
+from fixtures.waiting import accepts, eventually, free_port
+from tests.integration.mesh.conftest import Join
+
+from strands_robots.device_connect.backends import loopback_config, open_client
+from strands_robots.mesh import keys
+
+
+@pytest.mark.parametrize("first", ["device", "mesh"])
+async def test_who_comes_second_shares_the_port_and_a_survivor_takes_it_over(join: Join, port: int, first: str) -> None:
+    link = loopback_config(port)
+    console = join("console", "none") if first == "mesh" else None
+    with EchoDevice("dev-1", link) as one, EchoDevice("dev-2", link):
+        console = console or join("console", "none")
+        sim = join("sim-1")
+        console.sees("sim-1")
+        sim.sees("console")
+        async with Caller(client=await open_client(link)) as caller:
+            await caller.sees("dev-1", "dev-2")
+            assert (await caller.call("dev-2", "getStatus", {"value": "a"}))["result"]["value"] == "a"
+            (one if first == "device" else console).kill()
+            eventually(lambda: accepts(port), within=5, what="somebody at the port again")
+            assert (await caller.call("dev-2", "getStatus", {"value": "b"}))["result"]["value"] == "b"
+        other = join("sim-2")
+        eventually(lambda: other.ask("ping", "sim-1", 0.5)["status"] == "ok", within=8)
+        sim.sees("sim-2")
+        async with Caller(client=await open_client(link)) as late:
+            await late.sees("dev-2")
+
+
+@pytest.fixture
+def served_on_both(port: int, tmp_path: Path) -> Iterator[str]:
+    """A simulated arm in one process, on Device Connect under the id that is given, and on the mesh."""
+    state = tmp_path / "both"
+    state.mkdir(mode=0o700)
+    both = {"STRANDS_MESH": "true", "STRANDS_MESH_PORT": str(port), "STRANDS_DC_PORT": str(port)}
+    serving = subprocess.Popen(
+        [sys.executable, "-m", "strands_robots.cli", "serve", "so100", "--peer-id", "arm-1", "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **both, "STRANDS_STATE_DIR": str(state)},
+    )
+    try:
+        assert serving.stdout is not None
+        yield json.loads(serving.stdout.readline())["peer_id"]
+    finally:
+        serving.kill()
+        serving.communicate()
+
+
+async def test_one_process_serves_its_robot_on_both(join: Join, port: int, served_on_both: str) -> None:
+    console = join("console", "none")
+
+    def on_mesh() -> Any:
+        return next((row for row in console.ask("peers") if row.get("sim_robots") == ["so100"]), None)
+
+    peer = eventually(on_mesh, within=8, what="the arm on the mesh")["peer_id"]
+    assert console.ask("send", peer, {"action": "status"}, 5)["result"]["status"] == "success"
+    async with Caller(client=await open_client(loopback_config(port))) as caller:
+        await caller.sees(served_on_both)
+        assert (await caller.call(served_on_both, "getStatus"))["result"]
+        # A stop by one road locks the robot on the other.
+        console.ask("estop")
+        moved = await caller.call(served_on_both, "execute", {"instruction": "wave", "policy_provider": "mock"})
+        assert moved["result"]["status"] == "error"
+
+
+def test_a_mesh_with_certificates_needs_another_port_and_says_so(
+    join: Join, port: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    keys.init(tmp_path / "keys")
+    certified = keys.issue(tmp_path / "keys", "sim-1").settings()
+    with EchoDevice("dev-1", loopback_config(port)):
+        assert join("sim-1", **certified).ask("alive") is False
+        assert "set STRANDS_MESH_PORT" in capfd.readouterr().err
+        assert join("sim-1", **certified, STRANDS_MESH_PORT=str(free_port())).ask("alive") is True
