@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import socket
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,7 @@ from strands_robots.ros.link import RosError
 from strands_robots.ros_telemetry import INSECURE
 from strands_robots.utils import ValidationError
 
+ROOT = Path(__file__).resolve().parents[3]
 HAS_PLUGINS = importlib.metadata.version("cyclonedds").startswith("0.10.")
 pytestmark = [
     pytest.mark.system,
@@ -283,3 +285,27 @@ def test_commands_are_refused_where_the_governance_leaves_them_open(pki: DdsPki,
     config = pki.member("lax", subscribe=("rt/my_arm/joint_command",), laws=laws)
     with pytest.raises(ValidationError, match=open_because):
         HardwareRtpsBridge(Arm(), domain_id=DOMAIN, dds_security_config=config)
+
+
+def test_the_keys_of_the_documentation_secure_an_arm(tmp_path: Path) -> None:
+    for member in ("arm", "controller"):
+        subprocess.run([ROOT / "examples/dds_security/make-keys.sh", tmp_path, member], check=True)
+
+    def config(member: str) -> dict[str, str]:
+        own = {"certificate": f"{member}.pem", "private_key": f"{member}.key", "permissions": f"{member}.p7s"}
+        shared = {"identity_ca": "identity_ca.pem", "permissions_ca": "permissions_ca.pem"}
+        files = {**own, **shared, "governance": "governance.p7s"}
+        return {key: str(tmp_path / file) for key, file in files.items()}
+
+    arm = Arm()
+    bridge = HardwareRtpsBridge(arm, command_robot_name="arm", poll_period=0.005, dds_security_config=config("arm"))
+    command = {"name": ["a.pos"], "position": [0.5]}
+    try:
+        with Child("fixtures.dds_member", {"domain_id": 0, "security": config("controller")}) as controller:
+            eventually(lambda: controller.ask("say", "/arm/joint_command", JOINTS, command) or arm.taken)
+            controller.ask("listen", "/arm/joint_states", JOINTS)
+            eventually(lambda: bridge.publish_joint_states("arm", ["a.pos"], [0.5]) or controller.ask("heard"))
+            with pytest.raises(RuntimeError, match="NOT_ALLOWED_BY_SECURITY"):
+                controller.ask("say", "/arm/joint_states", JOINTS, command)
+    finally:
+        bridge.shutdown()
