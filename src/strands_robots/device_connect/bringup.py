@@ -242,6 +242,12 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
         from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver  # noqa: PLC0415 - for it alone
 
         return ReachyMiniDriver(robot=robot)
+    if getattr(robot, "nav_action", None) is not None and callable(getattr(robot, "start_navigation", None)):
+        from strands_robots.device_connect.navigating_base_driver import (  # noqa: PLC0415 - as above
+            NavigatingBaseDeviceDriver,
+        )
+
+        return NavigatingBaseDeviceDriver(robot)
     if callable(getattr(robot, "start_drive", None)):
         from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver  # noqa: PLC0415 - as above
 

@@ -34,6 +34,8 @@ class Order:
 class Burst:
     """Sends an order under a permit. :meth:`run` once, on any thread; :meth:`interrupt` from any other."""
 
+    policy = "drive"
+
     def __init__(self, order: Order, wire: VelocityWire, permit: Permit) -> None:
         self.order = order
         self.state = "running"
@@ -45,6 +47,16 @@ class Burst:
         self._wire = wire
         self._permit = permit
         self._stopped = threading.Event()
+
+    @property
+    def instruction(self) -> str:
+        """The drive in a few words."""
+        return f"drive {self.order.linear:g} m/s, {self.order.angular:g} rad/s"
+
+    @property
+    def velocities(self) -> Mapping[str, float]:
+        """What was ordered, in m/s and rad/s."""
+        return {"linear": self.order.linear, "angular": self.order.angular}
 
     @property
     def elapsed_s(self) -> float:

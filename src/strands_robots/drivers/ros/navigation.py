@@ -48,13 +48,16 @@ class Destination:
 class Navigation:
     """Sends one goal under a permit and waits; a void permit cancels it. :meth:`run` once."""
 
+    policy = "navigate"
+
     def __init__(self, link: RosLink, action: str, kind: str, to: Destination, permit: Permit) -> None:
         self.to = to
         self.state = "running"
         self.ended = threading.Event()
         self.report: GoalReport | None = None
         self.feedback: list[Mapping[str, Any]] = []
-        self.heard = 0
+        self.sent = 0
+        self.answer: Envelope | None = None
         self._link = link
         self._target = (action, kind)
         self._permit = permit
@@ -65,6 +68,11 @@ class Navigation:
     def instruction(self) -> str:
         """The goal in a few words."""
         return f"navigate to x {self.to.x:g} m, y {self.to.y:g} m in {self.to.frame_id}"
+
+    @property
+    def velocities(self) -> Mapping[str, float]:
+        """None: the stack chooses them."""
+        return {}
 
     @property
     def elapsed_s(self) -> float:
@@ -91,7 +99,7 @@ class Navigation:
                 logger.warning("The %s could not be cancelled: %s", self.instruction, exc)
 
     def run(self) -> Envelope:
-        """Send, wait, and answer how it went."""
+        """Send, wait, and answer how it went; the answer is kept in ``answer``."""
         try:
             self.report = run_goal(
                 self._link,
@@ -101,16 +109,17 @@ class Navigation:
                 feedback=self._hear,
                 given_up=lambda: not self._permit.valid,
             )
+            self.answer = self._answered(self.report)
         except (RosError, MissingExtraError) as exc:
             self.state = "error"
-            return error(f"The goal was not begun: {exc}", goal_state="not sent")
+            self.answer = error(f"The goal was not begun: {exc}", goal_state="not sent")
         finally:
             self._took_s = time.monotonic() - self._began
             self.ended.set()
-        return self._answered(self.report)
+        return self.answer
 
     def _hear(self, message: Message) -> None:
-        self.heard += 1
+        self.sent += 1
         self.feedback = [*self.feedback[1 - FEEDBACK_KEPT :], dict(message)]
 
     def _answered(self, report: GoalReport) -> Envelope:
@@ -119,7 +128,7 @@ class Navigation:
             "goal_state": report.state,
             "result": report.values,
             "feedback": list(self.feedback),
-            "feedback_count": self.heard,
+            "feedback_count": self.sent,
             "ended_by": report.cut or None,
         }
         if report.state == "succeeded":

@@ -1,16 +1,39 @@
-"""Who is told when a drive begins and ends."""
+"""Who is told when a drive or a navigation begins and ends."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Literal
+from typing import Literal, Protocol
 
 from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
-from strands_robots.drivers.ros.burst import Burst
-from strands_robots.envelope import is_error, text_of
+from strands_robots.envelope import Envelope, is_error, text_of
 
 logger = logging.getLogger(__name__)
+
+
+class Motion(Protocol):
+    """What is told about: a burst of velocities, or a goal of a navigation stack."""
+
+    policy: str
+    state: str
+    answer: Envelope | None
+
+    @property
+    def instruction(self) -> str:
+        """What was ordered, in a few words."""
+
+    @property
+    def sent(self) -> int:
+        """How far it has come: messages sent, or samples of feedback."""
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since it was ordered, or that it took."""
+
+    @property
+    def velocities(self) -> Mapping[str, float]:
+        """``linear`` in m/s and ``angular`` in rad/s, where those were ordered."""
 
 
 class Observers:
@@ -29,25 +52,25 @@ class Observers:
 
         return remove
 
-    def started(self, burst: Burst) -> None:
-        """A drive begins."""
-        self._tell("started", burst, {"linear": burst.order.linear, "angular": burst.order.angular})
+    def started(self, motion: Motion) -> None:
+        """A motion begins."""
+        self._tell("started", motion, motion.velocities)
 
-    def finished(self, burst: Burst) -> None:
-        """A drive is over, its zero included."""
-        self._tell("finished", burst, {})
+    def finished(self, motion: Motion) -> None:
+        """A motion is over; of a drive, its zero included."""
+        self._tell("finished", motion, {})
 
-    def _tell(self, kind: Literal["started", "finished"], burst: Burst, action: Mapping[str, float]) -> None:
-        answer = burst.answer
+    def _tell(self, kind: Literal["started", "finished"], motion: Motion, action: Mapping[str, float]) -> None:
+        answer = motion.answer
         event = RolloutEvent(
             kind=kind,
             robot=self._robot,
-            instruction=f"drive {burst.order.linear:g} m/s, {burst.order.angular:g} rad/s",
-            policy="drive",
-            step=burst.sent,
-            elapsed_s=burst.elapsed_s,
-            state=burst.state,
-            error=text_of(answer) if answer is not None and burst.state == "error" and is_error(answer) else "",
+            instruction=motion.instruction,
+            policy=motion.policy,
+            step=motion.sent,
+            elapsed_s=motion.elapsed_s,
+            state=motion.state,
+            error=text_of(answer) if answer is not None and motion.state == "error" and is_error(answer) else "",
             action=action,
         )
         for observer in self._all:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -111,34 +112,25 @@ class RosBridgedRobot(MobileBaseRobot):
         failure is an error envelope with ``goal_state``: not sent, rejected, aborted, canceled, or lost where nobody
         knows whether the robot is still on its way.
         """
-        try:
-            to = Destination(
-                number("x", x),
-                number("y", y),
-                number("yaw", yaw),
-                text("frame_id", frame_id, longest=255),
-                number("timeout", timeout, above=0),
-            )
-        except ValidationError as refused:
-            return error(str(refused))
-        if self.nav_action is None:
-            return error(f"navigate_to needs nav_action, and {self.tool_name_str} was made without one.")
-        if not self._slot.acquire(blocking=False):
-            return error("The base is being driven; stop it first, or wait for its end.")
-        try:
-            permit = self.gate.permit("navigate_to")
-            refusal = self.command_gate.refusal(self.nav_action, self.nav_action_type, "navigate_to", tool_context)
-            if refusal is not None:
-                return refusal
-            self._watch_odometry()
-            self._holds.end_for(permit)
-            self._burst = None
-            going = self._navigation = Navigation(self.link, self.nav_action, self.nav_action_type, to, permit)
-            return going.run()
-        except MotionRefused as locked:
-            return locked.envelope
-        finally:
-            self._slot.release()
+        going = self._depart((x, y, yaw, frame_id, timeout), tool_context)
+        return self._travel(going) if isinstance(going, Navigation) else going
+
+    def start_navigation(  # noqa: PLR0917 - as above
+        self,
+        x: float,
+        y: float,
+        yaw: float = 0.0,
+        frame_id: str = "map",
+        timeout: float = 120.0,
+        tool_context: Any = None,
+    ) -> Envelope:
+        """Start what :meth:`navigate_to` waits for; its end is told to observers and by :meth:`get_task_status`."""
+        going = self._depart((x, y, yaw, frame_id, timeout), tool_context)
+        if not isinstance(going, Navigation):
+            return going
+        name = f"navigate-{self.node_name}"
+        threading.Thread(target=self._travel, args=(going,), name=name, daemon=True).start()
+        return success(f"On the way: {going.instruction}.", timeout=going.to.timeout_s)
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Cancel the navigation goal and stop the base; see :meth:`MobileBaseRobot.halt`.
@@ -180,7 +172,7 @@ class RosBridgedRobot(MobileBaseRobot):
             f"The last goal is {going.state}.",
             task_status=going.state,
             instruction=going.instruction,
-            step_count=going.heard,
+            step_count=going.sent,
             duration=round(going.elapsed_s, 3),
             feedback=latest,
         )
@@ -192,3 +184,46 @@ class RosBridgedRobot(MobileBaseRobot):
 
         found = super().tools
         return found if self.nav_action is None else [*found, navigate_tool(self)]
+
+    def _depart(self, stated: tuple[Any, Any, Any, Any, Any], tool_context: Any) -> Navigation | Envelope:
+        """A navigation that may begin, with the base's one slot taken for it; or why it may not."""
+        x, y, yaw, frame_id, timeout = stated
+        try:
+            to = Destination(
+                number("x", x),
+                number("y", y),
+                number("yaw", yaw),
+                text("frame_id", frame_id, longest=255),
+                number("timeout", timeout, above=0),
+            )
+        except ValidationError as refused:
+            return error(str(refused))
+        if self.nav_action is None:
+            return error(f"navigate_to needs nav_action, and {self.tool_name_str} was made without one.")
+        if not self._slot.acquire(blocking=False):
+            return error("The base is being driven; stop it first, or wait for its end.")
+        held = False
+        try:
+            permit = self.gate.permit("navigate_to")
+            refusal = self.command_gate.refusal(self.nav_action, self.nav_action_type, "navigate_to", tool_context)
+            if refusal is not None:
+                return refusal
+            self._watch_odometry()
+            self._holds.end_for(permit)
+            self._burst = None
+            going = self._navigation = Navigation(self.link, self.nav_action, self.nav_action_type, to, permit)
+            held = True
+        except MotionRefused as locked:
+            return locked.envelope
+        finally:
+            if not held:
+                self._slot.release()
+        return going
+
+    def _travel(self, going: Navigation) -> Envelope:
+        self._observers.started(going)
+        try:
+            return going.run()
+        finally:
+            self._slot.release()
+            self._observers.finished(going)
