@@ -240,3 +240,9 @@ def test_an_observer_that_stops_its_own_rollout_does_not_deadlock() -> None:
     assert one.join(5)
     assert said == [False]
     assert len(body.writes) == 1
+
+
+def test_a_policy_that_exits_instead_of_failing_leaves_a_hold_all_the_same() -> None:
+    one, body = run(ScriptedPolicy([{"a": 0.1}, SystemExit("a library gave up")]))
+    assert (one.state, body.holds) == ("error", 1)
+    assert "SystemExit" in one.error

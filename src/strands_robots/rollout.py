@@ -222,7 +222,7 @@ class Rollout:
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"
-                except Exception as exc:  # noqa: BLE001 - whatever a policy raises is told in `_lament`
+                except BaseException as exc:  # noqa: BLE001 - whatever a policy raises, SystemExit too, is told and held
                     # What was told to stop may give up in any way it likes.
                     if self._permit.valid:
                         state, self.error = "error", f"{type(exc).__name__}: {exc}"
@@ -234,12 +234,12 @@ class Rollout:
         finally:
             self._finish(state)
 
-    def _lament(self, exc: Exception) -> None:
+    def _lament(self, exc: BaseException) -> None:
         what = "The rollout of %s on %s failed; it holds: %s"
         if isinstance(exc, PolicyError | OSError | ValidationError):
             logger.error(what, self.policy_name, self.robot, exc)
         else:
-            logger.exception(what, self.policy_name, self.robot, exc)
+            logger.error(what, self.policy_name, self.robot, exc, exc_info=exc)
 
     def _loop(self, bounds: Ranges) -> State:
         started = self._clock.now()

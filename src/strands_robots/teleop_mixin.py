@@ -12,7 +12,7 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.rollout import STOP_JOIN_S, Body, Observers, Rollout
-from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, Waiting
 from strands_robots.teleop import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
 
@@ -116,8 +116,10 @@ class TeleopMixin:
             seconds = None if duration is None else number("duration", duration, above=0, high=3600)
             rate = number("hz", hz, low=1, high=1000)
             sink = self._teleop_sink(flag("publish", publish))
-            with self.starting:
-                session = self._lead(identifier("name", name), seconds, rate, sink)
+            permit = self.gate.permit("teleoperate")
+            with self._teleop_waiting.until_begun(permit, identifier("name", name)), self.starting:
+                permit.check()
+                session = self._lead(name, seconds, rate, sink, permit)
         except MotionRefused as refused:
             return refused.envelope
         except ValidationError as exc:
@@ -126,6 +128,7 @@ class TeleopMixin:
 
     def stop_teleoperate(self, name: str | None = None, timeout: float = STOP_JOIN_S) -> Envelope:
         """Stop one leader, or all. ``stopped`` is false when a loop outlived the ``timeout`` in seconds."""
+        self._teleop_waiting.void(name)
         running = self.teleoperating()
         asked = running if name is None else {key: each for key, each in running.items() if key == name}
         if not asked:
@@ -154,6 +157,12 @@ class TeleopMixin:
         """The leader that drives the body of that name now; empty when none does."""
         return next((name for name, each in self.teleoperating().items() if each.robot == robot), "")
 
+    def void_leaders(self, robot: str) -> None:
+        """Keep leaders of the body of that name from beginning that have not begun yet."""
+        for name, attachment in list(self._teleop_leaders.items()):
+            if attachment.robot == robot:
+                self._teleop_waiting.void(name)
+
     def teleop_stops(self, deadline: float) -> dict[str, Callable[[], object]]:
         """For a halt: void every session at once; how to wait for each, until ``deadline`` on the monotonic clock."""
         running = self.teleoperating()
@@ -166,6 +175,10 @@ class TeleopMixin:
         return {}
 
     @cached_property
+    def _teleop_waiting(self) -> Waiting:
+        return Waiting()
+
+    @cached_property
     def _teleop_sessions(self) -> dict[str, tuple[Rollout, LeaderPolicy]]:
         return {}
 
@@ -174,7 +187,7 @@ class TeleopMixin:
             raise ValidationError("publish must be false: no network that carries input streams is attached.")
         return self.input_sink if publish else None
 
-    def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None) -> Rollout:
+    def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None, permit: Permit) -> Rollout:
         attachment = self._teleop_leaders.get(name)
         if attachment is None:
             known = ", ".join(self._teleop_leaders) or "none yet"
@@ -195,7 +208,7 @@ class TeleopMixin:
         session = Rollout(
             body,
             policy,
-            permit=self.gate.permit("teleoperate"),
+            permit=permit,
             instruction=f"follow {name}",
             policy_name="teleoperation",
             duration=seconds,

@@ -114,6 +114,17 @@ async def test_stop_names_what_did_not_stop_beside_what_did(world: ToyWorld, mon
         assert "its loop hangs" in answer["reason"]
 
 
+async def test_a_policy_that_hangs_does_not_hold_up_the_stop_of_the_others(world: ToyWorld) -> None:
+    waited: list[bool] = []
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        for name in ("left", "right"):
+            await bench.call("execute", instruction="wave", robot_name=name)
+        permits = [rollout._permit for rollout in world.rollouts.values()]
+        world.before["stop_policy"] = lambda: waited.append(any(permit.valid for permit in permits))
+        assert (await bench.call("stop"))["status"] == "success"
+    assert waited == [False, False], "every permit is void before anybody waits for a rollout"
+
+
 async def test_a_world_torn_down_under_a_stop_is_an_error_and_not_an_exception(
     world: ToyWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:

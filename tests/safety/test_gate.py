@@ -26,8 +26,7 @@ def test_a_halt_voids_every_permit_given_so_far_and_none_given_after() -> None:
     assert [permit.valid for permit in before] == [False, False]
     assert after.valid
     gate.revoke()
-    assert not after.valid
-    assert not before[0].valid
+    assert [permit.valid for permit in (after, before[0])] == [False, False]
 
 
 def test_a_withdrawn_permit_is_void_alone() -> None:
@@ -151,3 +150,24 @@ def test_a_permit_that_waited_says_so_when_it_is_void() -> None:
     gate.revoke()
     with pytest.raises(MotionRefused, match="halted after it was asked for"):
         permit.check()
+
+
+def test_a_motion_that_stops_everything_else_first_goes_on_with_a_fresh_permit() -> None:
+    gate = MotionGate()
+    mine, other = gate.permit("reset"), gate.permit("wave")
+    fresh = gate.renew(mine)
+    assert [permit.valid for permit in (fresh, mine, other)] == [True, False, False]
+    gate.revoke()
+    assert not fresh.valid
+
+
+def test_a_motion_is_not_renewed_over_a_halt_or_a_lock() -> None:
+    gate = MotionGate()
+    permit = gate.permit("reset")
+    gate.revoke()
+    with pytest.raises(MotionRefused, match="halted after it was asked for"):
+        gate.renew(permit)
+    permit = gate.permit("reset")
+    gate.attach(Latch())
+    with pytest.raises(MotionRefused, match="locked"):
+        gate.renew(permit)

@@ -261,15 +261,17 @@ class SimulationDeviceDriver(RobotDriver):
         return {**answer, "robot_name": name}
 
     def _stop_all(self) -> Envelope:
-        """Each rollout by its own verb, then everything else that moves; one answer for all."""
+        """Everything that moves at once, then each rollout's own word; one answer for all."""
         running: list[str] = []
         unlisted: dict[str, str] = {}
         try:
             running = [str(row.get("robot", "")) for row in self.world.list_policies_running()]
         except Exception as exc:  # noqa: BLE001 - a world that changes under the stop is halted as a whole below
             unlisted = {"rollouts": explain(exc)}
-        rollouts = halt_each({name: _stopping(self.world, name) for name in running})
+        # The halt comes first: a policy that hangs would have the others move on while its own stop waits for it.
         rest = self.halt("stop")
+        open_ = [name for name in running if name not in rest.not_stopped]
+        rollouts = halt_each({name: _stopping(self.world, name) for name in open_})
         stopped = [*rollouts.halted, *(name for name in rest.halted if name not in running)]
         refused = {**unlisted, **rollouts.not_stopped, **rollouts.unknown, **rest.not_stopped, **rest.unknown}
         fields = {"stopped": stopped, "not_stopped": sorted(refused), "reasons": refused}

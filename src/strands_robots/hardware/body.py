@@ -71,6 +71,8 @@ class DeviceBody:
         self._latest: tuple[float, dict[str, float]] | None = None
         self._lost = False
         self._stops = 0
+        self.driven = False
+        """True from an action until it was frozen or let go."""
 
     @property
     def lost(self) -> bool:
@@ -135,6 +137,7 @@ class DeviceBody:
         with self.lock:
             if not permit.valid:
                 raise PermitVoidError(f"{self.name} was stopped")
+            self.driven = True
             sent = self.device.send_action(dict(action))
             return sent if isinstance(sent, Mapping) else dict(action)
 
@@ -142,6 +145,7 @@ class DeviceBody:
         with self.lock:
             if permit is None or not permit.revoked:
                 self._hold()
+                self.driven = False
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
@@ -167,10 +171,13 @@ class DeviceBody:
         with self.stopping():
             if self.lost:
                 raise ConnectionError("its port is gone; a servo goes on to its last goal")
+            if not self.is_connected:
+                raise ConnectionError("it is not connected; what it was told last goes on")
             if self.stop_level == "release":
                 self._release()
             else:
                 self._hold(urgent=True)
+            self.driven = False
 
     def running(self) -> AbstractContextManager[None]:
         return nullcontext()

@@ -98,10 +98,10 @@ def _pass(attempt: _Attempt) -> None:
     body = attempt.body
     with body.stopping():
         try:
-            if body.is_connected or body.lost:
+            if body.is_connected or body.lost or body.driven:
                 body.stop()
-        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the halt reports it
-            attempt.failure = exc
+        except BaseException as exc:  # noqa: BLE001 - a device may raise anything; the halt reports it
+            attempt.failure = exc if isinstance(exc, Exception) else RuntimeError(repr(exc))
             logger.critical("%s could not be frozen: %s: %s", body.name, type(exc).__name__, exc)
         finally:
             attempt.done.set()

@@ -63,6 +63,9 @@ class HardwareRobot(Tasks):
     @property
     def safety_key(self) -> str:
         """Under what its lockout is kept: the hardware's own id, whatever it is called; empty where it has none."""
+        given = getattr(self.device, "safety_key", "")
+        if given:
+            return str(given)
         own = stable_id(self.device)
         return "" if own is None else hardware_key(kind(self.device), own)
 
@@ -73,6 +76,9 @@ class HardwareRobot(Tasks):
         """
         self._body.connect()
         self._freezer.ready()
+        if self.gate.refusal("connect") is not None:
+            # The halt found no port: a servo that is back goes on to its last goal.
+            self._freezer.freeze(ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S"))
 
     def get_features(self) -> Envelope:
         """``observation_features`` and ``action_features`` as data (``float``, or an image's shape), with ranges."""
@@ -113,9 +119,9 @@ class HardwareRobot(Tasks):
     def send_action(self, action: Mapping[str, float]) -> Envelope:
         """Set targets once; ``sent`` is what the device really took. Refused while a task or a leader drives it."""
         try:
+            permit = self.gate.permit("send_action")
             with self.starting:
                 self._freezer.ready()
-                permit = self.gate.permit("send_action")
                 self._free()
                 targets = checked_action(dict(action) if isinstance(action, Mapping) else action, self._body.bounds)
             self._sends.add(permit)

@@ -14,7 +14,7 @@ from strands_robots.hardware.body import DeviceBody
 from strands_robots.hardware.freezer import Freezer, NoAnswerError
 from strands_robots.policies.registry import create_policy, resolve_provider
 from strands_robots.rollout import Observers, Rollout
-from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.safety.gate import MotionGate, MotionRefused, Waiting
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
 
@@ -42,6 +42,7 @@ class Tasks(TeleopMixin):
         self._freezer = Freezer(body)
         self.observers = Observers()
         self._task: Rollout | None = None
+        self._waiting = Waiting()
 
     def body(self, robot_name: str | None = None) -> DeviceBody:
         """The one body of this robot, by its name or without one."""
@@ -102,6 +103,7 @@ class Tasks(TeleopMixin):
 
     def stop_task(self) -> Envelope:
         """Stop the task and freeze the robot; ``stopped`` is false when the loop outlived the halt deadline."""
+        self._waiting.void()
         task = self._task
         if task is None or not task.running:
             return success("No task runs.", stopped=True, was_running=False, **self._task_fields())
@@ -139,16 +141,20 @@ class Tasks(TeleopMixin):
         seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
         whole("policy_port", options["policy_port"], low=0, high=65535)
         name = resolve_provider(provider)
-        with self.starting:
+        # Before the line for the robot: a stop that comes while this waits, connects or loads is newer.
+        permit = self.gate.permit("start_task")
+        with self._waiting.until_begun(permit), self.starting:
+            permit.check()
             self._freezer.ready()
-            permit = self.gate.permit("start_task")
             self._free()
             self._reconnect()
             if not self._body.is_connected:
                 raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
+            policy = create_policy(name, **options)
+            permit.check()
             rollout = Rollout(
                 self._body,
-                create_policy(name, **options),
+                policy,
                 permit=permit,
                 instruction=task,
                 policy_name=name,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Caller
 from strands_robots.mesh.safety import FleetSafety
 from strands_robots.mesh.scheduler import Scheduler
-from strands_robots.mesh.serving import MotionDoor, Server
+from strands_robots.mesh.serving import Line, MotionDoor, Server
 from strands_robots.mesh.state import StateReader, describe
 from strands_robots.mesh.stream import Limiter
 from strands_robots.mesh.subscriptions import Subscriptions
@@ -176,7 +175,6 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     inputs: dict[str, dict[str, Any]] = {}
 
     def halt(reason: str) -> StopVerdict:
-        teleop.close()
         return halt_of(robot, peer, reason) if robot is not None else StopVerdict()
 
     dispatcher = Dispatcher(robot, halt, closing=lambda: not context.running())
@@ -189,11 +187,13 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     }
 
     def dispatch(command: dict[str, Any], sample: Sample) -> Any:
-        return (desk.get(command["action"]) or dispatcher)(command)
+        answer = (desk.get(command["action"]) or dispatcher)(command)
+        if command["action"] == "stop":
+            # After the halt, which voids their permits: it must not wait for a frame that a slow bus still takes.
+            teleop.close()
+        return answer
 
-    def asked() -> AbstractContextManager[None]:
-        return nullcontext() if robot is None else robot.gate.asked_at(robot.gate.asked())
-
+    line = Line(None if robot is None else robot.gate)
     approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
     assembled: Assembled
 
@@ -212,7 +212,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         lanes=lanes,
         door=door,
         caller=caller,
-        server=Server(context, lanes, approval_door, safety.locked, dispatch, asked=asked),
+        server=Server(context, lanes, approval_door, safety.locked, dispatch, line=line),
         herald=Herald(context, mesh.peer_type, facts),
         safety=safety,
         state=StateReader(peer, robot, parts.clock),

@@ -28,7 +28,7 @@ class Lane:
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         self._open = True
-        self._busy = 0
+        self._accepted = self._done = 0
         self.dropped = 0
 
     def submit(self, work: Work) -> bool:
@@ -44,7 +44,9 @@ class Lane:
                     return False
                 self._forget_oldest()
         with self._lock:
-            short = not self._threads or (len(self._threads) < self._workers and self._busy >= len(self._threads))
+            self._accepted += 1
+            # Counted from here and not from a worker's start: of jobs that come together each gets its own.
+            short = len(self._threads) < self._workers and self._accepted - self._done > len(self._threads)
             # Closed meanwhile, nobody takes the job: a thread made now would wait for ever.
             if self._open and short:
                 self._add()
@@ -70,7 +72,7 @@ class Lane:
     def join(self, timeout: float) -> list[str]:
         """Wait for the threads of a closed lane; names of those still running."""
         with self._lock:
-            threads, self._threads = self._threads, []
+            threads = list(self._threads)
         deadline = time.monotonic() + timeout
         for thread in threads:
             if thread is not threading.current_thread():
@@ -88,18 +90,18 @@ class Lane:
         except queue.Empty:
             return
         self.dropped += 1
+        with self._lock:
+            self._done += 1
 
     def _run(self) -> None:
         while (work := self._queue.get()) is not None:
-            with self._lock:
-                self._busy += 1
             try:
                 work()
             except Exception:
                 logger.exception("%s: a job failed.", self._name)
             finally:
                 with self._lock:
-                    self._busy -= 1
+                    self._done += 1
 
 
 class Lanes:

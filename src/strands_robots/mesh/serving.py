@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
@@ -16,6 +17,7 @@ from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, validate_command
 from strands_robots.mesh.transport.base import Sample, TransportError
 from strands_robots.safety.approval import Approval, Claim
+from strands_robots.safety.gate import Asked, MotionGate
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
@@ -95,13 +97,50 @@ class MotionDoor:
         return None if found.proven else f"the sender is not attributed: {found.value}"
 
 
+class Line:
+    """Commands that have arrived and are not carried out yet, each as old as its arrival.
+
+    A halt since then refuses what one of them begins, and so does the stop of the robot that it names.
+
+    Args:
+        gate: of the peer's robot; None for a peer without one.
+    """
+
+    def __init__(self, gate: MotionGate | None) -> None:
+        self._gate = gate
+        self._lock = threading.Lock()
+        self._standing: WeakKeyDictionary[Asked, str] = WeakKeyDictionary()
+
+    def join(self, command: object) -> AbstractContextManager[None]:
+        """Taken when a command arrives; entered on the thread and at the time that carries it out."""
+        if self._gate is None:
+            return nullcontext()
+        asked = self._gate.asked()
+        with self._lock:
+            self._standing[asked] = _robot(command)
+        return self._gate.asked_at(asked)
+
+    def stopped(self, command: object) -> None:
+        """A stop that names one robot has arrived; what came before it for this robot, or for any, is void."""
+        name = _robot(command)
+        with self._lock:
+            for asked, whose in self._standing.items() if name else ():
+                if whose in (name, ""):
+                    asked.give_up()
+
+
+def _robot(command: object) -> str:
+    name = command.get("robot_name") if isinstance(command, dict) else None
+    return name if isinstance(name, str) else ""
+
+
 class Server:
     """Receives commands for one peer and replies.
 
     Args:
         locked: whether the lockout holds this peer.
         dispatch: carries out a validated command and returns its result.
-        asked: taken when a command arrives and entered when its turn comes, so that a stop in between refuses it.
+        line: where a command stands until its turn comes, so that a stop in between refuses it.
     """
 
     def __init__(
@@ -112,14 +151,14 @@ class Server:
         locked: Callable[[], bool],
         dispatch: Dispatch,
         *,
-        asked: Callable[[], AbstractContextManager[None]] = nullcontext,
+        line: Line | None = None,
     ) -> None:
         self._context = context
         self._lanes = lanes
         self._door = door
         self._locked = locked
         self._dispatch = dispatch
-        self._asked = asked
+        self._line = line or Line(None)
         self._replays = Replays(context.monotonic)
 
     def on_command(self, sample: Sample) -> None:
@@ -138,7 +177,9 @@ class Server:
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
             self._serve(request, sample)
             return
-        asked = self._asked()
+        if action == "stop":
+            self._line.stopped(request.command)
+        asked = self._line.join(request.command)
 
         def serve() -> None:
             with asked:

@@ -39,7 +39,7 @@ class PermitVoidError(RuntimeError):
 class Asked:
     """A call that asks for motion, since when: a halt after it voids what the call begins, and so does giving it up."""
 
-    __slots__ = ("generation", "given_up")
+    __slots__ = ("__weakref__", "generation", "given_up")
 
     def __init__(self, generation: int) -> None:
         self.generation = generation
@@ -62,6 +62,11 @@ class Permit:
         self.verb = verb
 
     @property
+    def generation(self) -> int:
+        """The gate's, when the motion was asked for."""
+        return self._asked.generation
+
+    @property
     def valid(self) -> bool:
         """False for ever once the robot was halted or locked, this permit withdrawn, or its call given up."""
         return not (self._withdrawn or self._asked.given_up or self.revoked)
@@ -79,6 +84,28 @@ class Permit:
     def withdraw(self) -> None:
         """Void this permit alone: one motion stops, the robot stays free."""
         self._withdrawn = True
+
+
+class Waiting:
+    """Motions that were given leave and have not begun, each by a name: a stop of that name alone voids them too."""
+
+    def __init__(self) -> None:
+        self._permits: dict[Permit, str] = {}
+
+    @contextmanager
+    def until_begun(self, permit: Permit, name: str = "") -> Iterator[None]:
+        """The time in which a motion loads, connects or stands in line; at its end it runs, or never will."""
+        self._permits[permit] = name
+        try:
+            yield
+        finally:
+            del self._permits[permit]
+
+    def void(self, name: str | None = None) -> None:
+        """Withdraw the permits of ``name``, or of all."""
+        for permit, whose in list(self._permits.items()):
+            if name in (None, whose):
+                permit.withdraw()
 
 
 class MotionGate:
@@ -147,6 +174,21 @@ class MotionGate:
     def revoke(self) -> None:
         """Void every permit given so far."""
         self._generation = next(self._numbers)
+
+    def renew(self, permit: Permit) -> Permit:
+        """Void every other permit, as a halt does, and go on with a fresh one in the place of this.
+
+        Raises :class:`MotionRefused` where anybody else has halted or locked the robot since ``permit`` was given.
+        """
+        permit.check()
+        mine = self._generation = next(self._numbers)
+        fresh = Permit(self, Asked(mine), permit.verb)
+        if mine != permit.generation + 1:
+            raise MotionRefused(error(_LATE.format(permit.verb)))
+        refusal = self._refusal(permit.verb, Asked(mine))
+        if refusal is not None:
+            raise MotionRefused(refusal)
+        return fresh
 
     def _asked_here(self) -> Asked:
         return getattr(self._here, "asked", None) or Asked(self._generation)

@@ -25,8 +25,9 @@ class Construction(WorldCore):
         plan = checked_plan(timestep, gravity)
         with self.starting:
             self._changeable("create_world")
+            permit = self.gate.permit("create_world")
             self._rebuild(plan)
-            self._physics.reset()
+            self._physics.reset(permit)
         return success("An empty world with a floor.", timestep=plan.timestep, gravity=plan.gravity)
 
     @answered

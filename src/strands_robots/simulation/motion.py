@@ -13,6 +13,7 @@ from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.registry import create_policy
 from strands_robots.rollout import STOP_JOIN_S, Observers, Rollout
+from strands_robots.safety.gate import Waiting
 from strands_robots.simulation.arguments import answered
 from strands_robots.simulation.body import RobotBody
 from strands_robots.simulation.pictures import Pictures
@@ -36,6 +37,7 @@ class Rollouts(Pictures, TeleopMixin):
         super().__init__(plan, realtime=realtime)
         self.observers = Observers()
         self._rollouts: dict[str, Rollout] = {}
+        self._waiting = Waiting()
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
         """Tell ``observer`` of every rollout event until the returned callable is called."""
@@ -88,10 +90,15 @@ class Rollouts(Pictures, TeleopMixin):
 
     @answered
     def stop_policy(self, robot_name: str) -> Envelope:
-        """Stop one robot's rollout and freeze the robot where it is; ``stopped`` is false if the loop outlived it."""
+        """Stop what drives one robot, a policy or a leader, and freeze the robot where it is.
+
+        ``stopped`` is false if the loop outlived it. A policy or a leader that is still made ready never begins.
+        """
         body = self.body(robot_name)
-        rollout = self._rollouts.get(body.name)
-        if rollout is None or not rollout.running:
+        self._waiting.void(body.name)
+        self.void_leaders(body.name)
+        rollout = self._running().get(body.name) or self.teleoperating().get(self.teleoperated_by(body.name))
+        if rollout is None:
             return success(f"{body.name} runs no policy.", robot=body.name, stopped=True, was_running=False)
         return self._stop(body, rollout, STOP_JOIN_S)
 
@@ -121,29 +128,30 @@ class Rollouts(Pictures, TeleopMixin):
         if not whole("policy_port", options.get("policy_port", 0), low=0, high=65535):
             options.pop("policy_port", None)
         permit = self.gate.permit("start_policy")
-        try:
-            policy = create_policy(provider, **options)
-        except MissingExtraError as missing:
-            raise ValidationError(str(missing)) from missing
-        with self.starting:
-            self._open()
-            body = self.body(robot_name)
-            self._idle(body.name)
-            if not permit.valid:
-                raise ValidationError(f"start_policy: {body.name} was halted while its policy was made ready.")
-            rollout = Rollout(
-                body,
-                policy,
-                permit=permit,
-                instruction=task,
-                policy_name=provider,
-                duration=seconds,
-                hz=settings.number("STRANDS_CONTROL_HZ"),
-                observers=self.observers,
-            )
-            self._rollouts[body.name] = rollout
-            rollout.start()
-            return rollout
+        with self._waiting.until_begun(permit, self.body(robot_name).name):
+            try:
+                policy = create_policy(provider, **options)
+            except MissingExtraError as missing:
+                raise ValidationError(str(missing)) from missing
+            with self.starting:
+                self._open()
+                body = self.body(robot_name)
+                self._idle(body.name)
+                if not permit.valid:
+                    raise ValidationError(f"start_policy: {body.name} was halted while its policy was made ready.")
+                rollout = Rollout(
+                    body,
+                    policy,
+                    permit=permit,
+                    instruction=task,
+                    policy_name=provider,
+                    duration=seconds,
+                    hz=settings.number("STRANDS_CONTROL_HZ"),
+                    observers=self.observers,
+                )
+                self._rollouts[body.name] = rollout
+                rollout.start()
+                return rollout
 
     def _idle(self, name: str) -> None:
         driver = self.occupied(name) or self.teleoperated_by(name)

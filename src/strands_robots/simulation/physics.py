@@ -133,9 +133,10 @@ class Physics:
                 for actuator in robot.actuators.values():
                     self._setpoints[actuator.index] = _still(actuator, lengths)
 
-    def reset(self) -> None:
-        """Back to the start state; the step count goes on."""
+    def reset(self, permit: Permit) -> None:
+        """Back to the start state; the step count goes on. Raises :class:`MotionRefused` when ``permit`` is void."""
         with self._step_lock, self._command_lock:
+            permit.check()
             self.snapshot = self._start(self.stage)
 
     def replace(self, stage: Stage) -> None:

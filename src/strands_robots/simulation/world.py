@@ -98,13 +98,14 @@ class Simulation(Rollouts):
     def reset(self) -> Envelope:
         """Halt, then put the world back to its initial state. Refused while the robot is locked."""
         self._open()
-        self.gate.permit("reset")
+        permit = self.gate.permit("reset")
         with self.starting:
-            # Nothing starts a rollout while this lock is held.
-            verdict = self.halt("reset")
+            # Nothing starts a rollout while this lock is held; a stop that comes meanwhile voids the fresh permit.
+            permit = self.gate.renew(permit)
+            verdict = self._frozen("reset")
             if not verdict.stopped:
                 return verdict.envelope()
-            self._physics.reset()
+            self._physics.reset(permit)
         return success("The world is back at its start.", sim_time=self._physics.snapshot.time, halted=verdict.halted)
 
     @answered
@@ -152,8 +153,11 @@ class Simulation(Rollouts):
         The gate goes first and the freeze second; both take microseconds, and after them no action is written,
         whatever a policy is doing. Waiting for the loops to end, so as to say whether they did, comes last.
         """
-        deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
         self.gate.revoke()
+        return self._frozen(reason)
+
+    def _frozen(self, reason: str) -> StopVerdict:
+        deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
         self._physics.hold()
         stops = self._stops(deadline)
         logger.info("Halting %s (%s): %s.", self.tool_name_str, reason or "no reason given", ", ".join(stops) or "-")

@@ -1,0 +1,112 @@
+"""Stops of one robot of a world, and of motions that have not begun yet."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.bodies import ScriptedPolicy
+from fixtures.waiting import eventually
+
+from strands_robots.envelope import error
+from strands_robots.simulation import Simulation, motion
+from strands_robots.teleop import ScriptedLeader
+
+
+@pytest.fixture
+def world() -> Iterator[Simulation]:
+    simulation = Simulation()
+    simulation.add_robot("left", "so100")
+    simulation.add_robot("right", "so101")
+    yield simulation
+    simulation.cleanup()
+
+
+def swinging() -> ScriptedLeader:
+    return ScriptedLeader({"shoulder_pan": (0.0, 0.5, 1.0)})
+
+
+def test_stopping_one_robot_stops_the_leader_that_drives_it_and_no_other(world: Simulation) -> None:
+    for name in ("left", "right"):
+        world.attach_teleop(swinging(), f"leader-{name}", robot_name=name)
+        assert world.teleoperate(f"leader-{name}")["status"] == "success"
+    answer = world.stop_policy("left")
+    assert answer["stopped"] is True
+    assert list(world.teleoperating()) == ["leader-right"]
+    held = world.body("left").targets
+    eventually(lambda: world.teleoperating()["leader-right"].step_count > 20)
+    assert world.body("left").targets == held
+
+
+def test_stopping_one_robot_reaches_its_policy_that_still_loads_and_no_other(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready, loading = threading.Event(), threading.Semaphore(0)
+
+    def slow(provider: str, **options: Any) -> ScriptedPolicy:
+        loading.release()
+        assert ready.wait(10)
+        return ScriptedPolicy([], always={"shoulder_pan": 0.5})
+
+    monkeypatch.setattr(motion, "create_policy", slow)
+    answers: dict[str, Any] = {}
+    threads = [
+        threading.Thread(target=lambda name=name: answers.update({name: world.start_policy(name, "wave")}))
+        for name in ("left", "right")
+    ]
+    for thread in threads:
+        thread.start()
+    assert all(loading.acquire(timeout=5) for _ in threads)
+    assert world.stop_policy("left")["stopped"] is True
+    ready.set()
+    for thread in threads:
+        thread.join(5)
+    assert answers["left"]["status"] == "error"
+    assert answers["right"]["status"] == "success"
+    assert [row["robot"] for row in world.list_policies_running()] == ["right"]
+
+
+def test_a_reset_that_waited_for_its_turn_does_not_move_what_was_stopped_meanwhile(world: Simulation) -> None:
+    world.send_action({"shoulder_pan": 0.5}, "left")
+    world.step(500)
+    before = world.get_observation("left")
+    answers: list[Any] = []
+    with world.starting:
+        thread = threading.Thread(target=lambda: answers.append(world.reset()))
+        thread.start()
+        thread.join(0.1)
+        assert thread.is_alive(), "it waits for whoever builds the world"
+        assert world.halt("test").stopped is True
+    thread.join(5)
+    assert answers[0]["status"] == "error"
+    assert world.get_observation("left")["shoulder_pan"] == pytest.approx(before["shoulder_pan"], abs=0.05)
+
+
+def test_a_stop_in_the_middle_of_a_reset_keeps_the_world_as_it_is(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.send_action({"shoulder_pan": 0.5}, "left")
+    world.step(500)
+    stops = world._stops
+
+    def meanwhile(deadline: float) -> Any:
+        found = stops(deadline)
+        monkeypatch.undo()
+        assert world.halt("somebody else").stopped is True
+        return found
+
+    monkeypatch.setattr(world, "_stops", meanwhile)
+    assert world.reset()["status"] == "error"
+    assert world.get_observation("left")["shoulder_pan"] > 0.3
+
+
+def test_a_locked_world_is_not_started_over(world: Simulation) -> None:
+    class Locked:
+        def refusal(self, verb: str) -> dict[str, Any]:
+            return error(f"{verb} is locked.")
+
+    world.gate.attach(Locked())
+    assert world.create_world()["reason"] == "create_world is locked."
+    assert world.list_robots() == ["left", "right"]
