@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,6 +23,7 @@ from strands_robots.teleop import FULL_RANGES_PER_S
 from strands_robots.utils import ValidationError, identifier
 
 if TYPE_CHECKING:
+    from strands_robots.hardware import LeaderArm
     from strands_robots.hardware.calibrating import Reach
 
 _LOOK_S = 0.05
@@ -179,15 +180,22 @@ def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
     if not at:
         yield recording(Path(leader))
         return
-    from strands_robots.hardware import DeviceBody  # noqa: PLC0415 - real arms only
+    from strands_robots.hardware import LeaderArm  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
 
-    arm = make_device(kind, {**options, "port": port}, "leader")
-    DeviceBody.bring_up(arm)
-    try:
+    with arm_connected(leader, LeaderArm(make_device(kind, {**options, "port": port}, "leader"))) as arm:
         yield arm
-    finally:
-        arm.disconnect()
+
+
+@contextmanager
+def arm_connected(name: str, arm: LeaderArm) -> Iterator[LeaderArm]:
+    """The leader arm while it is connected; one sentence where it cannot be."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(arm)
+        except Exception as exc:
+            raise ConnectionError(f"{name} could not be connected: {' '.join(str(exc).split())}") from exc
+        yield arm
 
 
 def recording(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
