@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import gc
 import json
 import random
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,8 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh import topics, wire
+from strands_robots.mesh import keys, topics, wire
+from strands_robots.mesh.input import InputReceiver
 from strands_robots.mesh.security import ValidationError, validate_command, validate_input_frame
+from strands_robots.mesh.transport.bridge import Seen
+from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
 
 LIMIT = 16 * 1024
 
@@ -44,7 +49,7 @@ def test_any_bytes_are_an_object_or_a_wire_error(data: bytes) -> None:
 
 
 @given(bodies)
-@settings(max_examples=500)
+@settings(max_examples=250)
 def test_any_object_is_a_message_or_a_wire_error(body: dict[str, Any]) -> None:
     for kind in (wire.Presence, wire.Request, wire.Reply, wire.EstopNotice, wire.ResumeRelay):
         try:
@@ -109,19 +114,71 @@ def test_a_message_too_large_is_an_error_to_its_sender() -> None:
     assert json.loads(wire.encode({"a": float("nan"), "b": [float("inf"), 1]}, LIMIT)) == {"a": None, "b": [None, 1]}
 
 
-def seeds(peers: Fleet) -> dict[str, dict[str, Any]]:
-    """A lawful message of each topic, to mutate."""
+signatures = st.fixed_dictionaries(
+    {
+        "v": st.just(1) | scalars,
+        "alg": st.sampled_from(["rsa-pss-sha256", "ecdsa-sha256", "ed25519"]) | scalars,
+        "cert": st.binary(max_size=60).map(lambda data: base64.b64encode(data).decode()) | values,
+        "t": st.floats(allow_nan=True) | st.just(1.0) | scalars,
+        "nonce": st.text(max_size=10) | scalars,
+        "sig": st.text("AZaz09-_=", max_size=20) | values,
+    }
+)
+
+
+@given(bodies, signatures | values)
+@settings(max_examples=250)
+def test_any_signature_is_verified_or_refused(certified: Path, body: dict[str, Any], signature: Any) -> None:
+    verifier = Verifier((certified / "ca.pem").read_bytes(), lambda: 1.0, lambda: 1.0)
+    with pytest.raises(IdentityError):
+        verifier.verify({**body, "sig": signature})
+
+
+@given(st.binary(max_size=100) | bodies.map(lambda body: json.dumps(body).encode()))
+@settings(max_examples=300)
+def test_any_bytes_are_a_command_that_was_seen_or_not(data: bytes) -> None:
+    seen = Seen()
+    assert seen.first(data) is True
+    assert isinstance(seen.first(data), bool)
+
+
+@given(st.text(max_size=60) | st.text("abc/*$#?", max_size=20).map("strands/{}".format))
+@settings(max_examples=300)
+def test_any_key_falls_under_a_topic(key: str) -> None:
+    topics.topic_of(key)
+    topics.matches("strands/*/response/**", key)
+    assert topics.matches("**", key)
+
+
+def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
+    """A lawful message of each topic, to mutate; those that carry a signature are signed."""
     now = peers.clock()
     assertion = {"v": 1, "epoch": "0" * 32, "targets": ["arm-1"], "t": now, "nonce": "1" * 32, "sig": "x"}
+    told = {"peer_id": "lead", "t": now, "x": 1.0}
+    sensors = ("state", "stream", "pose", "imu", "odom", "health", "lidar/summary", "lidar/state", "map/info")
     return {
-        "strands/arm-9/presence": {"robot_id": "arm-9", "robot_type": "robot", "hostname": "h", "timestamp": now},
+        "strands/arm-9/presence": signer.sign({"robot_id": "arm-9", "robot_type": "robot", "timestamp": now}),
+        "strands/arm-8/presence": {"robot_id": "arm-8", "robot_type": "robot", "hostname": "h", "timestamp": now},
         "strands/arm-1/cmd": {"sender_id": "x", "turn_id": "t", "command": {"action": "status"}, "timestamp": now},
         "strands/broadcast": {"sender_id": "x", "turn_id": "t", "command": {"action": "ping"}, "timestamp": now},
         "strands/arm-1/response/x/t": {"type": "response", "responder_id": "x", "turn_id": "t", "result": {}},
         "strands/safety/estop": {"peer_id": 5, "t": now, "estop_id": "a" * 32, "source_zid": "ff"},
         "strands/safety/resume": {"peer_id": "x", "t": now, "assertion": assertion, "source_zid": "ff"},
-        "strands/lead/input/leader": {"peer_id": "lead", "t": now, "seq": 1, "action": {"j": 1.0}},
+        "strands/lead/safety/event": {**told, "event": "emergency_stop"},
+        "strands/lead/input/leader": {**told, "seq": 1, "action": {"j": 1.0}},
+        "strands/lead/camera/front": {**told, "encoding": "jpeg", "data": "AAAA"},
+        "strands/lead/hand/left/state": told,
+        **{f"strands/lead/{name}": told for name in sensors},
     }
+
+
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fleet's authority and the certificate of arm-9."""
+    folder = tmp_path_factory.mktemp("keys")
+    keys.init(folder)
+    keys.issue(folder, "arm-9")
+    return folder
 
 
 def mutated(chance: random.Random, seed: dict[str, Any]) -> bytes:
@@ -142,13 +199,19 @@ def mutated(chance: random.Random, seed: dict[str, Any]) -> bytes:
     return bytes(data)
 
 
-def test_a_hundred_thousand_mutated_messages_leave_nothing_behind(peers: Fleet) -> None:
-    peers.join(World("left"), "arm-1", "sim")
+def test_a_hundred_thousand_mutated_messages_leave_nothing_behind(peers: Fleet, certified: Path) -> None:
+    checking = Identity(None, Verifier((certified / "ca.pem").read_bytes(), peers.clock, peers.clock), required=True)
+    arm = World("left")
+    mesh = peers.join(arm, "arm-1", "sim", identity=checking)
     console = peers.join(None, "console")
     stranger, chance = peers.stranger(), random.Random(5)
-    messages = list(seeds(peers).items())
-    stream = peers.meshes[0].subscribe("strands/*/input/*", lambda key, data: None)
-    assert stream
+    stranger.put("strands/lead/presence", {"robot_id": "lead", "robot_type": "robot", "timestamp": peers.clock()})
+    follower = InputReceiver(console, arm, "lead", apply_fn=lambda body, action: None)
+    follower.start()
+    assert follower.start_refusal is None
+    messages = list(seeds(peers, Signer(certified / "arm-9.pem", certified / "arm-9.key", peers.clock)).items())
+    assert {topics.topic_of(key).name for key, _ in messages} == set(topics.BY_NAME)
+    assert mesh.subscribe("strands/**", lambda key, data: None)
 
     def pour(count: int) -> None:
         for number in range(count):
@@ -161,6 +224,7 @@ def test_a_hundred_thousand_mutated_messages_leave_nothing_behind(peers: Fleet) 
     gc.collect()
     before = sys.getallocatedblocks()
     pour(90_000)
+    assert follower.stop()["rejected_invalid"] > 1000
     peers.audit.clear()
     gc.collect()
     assert sys.getallocatedblocks() - before < 60_000
