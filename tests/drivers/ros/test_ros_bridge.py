@@ -124,17 +124,21 @@ def test_a_goal_that_takes_too_long_is_cancelled(made: Made, stack: Stack) -> No
     assert robot.get_task_status()["task_status"] == "error"
 
 
-def test_a_goal_that_does_not_obey_its_cancel_is_lost_and_no_stop_says_otherwise(made: Made, stack: Stack) -> None:
+def test_a_goal_that_does_not_obey_its_cancel_is_lost_and_every_stop_asks_again(
+    made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot, stack.obeys = made(), False
     answer = robot.navigate_to(1.0, 2.0, timeout=0.05)
     assert (answer["status"], answer["goal_state"]) == ("error", "lost")
     assert "nobody knows whether the goal still goes on" in answer["reason"]
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
     verdict = robot.halt("test")
     assert verdict.stopped is False
     assert "nobody knows" in verdict.not_stopped["navigation"]
     assert stack.cancels == 2
-    stack.goals[0].end(5, {})
-    assert robot.halt("test").stopped is True
+    stack.obeys = True
+    assert robot.halt("test").halted == ("navigation",)
+    assert (robot.halt("test").stopped, stack.cancels) == (True, 3)
 
 
 def test_a_stop_cancels_the_goal_and_says_so(made: Made, stack: Stack) -> None:

@@ -89,6 +89,14 @@ class Navigation:
             return None
         return said(report)
 
+    def wait_until_over(self, within_s: float) -> None:
+        """Wait for the end of the goal, a late one of a lost goal too."""
+        deadline = time.monotonic() + within_s
+        self.ended.wait(within_s)
+        lost = None if self.report is None else self.report.sent
+        if lost is not None:
+            lost.done.wait(max(0.0, deadline - time.monotonic()))
+
     def cancel_again(self) -> None:
         """Ask once more for the end of a goal that nobody knows to be over."""
         lost = None if self.report is None else self.report.sent

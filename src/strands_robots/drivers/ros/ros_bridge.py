@@ -141,14 +141,15 @@ class RosBridgedRobot(MobileBaseRobot):
         began = time.monotonic()
         going = self._navigation
         was_going = going is not None and going.doubt is not None
-        if going is not None and was_going:
-            going.cancel_again()
-        # Revoking the permits, the first thing there, is what cancels the goal.
+        # Revoking the permits, the first thing there, is what cancels a goal that is waited for.
+        if going is not None and was_going and going.ended.is_set():
+            # One that nobody waits for any longer is asked again, beside the zeros: a broken link may hold this up.
+            threading.Thread(target=going.cancel_again, name=f"cancel-{self.node_name}", daemon=True).start()
         verdict = super().halt(reason)
         if going is None or not was_going:
             return verdict
         left = ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S") - (time.monotonic() - began)
-        going.ended.wait(max(0.0, left))
+        going.wait_until_over(max(0.0, left))
         doubt = going.doubt
         spent = (time.monotonic() - began) * 1000
         if doubt is None:
