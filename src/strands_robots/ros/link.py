@@ -98,6 +98,20 @@ class RosLink(Protocol):
         """Let go of the graph. A later use opens it anew."""
 
 
+@runtime_checkable
+class UrgentLink(Protocol):
+    """A link with a second way to the graph, for zeros alone, which the traffic of the first cannot hold up."""
+
+    def prepare_urgent(self, topic: str, kind: str) -> None:
+        """Have the second way ready for ``topic``; returns at once."""
+
+    def publish_urgent(self, topic: str, kind: str, fields: Message) -> None:
+        """Send one message by the second way. Raises :class:`RosError` where that cannot be done without waiting."""
+
+    def cut(self) -> None:
+        """Give up what the first way has not sent yet, so that nothing of it arrives later."""
+
+
 MemoryAction = Callable[[Message, Heard, Goal], None]
 
 

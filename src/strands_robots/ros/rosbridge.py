@@ -12,6 +12,7 @@ from typing import Any
 
 from strands_robots.ros.link import GivenUp, Goal, Heard, Message, RosError, Unwatch, never
 from strands_robots.ros.rosbridge_session import Session
+from strands_robots.ros.rosbridge_urgent import UrgentRoad
 from strands_robots.ros.rosbridge_wire import Fragments, decoded, encoded, with_bytes
 from strands_robots.utils import number, shown
 
@@ -43,6 +44,8 @@ class _Watched:
 class RosbridgeLink:
     """A :class:`~strands_robots.ros.link.RosLink` over one connection, opened by the first use and kept until closed.
 
+    What is published as urgent has a second connection of its own.
+
     A lost connection is reopened, its subscriptions restored and its topics advertised anew; what is sent meanwhile
     is refused, not queued: a velocity that arrives late is worse than one that does not. A ``status`` error of the
     server fails the request that it names, or the next publish on the topic that it names, and is logged.
@@ -57,14 +60,16 @@ class RosbridgeLink:
     """
 
     def __init__(self, host: str = "localhost", port: int = 9090, *, connect_s: float = 5.0) -> None:
+        seconds = number("connect_s", connect_s, above=0, high=60)
         self._session = Session(
             host,
             port,
-            connect_s=number("connect_s", connect_s, above=0, high=60),
+            connect_s=seconds,
             opened=self._restore,
             received=self._received,
             lost=self._lost,
         )
+        self._urgent = UrgentRoad(host, port, seconds)
         self._numbers = count(1)
         self._lock = threading.RLock()
         self._advertised: dict[str, str] = {}
@@ -89,6 +94,15 @@ class RosbridgeLink:
             self._session.send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))
             self._advertised[topic] = kind
         self._session.send(frame)
+
+    def prepare_urgent(self, topic: str, kind: str) -> None:
+        self._urgent.prepare(topic, kind)
+
+    def publish_urgent(self, topic: str, kind: str, fields: Message) -> None:
+        self._urgent.publish(topic, kind, fields)
+
+    def cut(self) -> None:
+        self._session.cut()
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
         asked = _Asked()
@@ -173,9 +187,11 @@ class RosbridgeLink:
         return sorted(str(name) for name in names)
 
     def close(self) -> None:
+        self._urgent.close()
         self._session.close()
         with self._lock:
             self._watched.clear()
+            self._advertised.clear()
 
     def _watch(self, topic: str, kind: str | None, heard: Heard, failed: Callable[[str], None]) -> Unwatch:
         self._session.open()
@@ -239,7 +255,9 @@ class RosbridgeLink:
     def _restore(self, send: Callable[[str], None]) -> None:
         with self._lock:
             self._fragments = Fragments()
-            self._advertised.clear()
+            # Whoever subscribes meets a new publisher some milliseconds late, so that it is there before its message.
+            for topic, kind in list(self._advertised.items()):
+                send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))
             for topic, watched in self._watched.items():
                 send(self._subscription(topic, watched))
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import struct
 import threading
 from collections.abc import Callable
 from functools import partial
+from socket import SHUT_RDWR, SO_LINGER, SOL_SOCKET
 from typing import Any
 
 from strands_robots.ros.link import RosError
@@ -61,6 +64,21 @@ class Session:
     def up(self) -> bool:
         """A connection stands."""
         return self._socket is not None
+
+    def start(self) -> None:
+        """Begin to connect when nothing was connected yet, and return."""
+        self._start()
+
+    def cut(self) -> None:
+        """Drop the connection with what it holds unsent: a blocked :meth:`send` fails, and nothing stale arrives.
+
+        A new one is made as after any loss.
+        """
+        socket = self._socket
+        if socket is not None:
+            with contextlib.suppress(OSError):  # it broke meanwhile, which is what was asked for
+                socket.socket.setsockopt(SOL_SOCKET, SO_LINGER, struct.pack("ii", 1, 0))
+                socket.socket.shutdown(SHUT_RDWR)
 
     def open(self) -> None:
         """Connect when nothing was connected yet. Raises :class:`RosError` while there is no connection."""

@@ -259,3 +259,38 @@ def test_curiosity_is_wired_to_its_simulation() -> None:
     rover = RosbridgeRobot.from_curiosity(max_linear=0.5)
     assert (rover.node_name, rover.max_linear, rover.max_angular, rover.max_duration) == ("curiosity", 0.5, 1.0, 30.0)
     assert rover.reads == ("get_pose",)
+
+
+def test_a_clogged_connection_holds_up_neither_a_stop_nor_its_verdict(server: RosbridgeServer) -> None:
+    robot = RosbridgeRobot("rover", "/cmd_vel", "/odom", host="127.0.0.1", port=server.port, command_gate=OPEN)
+    server.on_publish = lambda topic, twist: server.tell("/odom", {"twist": {"twist": twist}})
+    try:
+        assert robot.start_drive(0.5, 0.0, 30.0)["status"] == "success"
+        eventually(lambda: server.published and len(server.seen("advertise")) == 2)
+        server.clog()
+        # More than the sockets' buffers hold, so that whoever writes there next is stuck.
+        picture = {"data": bytes(12 * 2**20)}
+        stuffing = threading.Thread(target=lambda: stuffed(robot.link, picture))
+        stuffing.start()
+        time.sleep(0.3)
+        server.published.clear()
+        began = time.monotonic()
+        robot.halt("test")
+        first = eventually(lambda: server.published)[0]
+        assert first == (
+            "/cmd_vel",
+            {"linear": {"x": 0.0, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": 0.0}},
+        )
+        assert time.monotonic() - began < 1.5
+        stuffing.join(10)
+        assert not stuffing.is_alive()
+        assert all(topic == "/cmd_vel" and not twist["linear"]["x"] for topic, twist in server.published)
+        eventually(lambda: robot.halt("again").stopped, within=10)
+    finally:
+        robot.disconnect()
+
+
+def stuffed(link: RosbridgeLink, picture: Mapping[str, Any]) -> None:
+    with pytest.raises(RosError):
+        for _ in range(4):
+            link.publish("/picture", "sensor_msgs/Image", picture)

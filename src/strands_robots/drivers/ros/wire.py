@@ -8,13 +8,18 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from strands_robots.ros.link import RosLink
+from strands_robots.drivers.ros.behind import Behind
+from strands_robots.ros.link import RosError, RosLink, UrgentLink
 from strands_robots.safety.gate import Permit, PermitVoidError
 
 logger = logging.getLogger(__name__)
 
 BLIND_HOLD_S = 5.0
 """Seconds of zeros for a base whose odometry says nothing."""
+
+
+CLOGGED_S = 0.1
+"""Seconds after which a connection that does not take a zero is given up, with the commands that it still holds."""
 
 
 class VelocityWire:
@@ -26,18 +31,45 @@ class VelocityWire:
         self.kind = kind
         self._zero = dict(zero)
         self._lock = threading.Lock()
+        self._urgent = link if isinstance(link, UrgentLink) else None
+        self._behind = Behind(self.zero)
 
     def send(self, fields: Mapping[str, Any], permit: Permit) -> None:
         """One command. Raises :class:`PermitVoidError` when a stop came first, else what the link raises."""
         with self._lock:
             if not permit.valid:
                 raise PermitVoidError("the drive was stopped")
+            if self._urgent is not None:
+                self._prepare(self._urgent)
             self.link.publish(self.topic, self.kind, fields)
 
     def zero(self) -> None:
         """One zero, behind the write that may be in flight. Raises what the link raises."""
         with self._lock:
             self.link.publish(self.topic, self.kind, self._zero)
+
+    def halt(self) -> None:
+        """One zero that nothing delays, and one behind the commands. Raises what the link raises.
+
+        Where the link has a second way, the first goes there and the other is not waited for. A way that does not
+        take the other in time is cut, so that no command in it comes after the zeros.
+        """
+        if self._urgent is None:
+            self.zero()
+            return
+        if self._behind.offer() > CLOGGED_S:
+            logger.warning("%s does not take zeros behind its commands; its connection is cut.", self.topic)
+            self._urgent.cut()
+        try:
+            self._urgent.publish_urgent(self.topic, self.kind, self._zero)
+        except RosError:
+            self._behind.confirm(CLOGGED_S)
+
+    def _prepare(self, urgent: UrgentLink) -> None:
+        try:
+            urgent.prepare_urgent(self.topic, self.kind)
+        except RosError as exc:
+            logger.warning("A stop of %s has one way only: %s", self.topic, exc)
 
 
 class Hold:
@@ -75,7 +107,7 @@ class Hold:
         began = time.monotonic()
         while True:
             try:
-                self._wire.zero()
+                self._wire.halt()
                 self.problem = ""
                 self.sent.set()
             except Exception as exc:  # noqa: BLE001 - whatever the link raises, the next zero is tried and the verdict says so
