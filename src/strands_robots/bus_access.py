@@ -57,16 +57,18 @@ def bus_lock(device: Any) -> threading.RLock:
 def read_joints(device: Any) -> dict[str, float]:
     """Joint positions by observation key, in the device's unit, read under the bus lock and without its cameras.
 
-    From ``get_joints()`` where the device has it, from the motor bus alone where it is a LeRobot device with one bus,
-    else the numbers of a whole observation. Raises what the device raises.
+    From ``get_joints()`` where the device has it and answers with numbers (a native driver that answers with an
+    envelope names its motors there, not its action keys), from the motor bus alone where it is a LeRobot device with
+    one bus, else the numbers of a whole observation. Raises what the device raises.
     """
     source = joint_read_source(device)
     if source is None:
         return {}
     with bus_lock(source):
         own = getattr(source, "get_joints", None)
-        if callable(own):
-            return numbers(own())
+        told = own() if callable(own) else None
+        if told is not None and "status" not in told:
+            return numbers(told)
         motors = _motors(source)
         if motors is not None:
             positions = source.bus.sync_read("Present_Position")

@@ -11,6 +11,7 @@ from strands_robots.drivers.reachy.catalogue import Library
 from strands_robots.drivers.reachy.connection import Connection
 from strands_robots.drivers.reachy.envelope import (
     ACTION_KEYS,
+    BOUNDS,
     INIT_ANTENNAS,
     SLEEP_ANTENNAS,
     Target,
@@ -21,7 +22,7 @@ from strands_robots.drivers.reachy.feed import FRESH_S
 from strands_robots.drivers.reachy.links import ZENOH_PORT, PubSub
 from strands_robots.drivers.reachy.motion import Motions, head_distance
 from strands_robots.drivers.reachy.motors import Motors
-from strands_robots.drivers.reachy.rest import DaemonUnreachable
+from strands_robots.drivers.reachy.rest import DaemonError, DaemonUnreachable
 from strands_robots.drivers.reachy.transport import DEFAULT_PREFIX, SLEEP_DISABLES_SINCE
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate
@@ -32,6 +33,7 @@ UPRIGHT_LEGS = (0.6265, -0.6265, 0.6265, -0.6265, 0.6265, -0.6265)
 """Legs of the head at the identity, in radians, by the daemon's own inverse kinematics."""
 
 ARRIVED = 0.2
+POSE_EVERY_S = 0.005
 GESTURES = {"nod": gestures.nod, "shake": gestures.shake, "happy": gestures.happy}
 
 
@@ -94,6 +96,11 @@ class ReachyDriver:
         return dict.fromkeys(ACTION_KEYS, float)
 
     @property
+    def joint_ranges(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of each key of :meth:`send_action`: metres and radians."""
+        return dict(BOUNDS)
+
+    @property
     def is_connected(self) -> bool:
         """Joint data arrives."""
         return self.connection.alive
@@ -110,7 +117,7 @@ class ReachyDriver:
         """Nothing to do: the daemon configures its motors."""
 
     def connect(self, calibrate: bool = False, *, within_s: float = 10.0) -> None:
-        """Connect, and wait until joint data arrives.
+        """Connect, and wait until joint data arrives, and for its first head pose.
 
         Raises:
             DaemonUnreachable: no joint data ``within_s``; the driver has let go again.
@@ -121,6 +128,10 @@ class ReachyDriver:
             why = self.connection.refusal()
             self.connection.close()
             raise DaemonUnreachable(f"Reachy Mini at {self.connection.host}:{self.connection.port}: {why}.")
+        # The head's pose is a message of its own, and an observation needs both.
+        deadline = time.monotonic() + min(within_s, FRESH_S)
+        while self.connection.feed.pose() is None and time.monotonic() < deadline:
+            time.sleep(POSE_EVERY_S)
 
     def connect_eagerly(self, within_s: float = 5.0) -> Envelope:
         """Connect and say how it went; a robot that is away is connected to as soon as it appears. Never raises."""
@@ -164,6 +175,16 @@ class ReachyDriver:
         """
         target = self.checked(from_action(action, self.motions.present()))
         return self.motions.stream(target, "send_action").action()
+
+    def hold(self) -> None:
+        """Stop whatever moves the robot, so that it keeps its pose: how a control loop around this driver freezes it.
+
+        Raises:
+            DaemonError: it is not known to stand still.
+        """
+        verdict = self.halt("hold")
+        if not verdict.stopped:
+            raise DaemonError(f"Reachy Mini is not known to stand still: {verdict.envelope().get('reason')}")
 
     # Reachy's own verbs. Each raises MotionRefused, ValidationError or DaemonError where it does not do it.
 

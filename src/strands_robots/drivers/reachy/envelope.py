@@ -34,7 +34,7 @@ SLEEP_ANTENNAS = (-3.05, 3.05)
 HEAD_KEYS = ("head_x", "head_y", "head_z", "head_roll", "head_pitch", "head_yaw")
 ACTION_KEYS = (*HEAD_KEYS, "body_yaw", "antenna_right", "antenna_left")
 
-_BOUNDS = {
+BOUNDS = {
     "head_x": (-SIDEWAYS_M, SIDEWAYS_M),
     "head_y": (-SIDEWAYS_M, SIDEWAYS_M),
     "head_z": (-DOWN_M, UP_M),
@@ -45,6 +45,8 @@ _BOUNDS = {
     "antenna_right": (-ANTENNA, ANTENNA),
     "antenna_left": (-ANTENNA, ANTENNA),
 }
+"""Lowest and highest value of every action key, metres and radians."""
+
 _ROUNDING = 1e-9
 
 
@@ -110,7 +112,7 @@ def bounded(key: str, value: object, *, unit: str = "", scale: float = 1.0, name
     ``scale`` is the number of caller's units in a metre or radian and ``unit`` their name, so that a refusal speaks
     in the units it was asked in.
     """
-    low, high = (bound * scale for bound in _BOUNDS[key])
+    low, high = (bound * scale for bound in BOUNDS[key])
     label = f"{name or key} ({unit})" if unit else name or key
     # A bound is not missed by the last digit of a conversion between degrees and radians.
     slack = _ROUNDING * max(1.0, scale)

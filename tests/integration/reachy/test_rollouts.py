@@ -1,0 +1,67 @@
+"""A Reachy Mini under this package's own control loop, as any device with LeRobot's verbs: on every daemon."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+from fixtures.reachy_daemon.process import Daemon
+from fixtures.waiting import eventually
+
+from strands_robots.drivers.reachy import ReachyDriver
+from strands_robots.drivers.reachy.envelope import ACTION_KEYS, BOUNDS
+from strands_robots.hardware import HardwareRobot
+
+
+@pytest.fixture
+def robot(reachy: ReachyDriver) -> Iterator[HardwareRobot]:
+    made = HardwareRobot(reachy, "mini", control_hz=50)
+    yield made
+    made.cleanup()
+
+
+def running(daemon: Daemon) -> list[str]:
+    return [move["uuid"] for move in daemon.request("GET", "/api/move/running").json()]
+
+
+def test_its_joints_ranges_and_lockout_are_those_of_the_driver(robot: HardwareRobot, reachy: ReachyDriver) -> None:
+    assert set(robot.get_state()["joints"]) == set(ACTION_KEYS)
+    assert robot.get_features()["ranges"] == {key: list(pair) for key, pair in BOUNDS.items()}
+    assert robot.safety_key == reachy.safety_key
+
+
+def test_a_rollout_moves_it_and_holds_it_at_its_end(robot: HardwareRobot, reachy: ReachyDriver) -> None:
+    before = reachy.get_observation()
+    sent = reachy.motions.frames_sent
+    assert robot.start_task("wave", duration=2.0)["status"] == "success"
+    eventually(lambda: robot.get_task_status()["task_status"] != "running", 10.0, "its end")
+    status = robot.get_task_status()
+    assert status["task_status"] == "completed", status
+    assert reachy.motions.frames_sent - sent >= status["step_count"] > 20
+    after = reachy.get_observation()
+    assert max(abs(after[key] - before[key]) for key in ACTION_KEYS) > 0.05
+    frames = reachy.motions.frames_sent
+    time.sleep(0.1)
+    assert reachy.motions.frames_sent == frames
+
+
+def test_a_halt_ends_a_rollout_and_no_frame_follows(robot: HardwareRobot, reachy: ReachyDriver) -> None:
+    robot.start_task("wave", duration=30.0)
+    eventually(lambda: robot.get_task_status()["step_count"] > 20, 5.0, "steps")
+    verdict = robot.halt("test")
+    frames = reachy.motions.frames_sent
+    assert verdict.stopped is True
+    assert verdict.halted == ("task",)
+    time.sleep(0.1)
+    assert reachy.motions.frames_sent == frames
+    assert robot.start_task("again", duration=0.2)["status"] == "success"
+
+
+def test_a_halt_of_the_robot_stops_what_its_daemon_plays(
+    daemon: Daemon, robot: HardwareRobot, reachy: ReachyDriver
+) -> None:
+    reachy.wake_up()
+    assert len(running(daemon)) == 1
+    assert robot.halt("test").stopped is True
+    assert running(daemon) == []
