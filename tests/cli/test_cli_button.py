@@ -22,13 +22,14 @@ class FakeController:
         self.answer.set()
         self.links: list[bool] = []
         self.refused: dict[str, Answer] = {}
+        self.silent: list[tuple[str, ...]] = []
 
     def stop(self, expected: Collection[str], reason: str, *, estop_id: str, on_progress: Any) -> StopReport:
         self.ids.append(estop_id)
         self.expected.append(expected)
         assert self.answer.wait(10.0)
         link = self.links.pop(0) if self.links else True
-        return StopReport(estop_id, {}, {}, self.refused, (), link, 1.0)
+        return StopReport(estop_id, {}, {}, self.refused, self.silent.pop(0) if self.silent else (), link, 1.0)
 
 
 @pytest.fixture
@@ -86,6 +87,17 @@ def test_a_stop_that_never_left_goes_on_under_its_name(controller: FakeControlle
     controller.links = [False, False, True]
     bar = made(controller)
     bar.press()
-    eventually(lambda: bar.report is not None, within=5.0)
+    eventually(lambda: bar.report is not None and not bar.running, within=5.0)
     assert len(controller.ids) == 3
     assert len(set(controller.ids)) == 1
+
+
+def test_a_stop_goes_on_until_nobody_is_silent(controller: FakeController) -> None:
+    controller.silent = [("arm-1",), ("arm-1",), ()]
+    bar = made(controller)
+    bar.press()
+    eventually(lambda: not bar.running, within=5.0)
+    assert len(controller.ids) == 3
+    assert len(set(controller.ids)) == 1
+    assert bar.report is not None
+    assert bar.report.silent == ()

@@ -71,6 +71,16 @@ def test_an_unreadable_file_is_put_aside_when_the_next_lockout_is_kept(store: Lo
     assert store.path.with_suffix(".unreadable").read_text() == "{"
 
 
+def test_a_robot_that_was_off_while_the_file_was_put_aside_comes_up_locked(store: LockoutStore) -> None:
+    store.path.parent.mkdir()
+    store.path.write_text('{"v":1,"robots":{"the other": {"holds": [')
+    store.save({KEY: Kept()})
+    assert store.load("the other").state.epochs == (OVERFLOW,)
+    assert not store.load(KEY).state.locked
+    store.save({"the other": Kept()})
+    assert not store.load("the other").state.locked, "an operator has cleared it"
+
+
 def test_a_link_in_place_of_the_file_locks(store: LockoutStore, tmp_path: Path) -> None:
     store.path.parent.mkdir()
     (tmp_path / "free").write_text('{"v":1,"robots":{}}')

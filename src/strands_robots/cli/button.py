@@ -16,7 +16,8 @@ HELD_S = 1.0
 class Button:
     """Sends a stop at each press and keeps the latest of what became of it.
 
-    A press during a stop that goes on is part of it. A stop that never left goes on until the link is back.
+    A press during a stop that goes on is part of it. A stop goes on until it has left and nobody who is expected is
+    silent: a link that swallows everything looks as if it were up for seconds.
 
     Args:
         controller: sends.
@@ -56,16 +57,19 @@ class Button:
         self._closing.set()
 
     def _stop(self, estop_id: str) -> None:
-        report = None
-        while report is None or not (report.link or self._closing.is_set()):
+        while True:
             report = self._controller.stop(
                 self._expected(), self._reason, estop_id=estop_id, on_progress=self._note(estop_id)
             )
-        with self._guard:
-            if estop_id == self._id:
-                self.report, self._running = report, False
-                # A robot that was resumed meanwhile asks for a stop of another name.
-                self._id = "" if report.refused else self._id
+            open_ = not report.link or bool(report.silent)
+            with self._guard:
+                if estop_id != self._id:
+                    return
+                self.report, self._running = report, open_ and not self._closing.is_set()
+                if not self._running:
+                    # A robot that was resumed meanwhile asks for a stop of another name.
+                    self._id = "" if report.refused else self._id
+                    return
 
     def _note(self, estop_id: str) -> Callable[[Progress], None]:
         def note(progress: Progress) -> None:

@@ -59,15 +59,29 @@ class LockoutStore:
         """Where the lockouts are."""
         return (self._directory or state_dir()) / "lockouts.json"
 
+    @property
+    def _aside(self) -> Path:
+        return self.path.with_suffix(".unreadable")
+
     def load(self, key: str) -> Kept:
-        """What was kept under ``key``; nothing when there is no record, locked when it cannot be read."""
+        """What was kept under ``key``; nothing when there is no record, locked when it cannot be read.
+
+        A robot without a record is locked as well while a file that could not be read lies aside.
+        """
         try:
-            record = self._read().get(key)
-            return Kept() if record is None else _kept(record)
+            return self._found(key)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as exc:
             logger.critical("%s cannot be read (%s): %s comes up locked.", self.path, exc, key)
             hold = Hold(OVERFLOW, "this machine", "the lockout file is unreadable", time.time())
             return Kept(LockoutState(overflow=hold))
+
+    def _found(self, key: str) -> Kept:
+        record = self._read().get(key)
+        if record is not None:
+            return _kept(record)
+        if self._aside.exists():
+            raise ValueError(f"what was kept of this robot may stand in {self._aside.name}")
+        return Kept()
 
     def load_all(self) -> dict[str, Kept]:
         """Every record, by key.
@@ -92,8 +106,8 @@ class LockoutStore:
             try:
                 records = self._read()
             except ValueError:
-                # What is unreadable is kept aside for a person; robots that rely on it are locked in memory.
-                path.replace(path.with_suffix(".unreadable"))
+                # What is unreadable is kept aside for a person; whoever has no record yet comes up locked by it.
+                path.replace(self._aside)
                 records = {}
             records.update({key: _record(each) for key, each in kept.items()})
             _replace(path, {"v": VERSION, "robots": records})
