@@ -52,6 +52,8 @@ def test_a_filled_message_is_told_alike_over_rclpy_and_over_bare_dds(kind: str) 
 def test_numpy_arrays_and_lists_of_bytes_are_taken_too() -> None:
     image = filled(made("sensor_msgs/Image"), {"data": [1, 2, 255]})
     assert image.data == array("B", [1, 2, 255])
+    picture = filled(made("sensor_msgs/Image"), {"data": np.array([[1, 2], [3, 255]], dtype=np.uint8)})
+    assert picture.data == array("B", [1, 2, 3, 255])
     scan = filled(made("sensor_msgs/LaserScan"), {"ranges": np.array([1.0, 2.0])})
     assert list(scan.ranges) == [1.0, 2.0]
 
@@ -68,8 +70,9 @@ def test_numpy_arrays_and_lists_of_bytes_are_taken_too() -> None:
         ("sensor_msgs/Imu", {"orientation_covariance": [0.0]}, "orientation_covariance must have 9 items, not 1"),
         ("sensor_msgs/Image", {"height": 1.0}, "height must be a uint32, not 1.0"),
         ("sensor_msgs/Image", {"height": True}, "height must be a uint32, not True"),
-        ("sensor_msgs/Image", {"height": -1}, "height must be a uint32, not -1"),
-        ("sensor_msgs/Image", {"data": [256]}, "numbers from 0 to 255"),
+        ("sensor_msgs/Image", {"height": -1}, "height must be a uint32, from 0 to 4294967295, not -1"),
+        ("sensor_msgs/Image", {"data": [256]}, r"data\[0\] must be a uint8, from 0 to 255, not 256"),
+        ("builtin_interfaces/Time", {"sec": 2**31}, "sec must be a int32, from -2147483648 to 2147483647"),
         ("sensor_msgs/BatteryState", {"present": 1}, "present must be a boolean, not 1"),
     ],
 )

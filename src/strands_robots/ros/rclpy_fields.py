@@ -18,6 +18,7 @@ from strands_robots.utils import shown
 
 _SEQUENCE = re.compile(r"sequence<(.+?)(?:, *(\d+))?>\Z")
 _ARRAY = re.compile(r"(.+)\[(\d+)\]\Z")
+_INTEGER = re.compile(r"(u?)int(8|16|32|64)\Z")
 _NUMBERS: dict[str, type] = {"float": float, "double": float, "long double": float, "boolean": bool}
 
 
@@ -69,10 +70,23 @@ def _value(kind: str, value: Any, place: str, zero: Any = None) -> Any:
         return float(value)
     if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
         raise RosError(f"{place} must be a {kind}, not {shown(value)}.")
+    # Newer ROS 2 checks no value in its setters, and the conversion to C would cut an integer.
+    return _whole(kind, value, place) if isinstance(value, int) else value
+
+
+def _whole(kind: str, value: int, place: str) -> int:
+    integer = _INTEGER.match(kind)
+    if integer is not None:
+        bits = int(integer[2])
+        low, high = (0, 2**bits) if integer[1] else (-(2 ** (bits - 1)), 2 ** (bits - 1))
+        if not low <= value < high:
+            raise RosError(f"{place} must be a {kind}, from {low} to {high - 1}, not {shown(value)}.")
     return value
 
 
 def _items(kind: str, length: int | None, value: Any, place: str) -> Any:
+    if kind == "uint8" and str(getattr(value, "dtype", "")) == "uint8":
+        value = value.tobytes()
     if kind == "uint8" and isinstance(value, bytes | bytearray):
         items: Any = bytes(value)
     else:
@@ -82,18 +96,8 @@ def _items(kind: str, length: int | None, value: Any, place: str) -> Any:
         items = [_value(kind, each, f"{place}[{n}]") for n, each in enumerate(items)]
     if length is not None and len(items) != length:
         raise RosError(f"{place} must have {length} items, not {len(items)}.")
-    if kind == "uint8" and length is None:
-        # An array of the right type is taken as it is; every other sequence is checked number by number.
-        return _packed(items)
-    return items
-
-
-def _packed(items: Any) -> Any:
-
-    try:
-        return array("B", items)
-    except (TypeError, ValueError, OverflowError) as exc:
-        raise RosError(f"a sequence of uint8 must hold numbers from 0 to 255: {exc}.") from exc
+    # An array of the right type is taken as it is; every other sequence would be checked number by number.
+    return array("B", items) if kind == "uint8" and length is None else items
 
 
 def _plain(kind: str, value: Any) -> Any:

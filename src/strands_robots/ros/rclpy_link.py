@@ -153,7 +153,12 @@ class RclpyLink:
         self._goals.add(sending.goal)
         tell = None if feedback is None else _telling(feedback, f"{action} feedback", lambda told: told.feedback)
         session.later(lambda: sending.send(client, message, tell))
-        self._comes(sending.answered.is_set, deadline - time.monotonic(), given_up)
+        try:
+            self._comes(sending.answered.is_set, deadline - time.monotonic(), given_up)
+        except BaseException:
+            # A Ctrl-C here must not leave the robot on its way.
+            sending.goal.cancel()
+            raise
         if sending.goal.rejected:
             raise RosError(sending.goal.problem)
         return sending.goal
