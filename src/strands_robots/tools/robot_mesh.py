@@ -12,16 +12,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from strands_robots.agent_tool import tool
 from strands_robots.envelope import error
 from strands_robots.tools import networks
-from strands_robots.utils import ValidationError, choice, device_id, missing_extra, number, text
-
-try:
-    from strands import tool
-except ModuleNotFoundError as exc:
-    if (exc.name or "").partition(".")[0] != "strands":
-        raise
-    raise missing_extra("robot_mesh", "agent") from exc
+from strands_robots.utils import ValidationError, choice, device_id, number, text
 
 ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop")
 

@@ -4,15 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from strands_robots.agent_tool import ToolContext, tool
 from strands_robots.ros.actions import ros_action
-from strands_robots.utils import missing_extra
-
-try:
-    from strands import ToolContext, tool
-except ModuleNotFoundError as exc:
-    if (exc.name or "").partition(".")[0] != "strands":
-        raise
-    raise missing_extra("use_rtps", "agent") from exc
 
 
 @tool(context=True)

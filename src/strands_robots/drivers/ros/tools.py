@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.utils import missing_extra
-
-try:
-    from strands import ToolContext, tool
-except ModuleNotFoundError as exc:
-    if (exc.name or "").partition(".")[0] != "strands":
-        raise
-    raise missing_extra("the tools of a robot", "agent") from exc
+from strands_robots.agent_tool import ToolContext, tool
 
 if TYPE_CHECKING:
     from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
