@@ -59,6 +59,7 @@ class HardwareRobot(Tasks):
         super().__init__(DeviceBody(name, device, joint_ranges, level), number("control_hz", rate, low=1, high=2000))
         self.device = device
         self._sends: set[Permit] = set()
+        self._unread = ""
 
     @property
     def safety_key(self) -> str:
@@ -191,10 +192,15 @@ class HardwareRobot(Tasks):
         try:
             self._body.get_joints()
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
-            logger.warning("The joints of %s could not be read: %s", self.tool_name_str, exc)
-            return f"The joints could not be read: {type(exc).__name__}: {exc}"
+            problem = f"The joints could not be read: {type(exc).__name__}: {exc}"
+            if problem != self._unread:
+                # Somebody may ask fifty times a second.
+                logger.warning("%s: %s", self.tool_name_str, problem)
+            self._unread = problem
+            return problem
         finally:
             self._body.lock.release()
+        self._unread = ""
         return ""
 
 
