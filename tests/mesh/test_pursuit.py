@@ -9,7 +9,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh import safety
+from strands_robots.mesh import pursuit, safety
 from strands_robots.mesh.core import Mesh
 
 
@@ -70,3 +70,20 @@ def test_a_newcomer_is_not_pursued(peers: Fleet) -> None:
     time.sleep(1.3)
     assert mesh.lockout_epoch is None
     assert late.halts == []
+
+
+def test_a_peer_that_is_heard_and_never_answers_is_given_up(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pursuit, "EVERY_S", 0.05)
+    monkeypatch.setattr(pursuit, "ANSWER_S", 0.02)
+    console, ghost = peers.join(None, "console"), peers.stranger()
+    heartbeat = {"robot_id": "ghost", "timestamp": peers.clock()}
+    ghost.put("strands/ghost/presence", heartbeat)
+    asked: list[str] = []
+    ghost.declare_subscriber("strands/ghost/cmd", lambda sample: asked.append(sample.key))
+    console.emergency_stop()
+    peers.clock.pass_(1)
+    ghost.put("strands/ghost/presence", {**heartbeat, "timestamp": peers.clock()})
+    eventually(lambda: "is in reach and does not answer" in caplog.text, within=5)
+    assert len(asked) == pursuit.TRIES

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -18,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 EVERY_S = 0.55
 ANSWER_S = 1.0
+TRIES = 10  # of a peer that is in reach and does not answer; access rules may keep it from us
 KNOWN_S = 600.0
 """A peer heard of within these seconds is brought the stop when it comes back; a newcomer is not."""
 
@@ -53,7 +55,7 @@ class Pursuit:
     def _run(
         self, over: threading.Event, epoch: str, left: set[str], held: Callable[[], bool], publish: Callable[[], None]
     ) -> None:
-        began = self._context.monotonic()
+        began, tries = self._context.monotonic(), Counter[str]()
         while left and not over.wait(EVERY_S) and self._context.transport is not None and held():
             back = sorted(peer for peer in left if self._heard_since(began, peer))
             if back:
@@ -62,9 +64,13 @@ class Pursuit:
                 if over.is_set():
                     return
                 reply: dict[str, Any] = self._caller.send(peer, {"action": "stop"}, ANSWER_S)
+                tries[peer] += 1
                 if "type" in reply:
                     left.discard(peer)
                     logger.warning("%s was out of reach and has answered emergency stop %s now.", peer, epoch)
+                elif tries[peer] >= TRIES:
+                    left.discard(peer)
+                    logger.critical("%s is in reach and does not answer emergency stop %s.", peer, epoch)
 
     def _heard_since(self, began: float, peer: str) -> bool:
         row = self._context.registry.get(peer, self._context.monotonic() - began)

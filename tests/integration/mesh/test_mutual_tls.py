@@ -114,3 +114,22 @@ def test_leaving_loopback_without_certificates_is_refused_by_name(tmp_path: Path
     settings = {"ZENOH_LISTEN": f"tcp/0.0.0.0:{free_port()}", "STRANDS_STATE_DIR": str(state)}
     with MeshPeer("sim-1", "world", settings) as peer:
         assert peer.ask("alive") is False
+
+
+def test_the_fleet_of_the_guide_works_with_rules_and_stated_endpoints(join: Join, fleet: Fleet, port: int) -> None:
+    endpoint = f"tls/127.0.0.1:{port}"
+    one = join("sim-1", ZENOH_CONNECT=endpoint, **fleet["sim-1"])
+    console = join("console", "none", ZENOH_LISTEN=endpoint, **fleet["console"])
+    two = join("sim-2", ZENOH_CONNECT=endpoint, **fleet["sim-2"])
+    for peer, others in ((console, ("sim-1", "sim-2")), (one, ("console", "sim-2")), (two, ("console", "sim-1"))):
+        peer.sees(*others, within=12)
+    assert console.ask("ping", "sim-1")["status"] == console.ask("ping", "sim-2")["status"] == "ok"
+    assert one.ask("ping", "sim-2", 0.5)["status"] == "timeout"
+    one.ask("start", "wave")
+    # A robot commands nobody, but its emergency stop is everybody's.
+    two.ask("estop")
+    eventually(lambda: one.ask("epoch") == console.ask("epoch") == two.ask("epoch"), within=3)
+    assert one.ask("moving") == []
+    two.kill()
+    eventually(lambda: "sim-2" not in console.ask("reachable"), within=2)
+    eventually(lambda: "sim-2" not in one.ask("reachable"), within=2)
