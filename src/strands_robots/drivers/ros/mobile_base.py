@@ -198,6 +198,11 @@ class MobileBaseRobot:
         found = (("get_pose", self._odometry.topic), ("get_scan", self._scan[0]))
         return tuple(verb for verb, topic in found if topic is not None)
 
+    @property
+    def holding(self) -> bool:
+        """Zeros still go out after a halt."""
+        return self._holds.running
+
     def motion_note(self) -> str:
         """What an agent has to know about how this platform moves, one sentence."""
         return "It turns in place."

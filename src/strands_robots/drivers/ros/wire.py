@@ -129,6 +129,12 @@ class Holds:
         self._lock = threading.Lock()
         self._current: Hold | None = None
 
+    @property
+    def running(self) -> bool:
+        """Zeros still go out."""
+        current = self._current
+        return current is not None and current.running
+
     def begin(self) -> Hold:
         """A fresh hold, whose first zero goes out at once."""
         with self._lock:
