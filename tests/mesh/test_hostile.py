@@ -49,7 +49,7 @@ def test_any_bytes_are_an_object_or_a_wire_error(data: bytes) -> None:
 
 
 @given(bodies)
-@settings(max_examples=250)
+@settings(max_examples=120)
 def test_any_object_is_a_message_or_a_wire_error(body: dict[str, Any]) -> None:
     for kind in (wire.Presence, wire.Request, wire.Reply, wire.EstopNotice, wire.ResumeRelay):
         try:
@@ -127,7 +127,7 @@ signatures = st.fixed_dictionaries(
 
 
 @given(bodies, signatures | values)
-@settings(max_examples=250)
+@settings(max_examples=120)
 def test_any_signature_is_verified_or_refused(certified: Path, body: dict[str, Any], signature: Any) -> None:
     verifier = Verifier((certified / "ca.pem").read_bytes(), lambda: 1.0, lambda: 1.0)
     with pytest.raises(IdentityError):
@@ -135,7 +135,7 @@ def test_any_signature_is_verified_or_refused(certified: Path, body: dict[str, A
 
 
 @given(st.binary(max_size=100) | bodies.map(lambda body: json.dumps(body).encode()))
-@settings(max_examples=300)
+@settings(max_examples=120)
 def test_any_bytes_are_a_command_that_was_seen_or_not(data: bytes) -> None:
     seen = Seen()
     assert seen.first(data) is True
@@ -143,7 +143,7 @@ def test_any_bytes_are_a_command_that_was_seen_or_not(data: bytes) -> None:
 
 
 @given(st.text(max_size=60) | st.text("abc/*$#?", max_size=20).map("strands/{}".format))
-@settings(max_examples=300)
+@settings(max_examples=120)
 def test_any_key_falls_under_a_topic(key: str) -> None:
     topics.topic_of(key)
     topics.matches("strands/*/response/**", key)
