@@ -6,7 +6,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -133,10 +133,8 @@ class DdsLink:
             slice_ns = _SLICE_MS * 1_000_000
             while not done.is_set():
                 if waitset.wait(slice_ns):
-                    for sample in reader.take(N=DEPTH):
-                        # A writer that leaves delivers one sample without data.
-                        if sample.sample_info.valid_data and not done.is_set():
-                            _tell(heard, plain(sample), topic)
+                    for message in _arrived(reader, topic, core.DDSException, done):
+                        _tell(heard, message, topic)
 
         thread = threading.Thread(target=run, name=f"dds-{topic.strip('/')}", daemon=True)
 
@@ -147,8 +145,8 @@ class DdsLink:
             if thread is not threading.current_thread():
                 thread.join(10 * _SLICE_MS / 1000)
 
-        self._unwatch.append(unwatch)
         thread.start()
+        self._unwatch.append(unwatch)
         return unwatch
 
     def endpoints(self) -> list[dict[str, str]]:
@@ -159,14 +157,15 @@ class DdsLink:
             "subscription": builtin.BuiltinTopicDcpsSubscription,
         }
         found = []
-        with self._lock:
-            for role, source in sources.items():
-                reader = builtin.BuiltinDataReader(self._open(), source)
-                alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
-                for each in reader.read(N=10_000, condition=core.ReadCondition(reader, alive)):
-                    if each.sample_info.valid_data and each.topic_name.startswith("rt/"):
-                        kind = each.type_name.replace("::msg::dds_::", "/msg/").removesuffix("_")
-                        found.append({"topic": each.topic_name[2:], "type": kind, "role": role})
+        # Not under the lock, which a command's first message needs.
+        participant = self._open()
+        for role, source in sources.items():
+            reader = builtin.BuiltinDataReader(participant, source)
+            alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
+            for each in reader.read(N=10_000, condition=core.ReadCondition(reader, alive)):
+                if each.sample_info.valid_data and each.topic_name.startswith("rt/"):
+                    kind = each.type_name.replace("::msg::dds_::", "/msg/").removesuffix("_")
+                    found.append({"topic": each.topic_name[2:], "type": kind, "role": role})
         return found
 
     def topics(self) -> list[dict[str, Any]]:
@@ -285,6 +284,26 @@ def _dds(module: str) -> ModuleType:
         if (exc.name or "").partition(".")[0] != "cyclonedds":
             raise
         raise missing_extra("Bare DDS", "ros2") from exc
+
+
+def _arrived(reader: Any, topic: str, lost: type[Exception], done: threading.Event) -> Iterator[dict[str, Any]]:
+    """What has arrived, one by one: a message that cannot be read takes no other with it, nor the watcher's thread."""
+    level = logging.WARNING
+    while not done.is_set():
+        try:
+            samples = reader.take(N=1)
+        except lost:
+            raise
+        except Exception as exc:  # noqa: BLE001 - the library's decoder raises whatever a peer's bytes provoke
+            logger.log(level, "A message of %s cannot be read: %s", topic, exc)
+            # A flood of them must not become a flood of warnings.
+            level = logging.DEBUG
+            continue
+        if not samples:
+            return
+        # A writer that leaves delivers one sample without data.
+        if samples[0].sample_info.valid_data:
+            yield plain(samples[0])
 
 
 def _tell(heard: Heard, message: dict[str, Any], topic: str) -> None:

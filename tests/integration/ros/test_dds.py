@@ -134,6 +134,22 @@ def test_a_read_leaves_no_thread_behind(base: subprocess.Popen[str]) -> None:
         link.close()
 
 
+def test_a_message_that_cannot_be_read_takes_no_other_with_it(caplog: pytest.LogCaptureFixture) -> None:
+    link = DdsLink(DOMAIN)
+    heard: list[Mapping[str, Any]] = []
+    garbler = subprocess.Popen(
+        [sys.executable, "-m", "fixtures.dds_garbler", str(DOMAIN)], stdin=subprocess.PIPE, cwd=ROOT
+    )
+    try:
+        link.watch("/garbled", "std_msgs/msg/String", heard.append)
+        eventually(lambda: len(heard) >= 5, within=15)
+        assert "cannot be read" in caplog.text
+        assert {each["data"] for each in heard} == {"good"}
+    finally:
+        garbler.communicate(timeout=10)
+        link.close()
+
+
 def test_what_bare_dds_cannot_do_is_said() -> None:
     link = DdsLink(DOMAIN)
     with pytest.raises(RosError, match="is a service"):
