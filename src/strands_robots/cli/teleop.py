@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.far import MESH, known_to, lead_far, leads
+from strands_robots.cli.far import MESH, follow_far, known_to, lead_far, leads
 from strands_robots.cli.output import Failure, Screen, table
 from strands_robots.cli.recorded import recorded
 from strands_robots.envelope import is_error, text_of
@@ -64,6 +64,13 @@ def teleop(
     record: Annotated[Path | None, typer.Option("--record", help="Also record the follower: a new .mcap.")] = None,
 ) -> None:
     """Let a leader drive a follower until it ends or Ctrl-C, which stops the follower first."""
+    if leader.startswith(MESH):
+        if follower.startswith(MESH) or publish is not None:
+            raise ValidationError("a leader of the mesh leads a follower of this machine, and publishes itself.")
+        peer = identifier("leader", leader.removeprefix(MESH))
+        options = arm_options("", follower_id, calibration)
+        _follow(screen, peer, follower, options=options, seconds=seconds, max_speed=max_speed, record=record)
+        return
     drive(
         screen,
         leader,
@@ -105,12 +112,8 @@ def drive(
         waits = partial(_until, screen)
         lead_far(screen, leader, peer, led, waits, method=method, seconds=seconds, hz=hz, max_speed=max_speed)
         return
-    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
-
-    kind, at, port = follower.partition("@")
-    place = None if publish is None else identifier("--publish", publish)
-    given = {**options, "port": port} if at else {}
-    robot = Robot(kind, mode="real" if at else "sim", peer_id=place, mesh=True if place else None, **given)
+    place = {} if publish is None else {"peer_id": identifier("--publish", publish), "mesh": True}
+    robot = _made(follower, options, **place)
     try:
         with recorded(screen, robot, publish or robot.tool_name_str, record), led(robot) as source:
             known_to(follower, source, robot.body().bounds)
@@ -133,6 +136,49 @@ def drive(
     screen.say(f"{row['state'].capitalize()} after {row['step']} frames, {row['errors']} of them unusable.", "green")
     if not verdict.stopped:
         raise Failure(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
+
+
+def _follow(
+    screen: Screen,
+    peer: str,
+    follower: str,
+    *,
+    options: dict[str, Any],
+    seconds: float | None,
+    max_speed: float,
+    record: Path | None,
+) -> None:
+    """Let a leader that a peer of the mesh publishes drive a follower of this machine."""
+    robot = _made(follower, options, mesh=True)
+    try:
+        with recorded(screen, robot, robot.tool_name_str, record):
+            why, stats = follow_far(screen, peer, robot, partial(_until, screen), seconds=seconds, max_speed=max_speed)
+            verdict = _stopped(screen, robot)
+    finally:
+        robot.halt("teleop ended")
+        robot.cleanup()
+    row = {key: stats[key] for key in ("frames_received", "errors", "rejected", "slew_rejected", "rate_dropped")}
+    screen.data({"event": "ended", **row, "why": why, "stopped": verdict.stopped})
+    if not verdict.stopped:
+        raise Failure(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
+    left_out = row["errors"] + row["rejected"] + row["slew_rejected"] + row["rate_dropped"]
+    screen.say(f"{why} {row['frames_received']} frames came, {left_out} of them were not applied.", "green")
+
+
+def _made(follower: str, options: dict[str, Any], **more: Any) -> Any:
+    """The follower of this machine: ``TYPE@PORT``, or a model in simulation."""
+    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
+
+    kind, at, port = follower.partition("@")
+    return Robot(kind, mode="real" if at else "sim", **more, **({**options, "port": port} if at else {}))
+
+
+def _stopped(screen: Screen, robot: Any) -> StopVerdict:
+    screen.say("Stopping the follower...")
+    verdict: StopVerdict = robot.halt("teleop ended")
+    if verdict.stopped:
+        screen.say("The follower stands still.", "green")
+    return verdict
 
 
 def calibrate(
@@ -227,10 +273,7 @@ def _followed(screen: Screen, robot: Any, source: Any) -> tuple[dict[str, Any], 
         return "" if _NAME in robot.teleoperating() else "It has ended."
 
     _until(screen, over, getattr(source, "duration", None) or 0.0)
-    screen.say("Stopping the follower...")
-    verdict: StopVerdict = robot.halt("teleop ended")
-    if verdict.stopped:
-        screen.say("The follower stands still.", "green")
+    verdict = _stopped(screen, robot)
     row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
     return row, verdict
 

@@ -102,3 +102,26 @@ def test_a_follower_that_is_not_there_is_one_sentence(replay: Any, wave: Path) -
     code, [told] = ended(replay(str(wave), "--to", "mesh:nobody-1"))
     assert code == 3
     assert "nobody-1" in told["reason"]
+
+
+def test_a_leader_that_is_published_drives_a_robot_of_this_machine(replay: Any, wave: Path, tmp_path: Path) -> None:
+    write_csv(tmp_path / "pan.csv", [(0.1 * step, {"shoulder_pan": 0.01 * step}) for step in range(100)])
+    leading = subprocess.Popen(
+        [*COMMAND, "teleop", str(tmp_path / "pan.csv"), "so100", "--publish", "lead-1", "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        line = ["teleop", "mesh:lead-1", "so100", "--for", "1", "--json"]
+
+        def following() -> list[dict[str, Any]]:
+            done = subprocess.run([*COMMAND, *line], stdout=subprocess.PIPE, text=True, check=False, timeout=30)
+            return [json.loads(each) for each in done.stdout.splitlines()] if done.returncode == 0 else []
+
+        [told] = eventually(following, within=20, what="the leader is on the mesh")
+    finally:
+        leading.kill()
+        leading.communicate()
+    assert told["stopped"] is True
+    assert told["frames_received"] > 10
+    assert (told["errors"], told["rejected"]) == (0, 0)

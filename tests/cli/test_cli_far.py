@@ -1,0 +1,27 @@
+"""A follower of this machine that is led from elsewhere does not jump to where its leader is."""
+
+from __future__ import annotations
+
+import pytest
+from fixtures.devices import RecordingDevice
+
+from strands_robots.cli.far import Glide
+from strands_robots.hardware import HardwareRobot
+from strands_robots.utils import ValidationError
+
+
+def test_the_first_frames_glide_and_a_pause_is_not_saved_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = RecordingDevice()
+    robot = HardwareRobot(device, "arm")
+    robot.connect()
+    clock = iter([0.0, 0.02, 0.04, 60.0])
+    glide = Glide(robot.body(), 1.0, now=lambda: next(clock))
+    applied: list[float] = []
+    monkeypatch.setattr(robot, "send_action", lambda action: applied.append(action["pan.pos"]))
+    for _ in range(3):
+        glide(robot, {"pan.pos": 90.0})
+    # From 10, at one range of 200 a second: 4 in each 20 ms, and 8 after a minute's pause.
+    assert applied == pytest.approx([14.0, 18.0, 26.0])
+    with pytest.raises(ValidationError, match="elbow"):
+        glide(robot, {"elbow": 1.0})
+    robot.cleanup()
