@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
+
+logger = logging.getLogger(__name__)
 
 Message = Mapping[str, Any]
 Heard = Callable[[Message], None]
@@ -164,7 +167,10 @@ class MemoryLink:
             self.sent.append((topic, message))
             watchers = list(self._watchers.get(topic, ()))
         for heard in watchers:
-            heard(message)
+            try:
+                heard(message)
+            except Exception:
+                logger.exception("A watcher of %s failed.", topic)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
         arrived = threading.Event()

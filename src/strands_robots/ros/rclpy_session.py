@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 from collections.abc import Callable, Sequence
@@ -68,6 +69,8 @@ class Session:
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._spin, name=f"rclpy-{name}", daemon=True)
         self._thread.start()
+        # A thread that the interpreter's end finds inside the client library can abort the process.
+        atexit.register(self.close)
 
     def later(self, what: Callable[[], None]) -> None:
         """Do this on the executor's thread, soon, and log what it raises.
@@ -86,9 +89,14 @@ class Session:
     def close(self, parts: Sequence[Any] = ()) -> None:
         """End the thread and take the node off the graph; not to be called by a callback of this node.
 
+        A second call does nothing; at the interpreter's end it is called for every session that is left.
+
         Args:
             parts: what the node does not destroy by itself, such as its action clients.
         """
+        atexit.unregister(self.close)
+        if self._done.is_set():
+            return
         self._done.set()
         self._thread.join(20 * SPIN_S)
         for each in parts:

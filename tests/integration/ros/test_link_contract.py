@@ -89,6 +89,23 @@ def test_what_is_published_reaches_whoever_watches_until_they_do_not(ends: tuple
     assert len(heard) == 1
 
 
+def test_a_watcher_that_raises_harms_nobody(ends: tuple[RosLink, RosLink]) -> None:
+    near, far = ends
+    heard: list[Message] = []
+
+    def fail(message: Message) -> None:
+        raise ValueError(message)
+
+    far.watch("/cmd_vel", TWIST, fail)
+    far.watch("/cmd_vel", TWIST, heard.append)
+
+    def sent_again() -> bool:
+        near.publish("/cmd_vel", TWIST, {})
+        return len(heard) > 1
+
+    eventually(sent_again)
+
+
 def test_a_read_gets_the_next_message_and_silence_is_named(ends: tuple[RosLink, RosLink]) -> None:
     near, far = ends
     done = threading.Event()

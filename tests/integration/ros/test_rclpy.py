@@ -157,7 +157,7 @@ def test_a_stop_cancels_the_goal_of_a_stack_in_another_process(rover: Rover) -> 
 
 def test_a_graph_is_looked_at_read_and_asked_through_ros_action(sourced: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_ROS2_COMMAND_ALLOW", "navigate_to_pose")
-    at: dict[str, Any] = {"domain_id": DOMAIN}
+    at: dict[str, Any] = {"domain_id": DOMAIN, "timeout": 30.0}
     with nav2(DOMAIN, "reach"):
         eventually(lambda: ros_action("list_actions", **at)["actions"] == ["/navigate_to_pose"])
         assert ros_action("status", **at)["backend"] == "RclpyLink"
