@@ -6,6 +6,7 @@ import logging
 import re
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -119,7 +120,8 @@ class RosTelemetryBase:
         own = str(getattr(robot, "tool_name_str", "") or "robot")
         self.command_topic = f"/{segment(own if command_robot_name is None else command_robot_name)}/joint_command"
         self._limits = checked_limits(joint_limits)
-        self._latest: Message | None = None
+        # One place: a newer command takes it, and none gets lost between a look and the next.
+        self._latest: deque[Message] = deque(maxlen=1)
         self._done = threading.Event()
         self._thread: threading.Thread | None = None
         self._link: TelemetryLink | None = None
@@ -217,13 +219,12 @@ class RosTelemetryBase:
             link.tell(topic, kind, fields)
 
     def _keep(self, command: Message) -> None:
-        self._latest = command
+        self._latest.append(command)
 
     def _poll(self) -> None:
-        while not self._done.wait(self._period_s):
-            command, self._latest = self._latest, None
-            if command is not None:
-                self.apply(command)
+        while not self._done.wait(min(self._period_s, threading.TIMEOUT_MAX)):
+            if self._latest:
+                self.apply(self._latest.popleft())
 
 
 class RosTelemetryBridge(RosTelemetryBase):
