@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from strands_robots.cli.words import assignments
+from strands_robots.cli.words import assignments, told_apart
 from strands_robots.utils import ValidationError
 
 
@@ -53,3 +53,27 @@ def test_any_word_is_read_or_refused_by_name(word: str) -> None:
         assignments([f"key={word}"])
     except ValidationError as refused:
         assert "key" in str(refused)
+
+
+@pytest.mark.parametrize(
+    ("words", "meeting", "serial"),
+    [
+        ([], None, None),
+        (["7447"], 7447, None),
+        (["/dev/ttyACM0"], None, "/dev/ttyACM0"),
+        (["com3", "1"], 1, "com3"),
+        (["65535", "/dev/serial/by-id/x"], 65535, "/dev/serial/by-id/x"),
+    ],
+)
+def test_a_port_that_is_a_number_is_where_robots_meet_and_a_path_is_an_arms(
+    words: list[str], meeting: int | None, serial: str | None
+) -> None:
+    assert told_apart(words) == (meeting, serial)
+
+
+@pytest.mark.parametrize(
+    "words", [["0"], ["65536"], ["-1"], [""], ["ttyACM0"], ["/"], ["1", "2"], ["/dev/a", "/dev/b"], ["7447.0"], ["²"]]
+)
+def test_any_other_port_is_refused(words: list[str]) -> None:
+    with pytest.raises(ValidationError, match="--port"):
+        told_apart(words)

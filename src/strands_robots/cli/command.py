@@ -36,12 +36,14 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
     def register(body: Body) -> Body:
         asked = inspect.signature(body, eval_str=True).parameters.values()
         own = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in asked if each.name not in ("screen", "network")]
-        parameters = [*own, *(NETWORK_OPTIONS if network else ()), _JSON]
+        # A command may read a flag of the network in a way of its own.
+        shared = [each for each in NETWORK_OPTIONS if network and each.name not in {mine.name for mine in own}]
+        parameters = [*own, *shared, _JSON]
 
         def run(**given: Any) -> None:
             screen = Screen(given.pop("machine"))
             if network:
-                given["network"] = Network(**{each.name: given.pop(each.name) for each in NETWORK_OPTIONS})
+                given["network"] = Network(**{each.name: given.pop(each.name) for each in shared})
             raise typer.Exit(int(outcome(screen, lambda: body(screen, **given))))
 
         run.__name__ = body.__name__

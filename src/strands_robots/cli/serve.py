@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,9 +19,9 @@ from strands_robots.cli.mesh import serve_on_mesh
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Failure, Screen, label, plain, table
 from strands_robots.cli.recorded import recorded
-from strands_robots.cli.words import assignments
+from strands_robots.cli.words import assignments, told_apart
 from strands_robots.envelope import text_of
-from strands_robots.utils import device_id, number
+from strands_robots.utils import ValidationError, device_id, number
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -45,7 +46,17 @@ def serve(
     *,
     robot: Annotated[str, typer.Argument(help="Such as so100, or an MJCF or URDF file.")],
     peer_id: Annotated[str | None, typer.Option("--peer-id", help="Its id on the network, without dots.")] = None,
-    mode: Annotated[str, typer.Option("--mode", help="sim or real; reachy_mini is always real.")] = "sim",
+    mode: Annotated[
+        str | None, typer.Option("--mode", help="sim or real; real by itself with a serial port, and for reachy_mini.")
+    ] = None,
+    port: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--port",
+            help="An arm's serial port, such as /dev/ttyACM0; or the number of the loopback port where robots meet.",
+            metavar="PORT",
+        ),
+    ] = None,
     host: Annotated[
         str | None, typer.Option("--host", help="Of a Reachy Mini's daemon; without it one is looked for.")
     ] = None,
@@ -81,15 +92,22 @@ def serve(
         if value is not None:
             settings.put(name, value)
     wanted = None if peer_id is None else device_id("--peer-id", peer_id)
+    meeting, serial = told_apart(port or [])
+    network = replace(network, port=meeting)
     link = None if on_mesh else network.link()
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
 
     chosen = assignments(options or []) | ({} if host is None else {"host": host})
-    body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
+    if serial is not None:
+        chosen["port"] = serial
+    kind = mode or ("real" if serial is not None or robot == "reachy_mini" else "sim")
+    if serial is not None and kind == "sim":
+        raise ValidationError(f"--mode must be real with the serial port {serial}, not sim.")
+    body = Robot(robot, mode="real" if robot == "reachy_mini" else kind, **chosen)
     try:
         with recorded(screen, body, wanted or str(body.tool_name_str), record, record_cameras):
             if link is None:
-                serve_on_mesh(screen, body, wanted, mode)
+                serve_on_mesh(screen, body, wanted, kind)
             else:
                 _serve(screen, network, link, body, wanted=wanted, piped=until_stdin_closes)
     finally:

@@ -10,6 +10,7 @@ from typing import Any
 
 from strands_robots.utils import ValidationError, shown
 
+_SERIAL = re.compile(r"/.|COM\d+\Z", re.IGNORECASE)
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 
@@ -30,6 +31,30 @@ def assignments(words: Iterable[str]) -> dict[str, Any]:
             raise ValidationError(f"{key} is given twice.")
         values[key] = _value(key, text)
     return values
+
+
+def told_apart(ports: Iterable[str]) -> tuple[int | None, str | None]:
+    """The TCP port and the serial port among the words of a ``--port`` that may mean either.
+
+    Raises:
+        ValidationError: one that is neither, or two of a kind.
+    """
+    meeting: int | None = None
+    serial: str | None = None
+    for word in ports:
+        if _SERIAL.match(word):
+            if serial is not None:
+                raise ValidationError(f"--port names two serial ports: {serial} and {word}.")
+            serial = word
+        elif word.isdecimal() and 1 <= int(word) <= 65535:
+            if meeting is not None:
+                raise ValidationError(f"--port names two numbers: {meeting} and {word}.")
+            meeting = int(word)
+        else:
+            raise ValidationError(
+                f"--port must be a serial port such as /dev/ttyACM0 or a number from 1 to 65535, not {shown(word)}."
+            )
+    return meeting, serial
 
 
 def _value(key: str, text: str) -> Any:

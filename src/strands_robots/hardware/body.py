@@ -12,6 +12,7 @@ from typing import Any, Literal
 from strands_robots.bus_access import action_ranges, bus_lock, read_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
+from strands_robots.hardware.ports import require_port
 from strands_robots.policies.actions import numbers
 from strands_robots.policies.base import Action
 from strands_robots.safety.gate import Permit, PermitVoidError
@@ -104,6 +105,7 @@ class DeviceBody:
     @staticmethod
     def bring_up(device: Any) -> None:
         """Connect a follower or leader, its calibration first. Raises what it raises, with its port closed."""
+        require_port(device)
         for left in reversed(range(CONNECT_TRIES)):
             try:
                 write_to_servos(device)

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from strands_robots.hardware._compat import lerobot_module, light
 from strands_robots.hardware.calibration import calibrate_from
+from strands_robots.hardware.ports import check_port
 from strands_robots.utils import ValidationError, mapping, missing_extra, shown
 
 logger = logging.getLogger(__name__)
@@ -45,7 +46,8 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
 
     Raises:
         MissingExtraError: LeRobot is not installed.
-        ValidationError: an unknown name, with the near ones; options that its configuration refuses; no calibration.
+        ValidationError: an unknown name, with the near ones; options that its configuration refuses; no serial port;
+            no calibration.
     """
     package, registry, factory = _ROLES[role]
     try:
@@ -65,8 +67,12 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
         fields["cameras"] = _cameras(fields["cameras"])
     if isinstance(fields.get("calibration_dir"), str):
         fields["calibration_dir"] = Path(fields["calibration_dir"]).expanduser()
-    if "id" not in fields and "id" in {each.name for each in dataclasses.fields(known[kind])}:
+    asked = {each.name: each for each in dataclasses.fields(known[kind])}
+    if "id" not in fields and "id" in asked:
         fields["id"] = name
+    # Of a robot on a network the port is a number.
+    if "port" in asked and str(asked["port"].type) in ("str", "<class 'str'>"):
+        check_port(str(name), fields.get("port"), needed=asked["port"].default is dataclasses.MISSING)
     try:
         config = known[kind](**fields)
     except (TypeError, ValueError) as exc:

@@ -99,6 +99,13 @@ def test_a_port_that_is_not_there_is_told(arm: Arm) -> None:
         arm(port="/dev/no-such-port")
 
 
+def test_no_port_at_all_is_one_sentence_that_says_what_it_is(arm: Arm) -> None:
+    for port in (None, "", 5):
+        with pytest.raises(ValidationError, match="so101 needs port, its serial port, such as /dev/ttyACM0") as refused:
+            arm(port=port)
+        assert "\n" not in str(refused.value)
+
+
 def test_a_first_connection_that_failed_can_be_tried_again(arm: Arm, bus: FeetechBus) -> None:
     bus.servos[3].dead = True
     with pytest.raises(ConnectionError, match="Missing motor IDs"):

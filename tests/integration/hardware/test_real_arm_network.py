@@ -140,10 +140,21 @@ def test_the_example_drives_the_whole_way_and_draws_it(tmp_path: Path) -> None:
 def test_serve_puts_a_real_arm_on_the_network(tmp_path: Path) -> None:
     calibration, port = write_calibration(tmp_path / "calibration.json"), free_port()
     with FeetechBus(arm_servos(), link=tmp_path / "arm") as bus:
-        arm = {"port": bus.port, "calibration": calibration, "calibration_dir": tmp_path}
+        arm = {"calibration": calibration, "calibration_dir": tmp_path}
         words = [word for key, value in arm.items() for word in ("--set", f"{key}={value}")]
-        words += ["--peer-id", "arm-7", "--rpc-allow", "tester", "--command-allow", "execute", "--port", str(port)]
-        line = [sys.executable, "-m", "strands_robots.cli", "serve", "so101", "--mode", "real", *words]
+        words += [
+            "--port",
+            bus.port,
+            "--peer-id",
+            "arm-7",
+            "--rpc-allow",
+            "tester",
+            "--command-allow",
+            "execute",
+            "--port",
+            str(port),
+        ]
+        line = [sys.executable, "-m", "strands_robots.cli", "serve", "so101", *words]
         process = subprocess.Popen(
             [*line, "--json", "--until-stdin-closes"],
             stdin=subprocess.PIPE,
