@@ -77,6 +77,20 @@ def test_a_leaders_actions_reach_the_follower_in_order(peers: Fleet) -> None:
     assert peers.events("input_stream_opened")
 
 
+def test_a_leader_that_begins_again_is_followed_on(peers: Fleet) -> None:
+    arm = Arm()
+    follower, lead = peers.join(arm, "follower"), peers.join(None, "lead")
+    receiver = InputReceiver(follower, arm, "lead")
+    receiver.start()
+    for _ in range(2):
+        arm.actions.clear()
+        publisher = InputPublisher(lead, Leader(), hz=50)
+        publisher.start()
+        eventually(lambda: len(arm.actions) >= 5, within=5)
+        publisher.stop()
+    assert receiver.stop()["out_of_order"] == 0
+
+
 def test_a_stream_needs_a_leader_that_was_seen(peers: Fleet) -> None:
     arm = Arm()
     receiver = InputReceiver(peers.join(arm, "follower"), arm, "nobody")

@@ -8,6 +8,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 from strands_robots import settings
@@ -52,6 +53,7 @@ class Mesh(SensorLoopsMixin):
         self.robot = fit(robot)
         self._parts = parts or Parts()
         self._lifecycle_lock = threading.Lock()
+        self._frames: dict[str, count[int]] = {}
         self._assembled = assemble(self, self._parts)
         self._context = self._assembled.context
         self._scheduler = self._assembled.scheduler
@@ -239,6 +241,11 @@ class Mesh(SensorLoopsMixin):
             self._assembled.inputs.pop(device, None)
         else:
             self._assembled.inputs[device] = {"device": device, "method": method, "hz": hz}
+
+    def next_input(self, device: str) -> int:
+        """The number of the next frame of an input stream. It rises for as long as this peer lives, so that a follower
+        does not take a leader that began again for one of its own earlier frames."""
+        return next(self._frames.setdefault(device, count()))
 
     def record(self, event: str, about: str, **payload: Any) -> None:
         """Record an event about a peer in the audit log."""

@@ -119,9 +119,8 @@ class InputPublisher:
 
     def _publish_loop(self, stopping: threading.Event) -> None:
         period, due = 1.0 / self._hz, time.monotonic()
-        sequence = 0
         while not stopping.is_set():
-            sequence += self._publish_one(sequence)
+            self._publish_one()
             due += period
             left = due - time.monotonic()
             if left < 0:
@@ -129,7 +128,7 @@ class InputPublisher:
             elif stopping.wait(left):
                 return
 
-    def _publish_one(self, sequence: int) -> int:
+    def _publish_one(self) -> None:
         try:
             action = self._teleoperator.get_action()
             frame = {
@@ -137,7 +136,7 @@ class InputPublisher:
                 "device": self._device,
                 "method": self._method,
                 "t": self._mesh.now(),
-                "seq": sequence,
+                "seq": self._mesh.next_input(self._device),
                 "action": numbers(action),
                 "events": self._events(),
             }
@@ -148,8 +147,6 @@ class InputPublisher:
             self._note(f"{type(exc).__name__}: {exc}")
         else:
             self._frames += 1
-            return 1
-        return 0
 
     def _events(self) -> dict[str, Any] | None:
         read: Callable[[], Any] | None = getattr(self._teleoperator, "get_teleop_events", None)

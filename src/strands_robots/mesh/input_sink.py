@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ class MeshInputSink:
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
-        self._sent: Counter[str] = Counter()
 
     def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
         """Send one frame. Raises what the mesh raises; the follower here goes on."""
@@ -27,9 +25,8 @@ class MeshInputSink:
             "device": device,
             "method": method,
             "t": self._mesh.now(),
-            "seq": self._sent[device],
+            "seq": self._mesh.next_input(device),
             "action": dict(action),
             "events": None if events is None else {str(key): bool(value) for key, value in events.items()},
         }
-        self._sent[device] += 1
         self._mesh.publish(topics.input_stream(self._mesh.peer_id, device), frame)
