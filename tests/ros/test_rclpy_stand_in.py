@@ -5,10 +5,15 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
+import numpy as np
 import pytest
+from fixtures.rclpy_stand_in import idl
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fixtures import rclpy_stand_in
+from strands_robots.ros.dds_types import Header, PoseStamped, Time
 from strands_robots.ros.rclpy_session import sourced
 
 
@@ -47,3 +52,61 @@ def test_its_messages_refuse_what_rosidl_refuses() -> None:
         image = import_module("sensor_msgs.msg").Image()
         with pytest.raises(AssertionError):
             image.height = -1
+
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STORE.register(
+    get_types_from_msg(
+        "uint64 guid\nint64 seq\nunique_identifier_msgs/UUID goal_id\ngeometry_msgs/PoseStamped pose\nstring tree",
+        "wire/msg/SendGoal",
+    )
+)
+
+
+def same(ours: Any, theirs: Any, kind: str) -> bool:
+    """Both are the same on the wire, but for the padding at the end, which is nobody's data."""
+    mine, other = ours.serialize(), bytes(STORE.serialize_cdr(theirs, kind))
+    return mine[: len(other)] == other and not mine[len(other) :].strip(b"\0")
+
+
+def test_what_it_writes_beside_messages_is_laid_out_as_an_independent_serializer_does() -> None:
+    types, some = STORE.types, list(range(16))
+    uuid = types["unique_identifier_msgs/msg/UUID"](uuid=np.array(some, np.uint8))
+    stamp = types["builtin_interfaces/msg/Time"](sec=5, nanosec=6)
+    theirs = types["action_msgs/msg/GoalInfo"](goal_id=uuid, stamp=stamp)
+    assert same(
+        idl.GoalInfo(goal_id=idl.UUID(uuid=some), stamp=Time(sec=5, nanosec=6)), theirs, "action_msgs/msg/GoalInfo"
+    )
+
+    node = types["rmw_dds_common/msg/NodeEntitiesInfo"](
+        node_namespace="/", node_name="rover", reader_gid_seq=[], writer_gid_seq=[]
+    )
+    gid = types["rmw_dds_common/msg/Gid"](data=np.array(some, np.uint8))
+    kind = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+    info = idl.NodeEntitiesInfo(node_namespace="/", node_name="rover", reader_gid_seq=[], writer_gid_seq=[])
+    told = idl.ParticipantEntitiesInfo(gid=idl.Gid(data=some), node_entities_info_seq=[info])
+    assert same(told, types[kind](gid=gid, node_entities_info_seq=[node]), kind)
+
+
+def test_a_request_carries_the_header_of_rmw_cyclonedds_and_then_its_body() -> None:
+    types = STORE.types
+    body = idl.action_services("nav2_msgs/NavigateToPose")["send_goal"][0]
+    goal = idl.ACTIONS["nav2_msgs/NavigateToPose"][0](
+        pose=PoseStamped(header=Header(frame_id="map")), behavior_tree="t"
+    )
+    ours = idl.wrapped(idl.RequestHeader(guid=2**40, seq=7), body(goal_id=idl.UUID(uuid=[1] * 16), goal=goal))
+    assert type(ours).__idl__.idl_transformed_typename == "nav2_msgs::action::dds_::NavigateToPose_SendGoal_Request_"
+    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id="map")
+    turned = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    place = types["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0)
+    pose = types["geometry_msgs/msg/PoseStamped"](
+        header=header, pose=types["geometry_msgs/msg/Pose"](position=place, orientation=turned)
+    )
+    theirs = types["wire/msg/SendGoal"](
+        guid=2**40,
+        seq=7,
+        goal_id=types["unique_identifier_msgs/msg/UUID"](uuid=np.array([1] * 16, np.uint8)),
+        pose=pose,
+        tree="t",
+    )
+    assert same(ours, theirs, "wire/msg/SendGoal")

@@ -124,8 +124,8 @@ def test_a_stack_in_another_process_reaches_a_goal(rover: Rover) -> None:
     [
         ("abort", 10.0, "aborted", ["goal"]),
         ("reject", 10.0, "not sent", ["goal"]),
-        ("stuck", 0.5, "canceled", ["goal", "cancel"]),
-        ("deaf", 0.5, "lost", ["goal", "cancel"]),
+        ("stuck", 2.0, "canceled", ["goal", "cancel"]),
+        ("deaf", 2.0, "lost", ["goal", "cancel"]),
     ],
 )
 def test_a_goal_that_is_not_reached_says_why(
