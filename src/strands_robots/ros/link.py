@@ -82,6 +82,10 @@ class GoalLink(Protocol):
         """
 
 
+class EarlierRefusedError(RosError):
+    """A message was not sent, because the far end has refused an earlier one of its topic; the next one will be."""
+
+
 class RosLink(Protocol):
     """One road to a ROS graph. Thread-safe; opened by the first use; every verb raises :class:`RosError`."""
 

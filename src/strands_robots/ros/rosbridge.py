@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
 
-from strands_robots.ros.link import GivenUp, Goal, Heard, Message, RosError, Unwatch, never
+from strands_robots.ros.link import EarlierRefusedError, GivenUp, Goal, Heard, Message, RosError, Unwatch, never
 from strands_robots.ros.rosbridge_session import Session
 from strands_robots.ros.rosbridge_urgent import UrgentRoad
 from strands_robots.ros.rosbridge_wire import Fragments, decoded, encoded, with_bytes
@@ -88,7 +88,7 @@ class RosbridgeLink:
         complaint = self._complaints.pop(topic, None)
         if complaint is not None:
             self._advertised.pop(topic, None)
-            raise RosError(complaint)
+            raise EarlierRefusedError(complaint)
         frame = encoded("publish", id=self._id("publish", topic), topic=topic, type=kind, msg=fields)
         if self._advertised.get(topic) != kind or not self._session.up:
             self._session.send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))

@@ -15,7 +15,7 @@ from strands_robots.contract import TaskRobot
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import MemoryLink, RosError
+from strands_robots.ros.link import EarlierRefusedError, MemoryLink, RosError
 from strands_robots.utils import ValidationError
 
 TOPIC = "/cmd_vel"
@@ -85,6 +85,23 @@ def test_a_timed_drive_sends_its_count_and_one_zero(linear: float, angular: floa
     messages = max(1, round(duration * 1000))
     assert sent[:messages] == [(linear, angular)] * messages
     assert sent[messages:] == ([] if linear == angular == 0 else [(0.0, 0.0)])
+
+
+def test_a_late_complaint_about_a_command_does_not_cost_the_base_its_zero() -> None:
+    class Complaining(MemoryLink):
+        def publish(self, topic: str, kind: str, fields: Mapping[str, Any]) -> None:
+            if len(self.sent) == 3 and not self.complained:
+                self.complained = True
+                raise EarlierRefusedError("the server refused message 3")
+            super().publish(topic, kind, fields)
+
+        complained = False
+
+    link = Complaining()
+    robot = MobileBaseRobot("rover", link, TOPIC, publish_rate=2000.0, command_gate=OPEN)
+    answer = robot.drive(0.5, count=3)
+    assert (answer["status"], velocities(link)[-1]) == ("error", (0.0, 0.0))
+    assert "the server refused message 3" in answer["reason"]
 
 
 @hypothesis_settings(max_examples=60, deadline=None)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from strands_robots.drivers.ros.behind import Behind
-from strands_robots.ros.link import RosError, RosLink, UrgentLink
+from strands_robots.ros.link import EarlierRefusedError, RosError, RosLink, UrgentLink
 from strands_robots.safety.gate import Permit, PermitVoidError
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,12 @@ class VelocityWire:
     def zero(self) -> None:
         """One zero, behind the write that may be in flight. Raises what the link raises."""
         with self._lock:
-            self.link.publish(self.topic, self.kind, self._zero)
+            try:
+                self.link.publish(self.topic, self.kind, self._zero)
+            except EarlierRefusedError:
+                # What was wrong with a command is told all the same, but it must not cost the base its zero.
+                self.link.publish(self.topic, self.kind, self._zero)
+                raise
 
     def halt(self) -> None:
         """One zero that nothing delays, and one behind the commands. Raises what the link raises.
