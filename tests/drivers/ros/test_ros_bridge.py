@@ -10,6 +10,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.contract import TaskRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
+from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros import goals, roads
 from strands_robots.ros.gate import CommandGate
@@ -251,3 +252,8 @@ def test_it_is_made_without_any_ros_and_says_what_is_missing_when_it_is_used(mon
     for answer in (robot.drive(0.1), robot.get_pose(), robot.stop()):
         assert "source a ROS 2 installation, or install the [ros2] extra" in answer["reason"]
     robot.disconnect()
+
+
+def test_the_same_base_over_bare_dds_is_the_same_robot_to_the_lockout() -> None:
+    here, there = RosBridgedRobot("a", "/cmd_vel", "/odom", domain_id=7), RtpsRobot("b", "/cmd_vel", domain_id=7)
+    assert here.safety_key == there.safety_key

@@ -87,7 +87,8 @@ class RosBridgedRobot(MobileBaseRobot):
             max_duration=max_duration,
             command_gate=command_gate,
         )
-        self.safety_key = f"ros2:{road.domain_id}:{cmd_vel_topic}"
+        # The same base over bare DDS is the same robot, so that a lock holds it on either road.
+        self.safety_key = f"dds:{road.domain_id}:{cmd_vel_topic}"
 
     @classmethod
     def from_ros(
