@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from typing import Any
+
 import pytest
 from tests.mesh.peers import Clock
 
 from strands_robots.mesh.transport.base import TransportError
-from strands_robots.mesh.transport.bridge import BridgeTransport, Seen
+from strands_robots.mesh.transport.bridge import BridgeTransport, Near, Seen
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 
 
@@ -54,6 +57,43 @@ def test_a_command_that_comes_by_both_legs_is_served_once(buses: tuple[MemoryBus
     assert len(served) == 1
     far.put("strands/a/cmd", {**body, "turn_id": "u"})
     assert len(served) == 2
+
+
+def test_a_stop_goes_to_the_broker_without_a_session_that_nobody_there_could_check(
+    buses: tuple[MemoryBus, MemoryBus],
+) -> None:
+    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
+    heard: dict[str, dict[str, Any]] = {}
+    near.declare_subscriber("strands/safety/estop", lambda sample: heard.update(near=json.loads(sample.payload)))
+    far.declare_subscriber("strands/safety/estop", lambda sample: heard.update(far=json.loads(sample.payload)))
+    both.put("strands/safety/estop", {"peer_id": "a", "t": 1.0, "source_zid": both.session_id})
+    assert heard == {
+        "near": {"peer_id": "a", "t": 1.0, "source_zid": both.session_id},
+        "far": {"peer_id": "a", "t": 1.0},
+    }
+
+
+def test_who_is_near_is_heard_on_the_local_leg_alone(buses: tuple[MemoryBus, MemoryBus]) -> None:
+    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
+    heard: list[tuple[str, str | None]] = []
+    both.declare_subscriber("strands/*/presence", lambda sample: heard.append((sample.key, sample.session)))
+    for number, peer in enumerate(["a", "b"]):
+        if number == 0:
+            near.put(f"strands/{peer}/presence", {"x": 1})
+        far.put(f"strands/{peer}/presence", {"x": 1})
+    assert heard == [("strands/a/presence", near.session_id), ("strands/b/presence", far.session_id)]
+
+
+def test_who_is_not_heard_nearby_any_more_is_heard_from_the_broker_again() -> None:
+    clock = Clock()
+    near = Near(clock)
+    near.note("a")
+    assert near.holds("a")
+    clock.pass_(4)
+    assert not near.holds("a")
+    for number in range(2000):
+        near.note(f"p{number}")
+    assert not near.holds("p0")
 
 
 def test_it_is_connected_while_either_leg_is(buses: tuple[MemoryBus, MemoryBus]) -> None:

@@ -28,6 +28,7 @@ CANNOT = {
     ("memory", "confirm"): "only MQTT tells whether anybody has subscribed",
     ("zenoh", "confirm"): "only MQTT tells whether anybody has subscribed",
     ("zenoh-tls", "confirm"): "only MQTT tells whether anybody has subscribed",
+    ("bridge", "confirm"): "its Zenoh leg does not tell whether anybody has subscribed",
 }
 """What a network cannot do by design, and why: a test that needs it is skipped there."""
 
@@ -170,7 +171,10 @@ class OverMqtt(Network):
         self._broker = self.stack.enter_context(MqttBroker(folder, own.ca, own.cert, own.key))
 
     def _join(self, peer_id: str, robot: str) -> Peer:
-        account = {
+        return self._start(peer_id, robot, self._account(peer_id))
+
+    def _account(self, peer_id: str) -> dict[str, str]:
+        return {
             **keys.issue(self._keys, peer_id).settings(),
             "STRANDS_MESH_REQUIRE_SIGNED_IDENTITY": "1",
             "STRANDS_MESH_BACKEND": "iot",
@@ -179,14 +183,31 @@ class OverMqtt(Network):
             "STRANDS_IOT_CERT_DIR": str(self._keys),
             "STRANDS_IOT_CA_FILE": str(self._keys / "ca.pem"),
         }
-        return self._start(peer_id, robot, account)
 
     def _stranger(self, name: str) -> Transport:
         own = keys.issue(self._keys, name)
         return IotMqttTransport(Account("localhost", self._broker.port, name, own.cert, own.key, own.ca))
 
 
-KINDS: dict[str, type[Network]] = {each.kind: each for each in (InMemory, OverZenoh, OverTls, OverMqtt)}
+class OverBoth(OverMqtt):
+    """The bridge: Zenoh with mutual TLS and the broker at once. The stranger is on Zenoh."""
+
+    kind = "bridge"
+
+    def __init__(self, folder: Path, settings: dict[str, str]) -> None:
+        self.port = free_port()
+        super().__init__(folder, {**settings, "STRANDS_MESH_PORT": str(self.port)})
+
+    def _account(self, peer_id: str) -> dict[str, str]:
+        return {**super()._account(peer_id), "STRANDS_MESH_BACKEND": "bridge"}
+
+    def _stranger(self, name: str) -> Transport:
+        issued = keys.issue(self._keys, name)
+        own = Credentials(issued.ca, issued.cert, issued.key)
+        return ZenohTransport(Posture("strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, None, False, 16))
+
+
+KINDS: dict[str, type[Network]] = {each.kind: each for each in (InMemory, OverZenoh, OverTls, OverMqtt, OverBoth)}
 
 
 @contextmanager

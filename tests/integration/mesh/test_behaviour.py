@@ -1,4 +1,4 @@
-"""What a mesh does, the same on every transport: in memory, Zenoh, Zenoh with mutual TLS, an MQTT 5 broker.
+"""What a mesh does, the same on every transport: in memory, Zenoh, Zenoh with mutual TLS, an MQTT 5 broker, both.
 
 Three peers: an operator's console, a simulated world and a real arm. Over Zenoh and MQTT each is a process.
 """
@@ -24,7 +24,15 @@ APPROVED = "execute@arm-1,start@arm-1,teleop_receive@arm-1"
 WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
 
 
-@pytest.fixture(scope="module", params=["memory", "zenoh", "zenoh-tls", pytest.param("mqtt", marks=pytest.mark.system)])
+NETWORKS = [
+    "memory",
+    "zenoh",
+    "zenoh-tls",
+    *(pytest.param(each, marks=pytest.mark.system) for each in ("mqtt", "bridge")),
+]
+
+
+@pytest.fixture(scope="module", params=NETWORKS)
 def net(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
     folder = tmp_path_factory.mktemp("network")
     public = keygen(folder / "operator.pem", PASSPHRASE)
@@ -273,8 +281,10 @@ def test_a_command_is_carried_out_once(net: Network) -> None:
     before, step = sim.ask("steps"), request("repeater", {"action": "step", "steps": 3})
     for _ in range(3):
         mallory.put("strands/sim-1/cmd", step)
-    eventually(lambda: len(found) == 3, within=5)
-    assert sorted(reply.get("error", "") for reply in found) == ["", "replay rejected", "replay rejected"]
+    # The bridge takes a command that comes again for the other leg's copy and does not even answer it.
+    again = [] if net.kind == "bridge" else ["replay rejected", "replay rejected"]
+    eventually(lambda: len(found) == 1 + len(again), within=5)
+    assert sorted(reply.get("error", "") for reply in found) == ["", *again]
     assert sim.ask("steps") == before + 3
 
 

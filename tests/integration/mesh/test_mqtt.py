@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from fixtures.mesh_peer import MeshPeer
 from fixtures.mqtt_broker import PROGRAM, MqttBroker
-from fixtures.waiting import eventually
+from fixtures.waiting import eventually, free_port
 
 from strands_robots.mesh import keys
 from strands_robots.mesh.resume_authority import keygen
@@ -126,6 +126,22 @@ def test_a_late_joiner_locks_on_the_kept_stop_and_not_once_it_was_resumed(join: 
     again = join("sim-2", **trusted)
     again.sees("sim-1")
     assert again.ask("epoch") is None
+
+
+@pytest.mark.system
+def test_a_stop_of_a_bridge_reaches_who_is_on_the_broker_alone_and_the_other_way_round(join: Join) -> None:
+    local = {"STRANDS_MESH_PORT": str(free_port())}
+    bridge = join("bridge", "none", STRANDS_MESH_BACKEND="bridge", **local)
+    near, far = join("sim-1", STRANDS_MESH_BACKEND="zenoh", **local), join("sim-2")
+    bridge.sees("sim-1", "sim-2")
+    far.sees("bridge")
+    bridge.ask("estop")
+    for peer in (near, far):
+        eventually(lambda peer=peer: peer.ask("epoch") == bridge.ask("epoch"), within=3)
+    for peer in (near, far, bridge):
+        peer.ask("clear")
+    far.ask("estop")
+    eventually(lambda: bridge.ask("epoch") == far.ask("epoch"), within=3)
 
 
 @pytest.mark.system

@@ -20,6 +20,11 @@ logger = logging.getLogger(__name__)
 
 SEEN_S = 120.0
 SEEN_MAX = 10_000
+NEAR_S = 3.0
+NEAR_MAX = 1024
+
+
+ALSO_NEAR = frozenset({"presence", "response", "health", "safety_event"})
 
 
 class Seen:
@@ -47,6 +52,29 @@ class Seen:
             return True
 
 
+class Near:
+    """Peers heard of on the local leg lately: what the broker brings of them as well says less and is left out.
+
+    Their heartbeat there names no session, and its signature would count only once.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._at: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    def note(self, peer: str) -> None:
+        with self._lock:
+            self._at.pop(peer, None)
+            self._at[peer] = self._clock()
+            while len(self._at) > NEAR_MAX:
+                del self._at[next(iter(self._at))]
+
+    def holds(self, peer: str) -> bool:
+        at = self._at.get(peer)
+        return at is not None and self._clock() - at <= NEAR_S
+
+
 class _Both:
     def __init__(self, handles: list[Subscription]) -> None:
         self._handles = handles
@@ -68,6 +96,7 @@ class BridgeTransport:
         self._local = local or _zenoh()
         self._cloud = cloud or _iot()
         self._seen = Seen()
+        self._near = Near()
         self._bridged = _bridged_names()
 
     @property
@@ -97,7 +126,11 @@ class BridgeTransport:
         topic = topics.topic_of(key)
         data = payload if isinstance(payload, bytes) else wire.encode(payload, topic.max_bytes)
         legs = [leg for leg in self._legs(topic) if leg.is_alive()]
-        problems = [problem for leg in legs if (problem := _try(leg.put, key, data)) is not None]
+        problems = [
+            problem
+            for leg in legs
+            if (problem := _try(leg.put, key, data if leg is self._local else _sessionless(topic, data))) is not None
+        ]
         if len(problems) == len(legs):
             raise LegError(f"{key}: {'; '.join(problems) or 'no leg of the bridge is connected'}")
 
@@ -109,7 +142,21 @@ class BridgeTransport:
             if not once or self._seen.first(sample.payload):
                 callback(sample)
 
-        handles = [leg.declare_subscriber(key, heard) for leg in self._legs(topic) if leg.is_alive()]
+        def near(sample: Sample) -> None:
+            if topic.name == "presence":
+                self._near.note(_publisher(sample.key))
+            heard(sample)
+
+        def far(sample: Sample) -> None:
+            if topic.name in ALSO_NEAR and self._near.holds(_publisher(sample.key)):
+                return
+            heard(sample)
+
+        handles = [
+            leg.declare_subscriber(key, near if leg is self._local else far)
+            for leg in self._legs(topic)
+            if leg.is_alive()
+        ]
         if not handles:
             raise LegError(f"{key}: no leg of the bridge is connected.")
         return _Both(handles)
@@ -145,6 +192,26 @@ def _bridged_names() -> frozenset[str]:
             f"STRANDS_MESH_BRIDGE_TOPICS must name topics of {', '.join(topics.BY_NAME)}, not {', '.join(unknown)}."
         )
     return frozenset(stated) or frozenset(topic.name for topic in topics.TABLE if topic.bridged)
+
+
+def _publisher(key: str) -> str:
+    """Whose a key is: a reply's is the responder's."""
+    parts = key.split("/")
+    if len(parts) > 3 and parts[2] == "response":
+        return parts[3]
+    return parts[1] if len(parts) > 1 else ""
+
+
+def _sessionless(topic: topics.Topic, data: bytes) -> bytes:
+    """A stop or a resume as it goes to the broker: one that names a session is refused where samples have none."""
+    if topic.name not in ("estop", "resume"):
+        return data
+    try:
+        body = wire.decode(data, topic.max_bytes)
+    except wire.WireError:
+        return data
+    body.pop("source_zid", None)
+    return wire.encode(body, topic.max_bytes)
 
 
 def _mark(payload: bytes) -> bytes | None:
