@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from strands_robots.mesh import topics, wire
@@ -32,14 +34,16 @@ Refusal = dict[str, Any]
 
 @dataclass(slots=True)
 class Turn:
-    """One question under way and the replies that counted."""
+    """One question under way. ``arrived`` gives the replies that count, in turn, and None when the mesh was stopped."""
 
     expected: str
-    done: threading.Event = field(default_factory=threading.Event)
-    over: bool = False
-    replies: list[dict[str, Any]] = field(default_factory=list)
+    arrived: SimpleQueue[dict[str, Any] | None] = field(default_factory=SimpleQueue)
     answered: set[tuple[str | None, str]] = field(default_factory=set)
     via: str = "publish"
+
+    def next(self, seconds: float) -> dict[str, Any] | None:
+        """The next reply. Raises Empty after ``seconds`` without one."""
+        return self.arrived.get(timeout=min(seconds, threading.TIMEOUT_MAX))
 
 
 class Caller:
@@ -61,11 +65,10 @@ class Caller:
             problem = self._publish(topics.command(peer), clean, turn_id, turn, seconds)
             if problem is not None:
                 return refused(problem) | ({"via": turn.via} if problem == OFFLINE else {})
-            if not turn.done.wait(seconds):
-                return {"status": "timeout", "target": peer, "turn_id": turn_id}
-            if not turn.replies:
-                return refused("the mesh was stopped while the reply was awaited.")
-            return turn.replies[0]
+            reply = turn.next(seconds)
+            return reply if reply is not None else refused("the mesh was stopped while the reply was awaited.")
+        except Empty:
+            return {"status": "timeout", "target": peer, "turn_id": turn_id}
         finally:
             self._close(turn_id)
 
@@ -105,9 +108,7 @@ class Caller:
             if problem is not None:
                 logger.warning("broadcast: %s", problem)
                 return []
-            self._collect(turn, turn_id, clean, seconds, missing)
-            with self._lock:
-                return list(turn.replies)
+            return self._collect(turn, turn_id, clean, seconds, missing)
         finally:
             self._close(turn_id)
 
@@ -118,22 +119,23 @@ class Caller:
         command: dict[str, Any],
         seconds: float,
         missing: Callable[[list[dict[str, Any]]], set[str]] | None,
-    ) -> None:
+    ) -> list[dict[str, Any]]:
+        replies: list[dict[str, Any]] = []
         now = time.monotonic()
-        deadline, again = now + seconds, now + REPEAT_S
-        while now < deadline and not turn.over:
-            turn.done.wait(deadline - now if missing is None else min(deadline, again) - now)
-            with self._lock:
-                turn.done.clear()
-                replies = list(turn.replies)
-            absent = missing(replies) if missing is not None else {""}
-            if not absent:
-                return
+        deadline = now + seconds
+        again = now + REPEAT_S if missing is not None else deadline
+        while now < deadline and (missing is None or missing(replies)):
+            with contextlib.suppress(Empty):  # nobody answered in this stretch
+                reply = turn.next(min(deadline, again) - now)
+                if reply is None:
+                    break
+                replies.append(reply)
             now = time.monotonic()
             if missing is not None and now >= again:
                 again = now + REPEAT_S
-                for peer in absent:
+                for peer in missing(replies):
                     self._publish(topics.command(peer), command, turn_id, turn)
+        return replies
 
     def on_response(self, sample: Sample) -> None:
         """A sample on our response topic: counted, or refused and audited."""
@@ -160,8 +162,7 @@ class Caller:
         with self._lock:
             turns = list(self._turns.values())
         for turn in turns:
-            turn.over = True
-            turn.done.set()
+            turn.arrived.put(None)
 
     def _hijacked(self, sample: Sample, reply: wire.Reply, turn: Turn) -> str | None:
         parts = sample.key.split("/")
@@ -183,11 +184,12 @@ class Caller:
         who = (sample.session, reply.responder_id)
         with self._lock:
             duplicate = who in turn.answered
-            if not duplicate and len(turn.replies) < REPLIES_MAX:
+            counts = not duplicate and len(turn.answered) < REPLIES_MAX
+            if counts:
                 turn.answered.add(who)
-                body.pop("sig", None)
-                turn.replies.append(body)
-                turn.done.set()
+        if counts:
+            body.pop("sig", None)
+            turn.arrived.put(body)
         if duplicate:
             self._context.audit("response_duplicate_rejected", reply.responder_id, turn_id=reply.turn_id)
 

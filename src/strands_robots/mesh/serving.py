@@ -27,6 +27,8 @@ REPLAYED = "replay rejected"
 LOCKED = "command rejected"
 DISPATCH = "dispatch error"
 BUSY = "busy"
+PING = {"action": "ping"}
+"""The command of a bare ping: nothing in it needs checking, and its answer is nothing."""
 
 REPLAY_S = wire.FRESH_S + wire.AHEAD_S
 REPLAYS_MAX = 4096
@@ -171,6 +173,9 @@ class Server:
             request = wire.Request.of(body)
         except wire.WireError as exc:
             context.audit("command_rejected", reason=str(exc))
+            return
+        if request.command == PING:
+            self._reply(request, result={})
             return
         action = request.command.get("action") if isinstance(request.command, dict) else None
         if action == "ping":

@@ -135,7 +135,7 @@ class Presence:
         return {key: value for key, value in self.body.items() if key not in known}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost each message a microsecond
 class Request:
     """A command to one peer or to all of them. ``command`` is anything until it is validated."""
 
@@ -160,7 +160,7 @@ class Request:
         return cls(sender, turn, body.get("command"), finite(body.get("timestamp")), body)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost each message a microsecond
 class Reply:
     """What a peer answers in a turn: ``result`` of a response, ``error`` text of an error."""
 

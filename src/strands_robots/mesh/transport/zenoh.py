@@ -25,6 +25,24 @@ OPEN_S = 5.0
 RESCUE_EVERY_S = 0.1
 STEADY_LOOKS = 10
 PUBLISHERS_MAX = 256
+THREADED = frozenset({"response"})
+"""Topics heard on a thread of their subscriber's own, where a message does not cost a new thread state.
+
+Commands are not among them: a motion that waits for a thread could be overtaken by the stop that came after it.
+"""
+
+
+class Handle:
+    """A subscriber that was declared, or will be in a moment."""
+
+    def __init__(self) -> None:
+        self.open = True
+        self.declared: Any = None
+
+    def undeclare(self) -> None:
+        self.open = False  # what still waits for the subscriber's thread is not delivered
+        if self.declared is not None:
+            self.declared.undeclare()
 
 
 class ZenohTransport:
@@ -139,8 +157,10 @@ class ZenohTransport:
             raise TransportError(f"{key}: {exc}") from None
 
     def declare_subscriber(self, key: str, callback: Callback) -> Any:
+        handle, put = Handle(), self._zenoh.SampleKind.PUT if self._zenoh is not None else None
+
         def heard(sample: Any) -> None:
-            if sample.kind != self._zenoh.SampleKind.PUT:
+            if sample.kind != put or not handle.open:
                 return
             source = sample.source_info
             session = str(source.source_id.zid) if source is not None else None
@@ -149,7 +169,11 @@ class ZenohTransport:
             except Exception:
                 logger.exception("A subscriber of %s failed.", key)
 
-        return self._declare(lambda session, direct: session.declare_subscriber(key, direct), heard, key)
+        threaded = topics.topic_of(key).name in THREADED
+        handle.declared = self._declare(
+            lambda session, called: session.declare_subscriber(key, called), heard, key, threaded=threaded
+        )
+        return handle
 
     def declare_token(self, key: str) -> Any:
         session = self._require()
@@ -180,11 +204,12 @@ class ZenohTransport:
             raise TransportError("the Zenoh session is closed.")
         return session
 
-    def _declare(self, declare: Any, heard: Any, key: str) -> Any:
-        # A direct callback runs on Zenoh's own thread; an indirect one would cost a thread for each subscriber.
-        direct = self._zenoh.handlers.Callback(heard, indirect=False)
+    def _declare(self, declare: Any, heard: Any, key: str, *, threaded: bool = False) -> Any:
+        session = self._require()
+        # A direct callback runs on Zenoh's own thread; an indirect one costs a thread for each subscriber.
+        called = self._zenoh.handlers.Callback(heard, indirect=threaded)
         try:
-            return declare(self._require(), direct)
+            return declare(session, called)
         except self.errors() as exc:
             raise TransportError(f"{key}: {exc}") from None
 
