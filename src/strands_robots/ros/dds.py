@@ -156,13 +156,17 @@ class DdsLink:
             "publisher": builtin.BuiltinTopicDcpsPublication,
             "subscription": builtin.BuiltinTopicDcpsSubscription,
         }
+        alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
         found = []
         # Not under the lock, which a command's first message needs.
         participant = self._open()
         for role, source in sources.items():
-            reader = builtin.BuiltinDataReader(participant, source)
-            alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
-            for each in reader.read(N=10_000, condition=core.ReadCondition(reader, alive)):
+            try:
+                reader = builtin.BuiltinDataReader(participant, source)
+                seen = reader.read(N=10_000, condition=core.ReadCondition(reader, alive))
+            except core.DDSException as exc:
+                raise RosError(f"DDS domain {self.domain_id} does not tell its endpoints: {exc}") from exc
+            for each in seen:
                 if each.sample_info.valid_data and each.topic_name.startswith("rt/"):
                     kind = each.type_name.replace("::msg::dds_::", "/msg/").removesuffix("_")
                     found.append({"topic": each.topic_name[2:], "type": kind, "role": role})
