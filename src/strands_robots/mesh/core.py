@@ -270,7 +270,8 @@ class Mesh(SensorLoopsMixin):
         Raises:
             RuntimeError: this peer is not on the mesh.
         """
-        if not self.alive:
+        # A link that is down for the moment keeps nobody from stopping here, and the fleet hears of it later.
+        if self._context.transport is None:
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
         return self._assembled.safety.emergency_stop()
 

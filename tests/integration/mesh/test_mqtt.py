@@ -155,6 +155,24 @@ def test_peers_meet_again_when_the_broker_comes_back(join: Join, broker: MqttBro
 
 
 @pytest.mark.system
+def test_a_stop_while_the_broker_is_away_stops_here_and_everybody_when_it_is_back(
+    join: Join, broker: MqttBroker
+) -> None:
+    sim, arm = join("sim-1"), join("arm-1", "arm")
+    arm.sees("sim-1")
+    for peer in (sim, arm):
+        peer.ask("start", "wave")
+    broker.stop()
+    eventually(lambda: arm.ask("alive") is False, within=5, what="the broker is missed")
+    assert arm.ask("estop")[1][0]["result"]["ok"] is True
+    assert arm.ask("moving") is False
+    assert sim.ask("moving") == ["left"]
+    broker.start()
+    eventually(lambda: sim.ask("epoch") == arm.ask("epoch"), within=25)
+    eventually(lambda: sim.ask("moving") == [], within=2)
+
+
+@pytest.mark.system
 def test_a_certificate_of_another_authority_gets_no_connection(
     broker: MqttBroker, tmp_path: Path, folder: Path
 ) -> None:
