@@ -56,6 +56,7 @@ class RclpyLink:
         self._match_s = number("match_s", match_s, low=0, high=60)
         self._lock = threading.RLock()
         self._session: Session | None = None
+        self._opened_at = 0.0
         self._made: dict[tuple[str, str, str], Any] = {}
         self._goals: WeakSet[Goal] = WeakSet()
 
@@ -204,6 +205,7 @@ class RclpyLink:
         with self._lock:
             if self._session is None:
                 self._session = Session(self.name, self.domain_id)
+                self._opened_at = time.monotonic()
             return self._session
 
     def _publisher(self, topic: str, kind: str) -> Any:
@@ -238,9 +240,10 @@ class RclpyLink:
         return found[0]
 
     def _looked(self) -> Any:
-        """Our node, which has had ``match_s`` to be told of the graph where it joined just now."""
+        """Our node, which has had ``match_s`` since it joined to be told of the graph."""
         node = self._open().node
-        self._comes(lambda: len(node.get_node_names_and_namespaces()) > 1, self._match_s)
+        left = self._opened_at + self._match_s - time.monotonic()
+        self._comes(lambda: len(node.get_node_names_and_namespaces()) > 1, left)
         return node
 
     def _comes(self, true: Callable[[], bool], within_s: float, given_up: GivenUp = never) -> bool:
