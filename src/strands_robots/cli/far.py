@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.cli.mesh import joined
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.envelope import is_error, text_of
-from strands_robots.policies.actions import SpeedLimit, checked_action, numbers
+from strands_robots.policies.actions import numbers
 from strands_robots.policies.base import Ranges
-from strands_robots.teleop import UNBOUNDED_PER_S, LeaderPolicy
+from strands_robots.teleop import LeaderPolicy
 from strands_robots.utils import ValidationError, number
 
 if TYPE_CHECKING:
@@ -25,11 +25,10 @@ MESH = "mesh:"
 
 LEADER = "leader"
 
-_FOUND_S, _ANSWER_S, _OPEN_S = 3.0, 5.0, 3.0
+FOUND_S, _ANSWER_S, _OPEN_S = 3.0, 5.0, 3.0
 _LOOK_S = 0.05
 _ASK_EVERY_S = 0.25
-_SILENT_S = 2.0
-_PAUSE_MAX_S = 0.04
+SILENT_S = 2.0
 _HALTED = "it was halted or locked"
 _REASONS = {
     "rejected_lockout": _HALTED,
@@ -128,7 +127,7 @@ def lead_far(
 
     rate, speed = number("hz", hz, low=1, high=1000), number("max_speed", max_speed, above=0, high=20)
     with joined(None, f"lead-{secrets.token_hex(4)}", "tool") as mesh:
-        if not wait_for_peer(mesh, peer, _FOUND_S):
+        if not wait_for_peer(mesh, peer, FOUND_S):
             raise Failure(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
         far = FarBody(mesh, peer)
         with led(far) as source:
@@ -154,86 +153,8 @@ def lead_far(
     screen.say(f"{why} {row['frames']} frames sent, {row['errors']} of the leader's unusable.", "green")
 
 
-class Glide:
-    """Puts the frames of a stream into a robot no faster than a bound, from where it stands: no jump at the start.
-
-    Args:
-        body: has ``bounds`` and ``get_joints``.
-        max_speed: whole joint ranges a second.
-        now: monotonic seconds.
-    """
-
-    def __init__(self, body: Any, max_speed: float, now: Callable[[], float] = time.monotonic) -> None:
-        self._bounds: Ranges = dict(body.bounds)
-        self._limit = SpeedLimit(self._bounds, number("max_speed", max_speed, above=0, high=20), UNBOUNDED_PER_S)
-        self._last = {key: value for key, value in body.get_joints().items() if key in self._bounds}
-        self._now = now
-        self._at = now()
-
-    def __call__(self, robot: Any, action: dict[str, float]) -> Any:
-        """Apply one frame; what the robot answers. Raises :class:`ValidationError` for a key it has not."""
-        target = checked_action(action, self._bounds)
-        now = self._now()
-        # A pause may not be saved up for a jump.
-        passed, self._at = min(now - self._at, _PAUSE_MAX_S), now
-        self._last |= self._limit.limit(target, self._last, passed)
-        return robot.send_action({key: self._last[key] for key in target})
-
-
-def follow_far(
-    screen: Screen, peer: str, robot: Any, wait: Wait, *, seconds: float | None, max_speed: float
-) -> tuple[str, dict[str, Any]]:
-    """Let a leader that another peer publishes drive a robot of this machine: why it ended, and the counters.
-
-    Args:
-        screen: where it is told.
-        peer: who publishes; its device is called ``leader``.
-        robot: joined to the mesh.
-        wait: as of :func:`lead_far`.
-        seconds: end after so many.
-        max_speed: whole joint ranges a second that the robot may cross.
-
-    Raises:
-        Failure: the mesh is off, nobody of that name is on it, or the robot may not move.
-    """
-    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when something is led
-    from strands_robots.mesh.input import InputReceiver  # noqa: PLC0415 - as above
-
-    if robot.mesh is None or not robot.mesh.alive:
-        raise Failure("The mesh has no session, or STRANDS_MESH switches it off.")
-    if not wait_for_peer(robot.mesh, peer, _FOUND_S):
-        raise Failure(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
-    receiver = InputReceiver(robot.mesh, robot, peer, LEADER, Glide(robot.body(), max_speed))
-    receiver.start()
-    if receiver.start_refusal is not None:
-        raise Failure(f"{peer} cannot lead: {receiver.start_refusal}.")
-    try:
-        leads(screen, f"{peer}/{LEADER}", robot.tool_name_str, receiver)
-        return wait(_heard(peer, receiver, seconds), 0.0), receiver.stats
-    finally:
-        receiver.stop()
-
-
-def _heard(peer: str, receiver: Any, seconds: float | None) -> Callable[[], str]:
-    """Says why following is over, empty while it is not."""
-    began = heard = time.monotonic()
-    frames = 0
-
-    def over() -> str:
-        nonlocal heard, frames
-        now, stats = time.monotonic(), receiver.stats
-        if stats["frames_received"] != frames:
-            frames, heard = stats["frames_received"], now
-        if not stats["running"]:
-            return f"The robot follows no more: {_reason(stats)}."
-        if now - heard > _SILENT_S:
-            return f"{peer} has been silent for {_SILENT_S:g} s."
-        return f"{seconds:g} s are over." if seconds is not None and now - began >= seconds else ""
-
-    return over
-
-
-def _reason(stats: Mapping[str, Any]) -> str:
+def reason_of(stats: Mapping[str, Any]) -> str:
+    """Why a stream that has ended did, from the follower's counters."""
     return next((text for name, text in _REASONS.items() if stats.get(name)), _HALTED)
 
 
@@ -271,12 +192,12 @@ def _end(
         try:
             streams = far.ask("teleop_status").get("streams") or []
         except Failure as silent:
-            return f"{far.peer} is out of reach: {silent.reason}" if now - heard > _SILENT_S else ""
+            return f"{far.peer} is out of reach: {silent.reason}" if now - heard > SILENT_S else ""
         heard = time.monotonic()
         told.update(next((each for each in streams if each.get("source") == leader), {"running": False}))
         if told.get("running"):
             return ""
-        return f"{far.peer} follows no more: {_reason(told)}"
+        return f"{far.peer} follows no more: {reason_of(told)}"
 
     return over
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.far import MESH, follow_far, known_to, lead_far, leads
+from strands_robots.cli.far import MESH, known_to, lead_far, leads
 from strands_robots.cli.output import Failure, Screen, table
+from strands_robots.cli.published import NOBODY, NoBody, follow_far, publish_far
 from strands_robots.cli.recorded import recorded
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety.stopping import StopVerdict
@@ -45,7 +46,7 @@ def teleop(
         typer.Argument(help="keyboard, gamepad, a recording (.csv, .parquet, .mcap), or TYPE@PORT of a leader arm."),
     ],
     follower: Annotated[
-        str, typer.Argument(help="TYPE@PORT of a real arm, a model in simulation, or mesh:PEER elsewhere.")
+        str, typer.Argument(help="TYPE@PORT of a real arm, a model in simulation, mesh:PEER, or none to --publish.")
     ],
     leader_id: Annotated[str | None, typer.Option("--leader-id", help="Whose calibration the leader has.")] = None,
     follower_id: Annotated[str | None, typer.Option("--id", help="Whose calibration the follower has.")] = None,
@@ -111,6 +112,13 @@ def drive(
         peer = identifier("follower", follower.removeprefix(MESH))
         waits = partial(_until, screen)
         lead_far(screen, leader, peer, led, waits, method=method, seconds=seconds, hz=hz, max_speed=max_speed)
+        return
+    if follower == NOBODY:
+        if publish is None or record is not None:
+            raise ValidationError(f"the follower {NOBODY} goes with --publish PEER, and has nothing to --record.")
+        peer, waits = identifier("--publish", publish), partial(_until, screen)
+        with led(NoBody()) as source:
+            publish_far(screen, leader, peer, source, waits, method=method, seconds=seconds, hz=hz)
         return
     place = {} if publish is None else {"peer_id": identifier("--publish", publish), "mesh": True}
     robot = _made(follower, options, **place)

@@ -125,3 +125,14 @@ def test_a_leader_that_is_published_drives_a_robot_of_this_machine(replay: Any, 
     assert told["stopped"] is True
     assert told["frames_received"] > 10
     assert (told["errors"], told["rejected"]) == (0, 0)
+
+
+def test_a_leader_is_published_alone_where_nobody_follows_here(replay: Any, wave: Path) -> None:
+    line = [*COMMAND, "teleop", str(wave), "none", "--for", "0.5", "--json"]
+    done = subprocess.run([*line, "--publish", "lead-1"], stdout=subprocess.PIPE, text=True, check=True, timeout=30)
+    told = json.loads(done.stdout)
+    assert told["frames"] > 10
+    assert told["errors"] == 0
+    refused = subprocess.run(line, stdout=subprocess.PIPE, text=True, check=False, timeout=30)
+    assert refused.returncode == 2
+    assert "--publish" in json.loads(refused.stdout)["reason"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fixtures.devices import RecordingDevice
 
-from strands_robots.cli.far import Glide
+from strands_robots.cli.published import Glide
 from strands_robots.hardware import HardwareRobot
 from strands_robots.utils import ValidationError
 
