@@ -10,7 +10,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from strands_robots import settings
@@ -110,8 +111,7 @@ class Motions:
 
     def stream(self, target: Target, name: str) -> Target:
         """Send one frame now; a longer way is cut to what one frame may do. Returns what was sent."""
-        with self._turn:
-            motion = self._begin(name)
+        with self._taken(name) as motion:
             start = self.present()
             steps = target.step_from(start)
             sent = start.toward(target, 1 / steps) if steps > 1 else target
@@ -122,8 +122,7 @@ class Motions:
 
     def go(self, target: Target, name: str) -> bool:
         """Go there: at once when one frame may, else by a ramp whose first frame is sent now. True for a ramp."""
-        with self._turn:
-            motion = self._begin(name)
+        with self._taken(name) as motion:
             start = self.present()
             far = target.step_from(start) > 1
             self._play(motion, ramp(start, target) if far else iter((target,)))
@@ -131,8 +130,7 @@ class Motions:
 
     def gesture(self, frames: Gesture, name: str) -> None:
         """Play frames at 50 Hz; the first one is sent now."""
-        with self._turn:
-            motion = self._begin(name)
+        with self._taken(name) as motion:
             self._play(motion, frames(self.present()))
 
     def daemon_move(self, name: str, path: str, *, reached: Reached, before: Callable[[], None] | None = None) -> str:
@@ -140,8 +138,7 @@ class Motions:
 
         ``before`` runs once the turn is ours and earlier motions are stopped. Raises :class:`DaemonError`.
         """
-        with self._turn:
-            motion = self._begin(name, of_daemon=True, limp=before is not None)
+        with self._taken(name, of_daemon=True, limp=before is not None) as motion:
             updates = None
             try:
                 updates = MoveUpdates(self._connection.host, self._connection.port)
@@ -172,11 +169,11 @@ class Motions:
 
     def torque(self, change: Callable[[], None], name: str) -> None:
         """Run ``change``, a write of the motors' torque, in its turn; what moves is stopped first."""
-        with self._turn:
-            motion = self._begin(name, limp=True)
+        with self._taken(name, limp=True) as motion:
             try:
-                motion.still_permitted()
-                change()
+                with self._write:  # so that a halt waits for it as for a frame
+                    motion.still_permitted()
+                    change()
             except Exception as exc:
                 self._end(motion, "error", str(exc))
                 raise
@@ -206,22 +203,25 @@ class Motions:
         motion = self._current
         return (motion is not None and motion.running) or bool(self._moves.running(time.monotonic() + 1.0))
 
-    def _begin(self, name: str, *, of_daemon: bool = False, limp: bool = False) -> Motion:
-        """The next motion, once nothing else of this robot moves. The turn is held."""
+    @contextmanager
+    def _taken(self, name: str, *, of_daemon: bool = False, limp: bool = False) -> Iterator[Motion]:
+        """The turn, with a new motion once nothing else moves. Leave comes first: a stop is newer than what waits."""
         permit = self._gate.permit(name)
-        refusal = self._connection.refusal()
-        if refusal is not None:
-            raise MotionRefused(error(f"{name} refused: {refusal}.", connected=self._connection.alive))
-        if not limp and self._connection.motor_mode == "disabled":
-            raise MotionRefused(error(f"{name} refused: the motors are disabled; wakeUp or enableMotors comes first."))
-        self._replace(name)
-        motion = self._current = Motion(name, permit, of_daemon)
-        try:
-            self._ready(motion)
-        except (MotionRefused, DaemonUnreachable) as exc:
-            self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
-            raise
-        return motion
+        with self._turn:
+            permit.check()
+            refusal = self._connection.refusal()
+            if refusal is not None:
+                raise MotionRefused(error(f"{name} refused: {refusal}.", connected=self._connection.alive))
+            if not limp and self._connection.motor_mode == "disabled":
+                raise MotionRefused(error(f"{name} refused: the motors are disabled; first wakeUp or enableMotors."))
+            self._replace(name)
+            motion = self._current = Motion(name, permit, of_daemon)
+            try:
+                self._ready(motion)
+            except (MotionRefused, DaemonUnreachable) as exc:
+                self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
+                raise
+            yield motion
 
     def _ready(self, motion: Motion) -> None:
         """What a new connection has to be told before its first motion."""
