@@ -38,6 +38,7 @@ def drive(world: Any, bridge: RosTelemetryBase, controller: DdsLink, to: float) 
     unwatch = controller.watch("/arm/joint_states", JOINT_STATE, told.append)
 
     def heard() -> bool:
+        # A bridge of a real robot does this by itself after bridge.start(20.0).
         joints = world.get_observation("arm")
         bridge.publish_joint_states("arm", list(joints), list(joints.values()))
         return bool(told)

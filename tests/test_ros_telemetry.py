@@ -3,11 +3,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+import pytest
+from fixtures.waiting import eventually
 from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots.envelope import Envelope, success
+from strands_robots.ros.link import MemoryLink
 from strands_robots.ros_telemetry import RosTelemetryBase
+from strands_robots.utils import ValidationError
 
 NAMES = st.lists(st.sampled_from(["a.pos", "b.pos", "c.pos"]), max_size=4)
 NUMBERS = st.one_of(
@@ -22,10 +27,36 @@ class Arm:
 
     def __init__(self) -> None:
         self.taken: list[dict[str, float]] = []
+        self.state: dict[str, Any] = {"joints": {"a.pos": 0.5}}
+
+    def get_state(self) -> Envelope:
+        return success("", **self.state)
+
+    def camera_frames(self) -> dict[str, Any]:
+        return {"front": np.zeros((2, 2, 3), np.uint8)}
 
     def send_action(self, action: dict[str, float]) -> Envelope:
         self.taken.append(action)
         return success("taken")
+
+
+class Bridge(RosTelemetryBase):
+    """A bridge to a graph in memory."""
+
+    def __init__(self, arm: Arm | None) -> None:
+        super().__init__(
+            arm,
+            domain_id=0,
+            enable_commands=False,
+            command_robot_name=None,
+            period=0.02,
+            period_name="period",
+        )
+        self.link = MemoryLink()
+        self._begin(self.link, "commands")
+
+    def told(self) -> list[str]:
+        return [topic for topic, _ in self.link.sent]
 
 
 def bridge(arm: Arm) -> RosTelemetryBase:
@@ -60,3 +91,37 @@ def test_what_a_robot_or_a_camera_is_called_becomes_one_word_of_a_topic() -> Non
     assert RosTelemetryBase.image_topic("1st", "front left") == "/_1st/front_left/image_raw"
     assert RosTelemetryBase.joint_states_topic("---") == "/robot/joint_states"
     assert bridge(Arm()).command_topic == "/arm/joint_command"
+
+
+def test_a_robots_joints_and_cameras_are_told_once_or_at_a_rate() -> None:
+    telling = Bridge(Arm())
+    telling.publish(["front"])
+    assert telling.told() == ["/arm/joint_states", "/arm/front/image_raw"]
+    assert telling.link.sent[0][1]["position"] == [0.5]
+    try:
+        telling.start(100.0)
+        eventually(lambda: len(telling.told()) > 5)
+        with pytest.raises(ValidationError, match="called before"):
+            telling.start()
+    finally:
+        telling.shutdown()
+    told = len(telling.told())
+    telling.publish_joint_states("arm", ["a.pos"], [0.5])
+    assert len(telling.told()) == told
+
+
+def test_joints_that_could_not_be_read_are_not_told() -> None:
+    arm = Arm()
+    arm.state["joints_error"] = "the bus is silent"
+    telling = Bridge(arm)
+    telling.publish()
+    assert telling.told() == []
+    telling.shutdown()
+
+
+def test_what_cannot_be_told_is_refused_before_a_thread_begins() -> None:
+    for options, named in (({"rate_hz": 0}, "rate_hz"), ({"cameras": ["rear"]}, "cameras must be among front")):
+        with pytest.raises(ValidationError, match=named):
+            Bridge(Arm()).start(**options)
+    with pytest.raises(ValidationError, match="robot must be given"):
+        Bridge(None).start()

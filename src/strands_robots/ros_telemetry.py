@@ -26,6 +26,8 @@ INSECURE = "STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 IMAGE = "sensor_msgs/msg/Image"
 
+RATE_MAX_HZ = 200.0
+
 Limits = dict[str, tuple[float, float]]
 
 
@@ -125,6 +127,44 @@ class RosTelemetryBase:
         self._done = threading.Event()
         self._thread: threading.Thread | None = None
         self._link: TelemetryLink | None = None
+        self._teller: threading.Thread | None = None
+
+    def publish(self, cameras: Sequence[str] = ()) -> None:
+        """Tell the robot's joints once, and the newest picture of each of these cameras of it.
+
+        Joints that could not be read are not told: nobody can see that a message of now holds the past.
+
+        Raises:
+            ValidationError: the bridge has no robot, or the robot no such camera.
+        """
+        if self._robot is None:
+            raise ValidationError("robot must be given to publish all of it at once, not None.")
+        name, state = self._robot.tool_name_str, self._robot.get_state()
+        joints = state.get("joints") or {}
+        if state.get("joints_error"):
+            logger.warning("The joints of %s are not published: %s", name, state["joints_error"])
+        elif joints:
+            self.publish_joint_states(name, list(joints), list(joints.values()))
+        frames = self._robot.camera_frames() if cameras else {}
+        for camera in cameras:
+            if camera not in frames:
+                raise ValidationError(f"cameras must be among {', '.join(frames) or 'none'}, not {shown(camera)}.")
+            self.publish_image(name, camera, frames[camera])
+
+    def start(self, rate_hz: float = 20.0, cameras: Sequence[str] = ()) -> None:
+        """:meth:`publish` at ``rate_hz``, above 0 and at most 200, on a thread, until :meth:`shutdown`.
+
+        Raises:
+            ValidationError: a rate outside its domain, nothing to publish, or started already.
+        """
+        period_s = 1 / number("rate_hz", rate_hz, above=0, high=RATE_MAX_HZ)
+        names = [text("cameras", each) for each in cameras]
+        if self._teller is not None:
+            raise ValidationError("start was called before; shutdown ends it.")
+        self.publish(names)
+        name = "ros-telemetry"
+        self._teller = threading.Thread(target=self._publish_on, args=(period_s, names), name=name, daemon=True)
+        self._teller.start()
 
     def publish_joint_states(self, robot: str, names: list[str], positions: list[float]) -> None:
         """Publish joint positions in the robot's own unit; lists of different length are dropped with a warning."""
@@ -151,10 +191,11 @@ class RosTelemetryBase:
         self._tell(self.image_topic(robot, camera), IMAGE, fields)
 
     def shutdown(self) -> None:
-        """Take no more commands and leave the graph. A second call does nothing."""
+        """Take no more commands, publish no more and leave the graph. A second call does nothing."""
         self._done.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(2.0)
+        for thread in (self._thread, self._teller):
+            if thread is not None and thread is not threading.current_thread():
+                thread.join(2.0)
         link, self._link = self._link, None
         if link is not None:
             link.close()
@@ -217,6 +258,15 @@ class RosTelemetryBase:
             logger.warning("Nothing is published on %s: the bridge was shut down.", topic)
         else:
             link.tell(topic, kind, fields)
+
+    def _publish_on(self, period_s: float, cameras: list[str]) -> None:
+        due = time.monotonic() + period_s
+        while not self._done.wait(max(0.0, due - time.monotonic())):
+            due = max(due + period_s, time.monotonic())
+            try:
+                self.publish(cameras)
+            except Exception as exc:  # noqa: BLE001 - whatever a device raises, the next sample is tried
+                logger.warning("%s was not told to the graph: %s", type(self).__name__, exc)
 
     def _keep(self, command: Message) -> None:
         self._latest.append(command)

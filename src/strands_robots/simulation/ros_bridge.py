@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-import threading
-import time
 from collections.abc import Sequence
 from typing import Any
 
-from strands_robots.ros.link import RosError
 from strands_robots.ros_telemetry import RosTelemetryBridge
-from strands_robots.utils import ValidationError, number, text
-
-logger = logging.getLogger(__name__)
-
-RATE_MAX_HZ = 200.0
+from strands_robots.utils import ValidationError
 
 
 class SimRosBridge(RosTelemetryBridge):
     """Publishes; a simulation takes no commands from a graph, it is driven by its own verbs.
 
     ``publish_joint_states`` and ``publish_image`` are those of a real robot's bridge. With a simulation,
-    :meth:`publish` tells all its robots at once, and :meth:`start` does so at a rate.
+    :meth:`publish` tells all its robots at once, and ``start`` does so at a rate.
 
     Args:
         simulation: the world whose robots are told; None to publish by hand.
@@ -41,8 +33,6 @@ class SimRosBridge(RosTelemetryBridge):
     ) -> None:
         super().__init__(domain_id=domain_id, node_name=node_name, qos_depth=qos_depth)
         self._simulation = simulation
-        self._ended = threading.Event()
-        self._teller: threading.Thread | None = None
 
     def publish(self, cameras: Sequence[str] = (), *, width: int = 320, height: int = 240) -> None:
         """Tell the joints of every robot (rad, or m for a sliding joint) and one picture of each of these cameras.
@@ -50,7 +40,9 @@ class SimRosBridge(RosTelemetryBridge):
         Raises:
             ValidationError: no simulation, or no such camera.
         """
-        world = self._world()
+        world = self._simulation
+        if world is None:
+            raise ValidationError("simulation must be given to publish all of it at once, not None.")
         for name in world.list_robots():
             # A joint's key is its own name; what else a robot observes, such as its base's pose, is no joint.
             joints = world.get_features()["robots"][name]["joints"]
@@ -60,38 +52,3 @@ class SimRosBridge(RosTelemetryBridge):
         for camera in cameras:
             picture, _ = world.picture(camera, width, height)
             self.publish_image(world.tool_name_str, camera, picture)
-
-    def start(self, rate_hz: float = 20.0, cameras: Sequence[str] = ()) -> None:
-        """:meth:`publish` at ``rate_hz``, above 0 and at most 200, on a thread, until :meth:`shutdown`.
-
-        Raises:
-            ValidationError: a rate outside its domain, no simulation, or started already.
-        """
-        period_s = 1 / number("rate_hz", rate_hz, above=0, high=RATE_MAX_HZ)
-        names = [text("cameras", each) for each in cameras]
-        self._world()
-        if self._teller is not None:
-            raise ValidationError("start was called before; shutdown ends it.")
-        self._teller = threading.Thread(target=self._tell_on, args=(period_s, names), name="sim-ros", daemon=True)
-        self._teller.start()
-
-    def shutdown(self) -> None:
-        """Publish no more and take the node off the graph. A second call does nothing."""
-        self._ended.set()
-        if self._teller is not None and self._teller is not threading.current_thread():
-            self._teller.join(2.0)
-        super().shutdown()
-
-    def _world(self) -> Any:
-        if self._simulation is None:
-            raise ValidationError("simulation must be given to publish all of it at once, not None.")
-        return self._simulation
-
-    def _tell_on(self, period_s: float, cameras: list[str]) -> None:
-        due = time.monotonic()
-        while not self._ended.wait(max(0.0, due - time.monotonic())):
-            due = max(due + period_s, time.monotonic())
-            try:
-                self.publish(cameras)
-            except (RosError, ValidationError) as exc:
-                logger.warning("The simulation was not told to the graph: %s", exc)
