@@ -27,6 +27,7 @@ PARTS = {
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",
     "recording": "Recording where robots are served",
+    "ros": "Robots on ROS graphs",
     "arm": "A real arm (in the environment of `make real-arm`)",
 }
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from typing import Any
 
 from strands_robots import settings
@@ -71,6 +72,7 @@ COMMAND_KINDS = {
 _YES = frozenset({"y", "yes", "a", "approve", "approved", "true"})
 
 
+@lru_cache(maxsize=256)
 def surface_of(name: str, kind: str | None = None) -> str | None:
     """The command surface that a graph name or its type stands for, or None: it moves nothing that we know of."""
     for word in reversed(name.lower().strip("/").split("/")):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 from strands_robots.utils import ValidationError, shown
 
@@ -32,6 +33,7 @@ def interface(name: str, value: object) -> str:
     return value
 
 
+@lru_cache(maxsize=256)
 def bare_kind(kind: str) -> str:
     """``pkg/Name`` of either spelling, so that types can be compared."""
     found = _KIND.match(kind)

@@ -33,7 +33,7 @@ BYTE_FIELDS = {
 def encoded(op: str, **fields: Any) -> str:
     """One frame. Raises :class:`RosError` for what JSON cannot carry, NaN and infinities among it."""
     try:
-        return json.dumps({"op": op, **fields}, allow_nan=False, default=_plain)
+        return _encoder.encode({"op": op, **fields})
     except (TypeError, ValueError, RecursionError) as exc:
         raise RosError(f"{op} cannot be sent as JSON: {exc}") from exc
 
@@ -103,3 +103,6 @@ def _plain(value: Any) -> Any:
     if callable(listed):
         return listed()
     raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+_encoder = json.JSONEncoder(allow_nan=False, default=_plain)

@@ -5,16 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from strands_robots.drivers.ros.wire import VelocityWire
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import Permit, PermitVoidError
 
 
-@dataclass(frozen=True, slots=True)
-class Order:
+class Order(NamedTuple):
     """A checked drive: velocities as sent (m/s, rad/s), the message that carries them, how often and how fast."""
 
     linear: float
