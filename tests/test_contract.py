@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.contract import AdaptedRobot, TaskRobot, adapt
+from strands_robots.contract import AdaptedRobot, TaskRobot, adapt, put_away
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.stopping import StopVerdict
@@ -129,3 +129,20 @@ def test_a_halt_while_a_foreign_robot_starts_stops_it_again() -> None:
     assert answer["status"] == "error"
     assert "halted while it started, and was stopped again" in answer["reason"]
     assert foreign.calls[-1] == "stop"
+
+
+def test_two_wrappers_of_one_robot_share_its_gate_so_that_a_stop_on_one_network_voids_the_other() -> None:
+    foreign = Foreign()
+    one, two = AdaptedRobot(foreign), AdaptedRobot(foreign)
+    permit = two.gate.permit("start_task")
+    one.halt("stop")
+    assert not permit.valid
+    assert AdaptedRobot(Foreign()).gate is not one.gate
+
+
+def test_a_robot_that_is_put_away_begins_nothing_until_it_is_taken_back() -> None:
+    foreign = Foreign()
+    free = put_away(foreign)
+    assert "taken off its network" in AdaptedRobot(foreign).start_task("wave")["reason"]
+    free()
+    assert AdaptedRobot(foreign).gate.permit("start_task").valid

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.safety.gate import MotionGate, MotionRefused
@@ -140,14 +141,42 @@ def adapt(robot: Any) -> TaskRobot:
     return AdaptedRobot(robot)
 
 
+class _PutAway:
+    def refusal(self, verb: str) -> Envelope:
+        return error(f"{verb} is refused: the robot is being taken off its network.")
+
+
+def put_away(robot: Any) -> Callable[[], None]:
+    """Let nothing begin on ``robot`` from now on, over whatever network; what is returned takes that back.
+
+    For whoever halts a robot and then leaves its network: a motion asked for in between would outlive the process.
+    """
+    gate, latch = _gate_of(robot), _PutAway()
+    gate.attach(latch)
+    return lambda: gate.detach(latch)
+
+
+_gates: WeakKeyDictionary[Any, MotionGate] = WeakKeyDictionary()
+
+
+def _gate_of(robot: Any) -> MotionGate:
+    """The robot's own gate, else one for it: the same however often it is wrapped, so that a stop voids all roads."""
+    own = getattr(robot, "gate", None)
+    if isinstance(own, MotionGate):
+        return own
+    try:
+        return _gates.setdefault(robot, MotionGate())
+    except TypeError:  # it cannot be a key; each wrapper has a gate, and every emergency stop knows them all
+        return MotionGate()
+
+
 class AdaptedRobot:
     """A foreign robot behind the contract: gated, haltable, with its own optional verbs used where it has them."""
 
     def __init__(self, robot: Any) -> None:
         self.wrapped = robot
         self.tool_name_str: str = str(getattr(robot, "tool_name_str", "") or "robot")
-        gate = getattr(robot, "gate", None)
-        self.gate: MotionGate = gate if isinstance(gate, MotionGate) else MotionGate()
+        self.gate = _gate_of(robot)
 
     def start_task(
         self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.contract import adapt
+from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, choice, device_id, identifier, missing_extra, shown
@@ -126,6 +126,7 @@ def run(
         try:
             asked.wait()
         finally:
+            free = put_away(getattr(body, "robot", body))
             verdict = body.halt("run ended")
             told = text_of(verdict.envelope())
             if verdict.stopped is True:
@@ -133,6 +134,7 @@ def run(
             else:
                 logger.critical("%s", told)
             device_connect.stop_device_connect(runtime)
+            free()
     return verdict
 
 

@@ -83,3 +83,28 @@ def test_the_stop_of_one_robot_reaches_its_start_that_stands_in_line(peers: Flee
     assert answers["left"]["result"]["status"] == "error"
     assert "halted after it was asked for" in answers["left"]["result"]["reason"]
     assert list(world.running) == ["right"]
+
+
+def test_a_frame_that_waits_for_the_bus_is_refused_after_a_stop(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
+    refused: list[bool] = []
+
+    class Late(Hanging):
+        def send_action(self, action: dict[str, float]) -> Envelope:
+            super().send_action(action)
+            refused.append(self.gate.refusal("send_action") is not None)
+            return success("asked")
+
+    arm = Late()
+    peers.join(arm, "arm-1")
+    console, leader = peers.join(None, "console"), peers.join(None, "lead")
+    console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=5)
+    frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1}
+    leader.publish("strands/lead/input/leader", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+    assert arm.inside.wait(5)
+    asking = threading.Thread(target=lambda: console.send("arm-1", {"action": "stop"}, timeout=8))
+    asking.start()
+    eventually(lambda: arm.halts, within=2)
+    arm.let_go.set()
+    asking.join(8)
+    eventually(lambda: refused == [True], within=2)

@@ -6,6 +6,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
@@ -245,7 +246,9 @@ class InputReceiver:
             self._counts["lockout"] += 1
             return
         try:
-            answer = self._apply(self._robot, action)
+            # A frame that waits for the bus is as old as its stream: a halt since then refuses it there.
+            with nullcontext() if permit is None else permit.inside():
+                answer = self._apply(self._robot, action)
         except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the frame counts as not applied
             answer = {"status": "error", "reason": f"{type(exc).__name__}: {exc}"}
         self._counts["received"] += 1

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import count
 from typing import Protocol
 
@@ -80,6 +80,10 @@ class Permit:
         """For a motion that had to wait for its turn. Raises :class:`MotionRefused` when this permit is void."""
         if not self.valid:
             raise MotionRefused(error(_LATE.format(self.verb)))
+
+    def inside(self) -> AbstractContextManager[None]:
+        """For this thread: what is begun inside is part of this motion, and refused once it was halted."""
+        return self._gate.asked_at(self._asked)
 
     def withdraw(self) -> None:
         """Void this permit alone: one motion stops, the robot stays free."""

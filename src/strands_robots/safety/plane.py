@@ -168,7 +168,7 @@ class SafetyPlane:
             self._inherit(entry)
             if not self._robots:
                 self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
-                self._reporter = Reporter(self._tick)
+                self._reporter = Reporter(self._tick, self._look)
             self._robots = {**self._robots, robot_id: entry}
         if entry.locked:
             entry.come_up_locked()
@@ -218,6 +218,10 @@ class SafetyPlane:
                     gate.revoke()
                 fresh.append(entry)
         reporter = self._reporter
+        if reporter is None:
+            # The last robot is leaving; nobody reports it any more, and it is halted all the same.
+            for entry in fresh:
+                entry.worker.halt(order.reason, lambda verdict: None)
         if not fresh or reporter is None:
             self._repeat(order, robots, on_report)
             return None
@@ -356,6 +360,8 @@ class SafetyPlane:
             names = ", ".join(silent) or "no safety controller was ever heard"
             reason = f"check-in lost: {names}, {self.checkin.timeout_s:g} s"
             self.begin(StopOrder(new_epoch(), "check-in", reason, road="check-in"))
+
+    def _look(self) -> None:
         if any(entry.locked for entry in self._robots.values()):
             self._desk.look()
 

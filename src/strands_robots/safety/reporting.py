@@ -74,14 +74,23 @@ class Reporter:
 
     Args:
         tick: called about every ``tick_s`` seconds on the reporting thread, for what is due by time alone.
+        chore: called about every ``chore_s`` seconds on the thread that writes, for what touches the disk.
     """
 
-    def __init__(self, tick: Callable[[], None] = lambda: None, tick_s: float = 0.1) -> None:
+    def __init__(
+        self,
+        tick: Callable[[], None] = lambda: None,
+        chore: Callable[[], None] = lambda: None,
+        *,
+        tick_s: float = 0.1,
+        chore_s: float = 0.3,
+    ) -> None:
         self._inbox: queue.SimpleQueue[StopRun | _Answer | _Kept | None] = queue.SimpleQueue()
         self._files: queue.SimpleQueue[StopRun | None] = queue.SimpleQueue()
         self._runs: list[StopRun] = []
         self._tick = tick
         self._tick_s = tick_s
+        self._chore, self._chore_s = chore, chore_s
         self._threads = [
             threading.Thread(target=self._run, name="safety-report", daemon=True),
             threading.Thread(target=self._write, name="safety-keep", daemon=True),
@@ -201,7 +210,14 @@ class Reporter:
         _call(run.on_done, run)
 
     def _write(self) -> None:
-        while (run := self._files.get()) is not None:
+        while True:
+            try:
+                run = self._files.get(timeout=self._chore_s)
+            except queue.Empty:
+                _call(self._chore)
+                continue
+            if run is None:
+                return
             try:
                 run.keep()
             except Exception:
