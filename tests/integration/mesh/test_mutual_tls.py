@@ -129,7 +129,7 @@ def test_the_fleet_of_the_guide_works_with_rules_and_stated_endpoints(join: Join
     # A robot commands nobody, but its emergency stop is everybody's.
     two.ask("estop")
     eventually(lambda: one.ask("epoch") == console.ask("epoch") == two.ask("epoch"), within=3)
-    assert one.ask("moving") == []
+    eventually(lambda: one.ask("moving") == [], within=2, what="it stands still")
     two.kill()
     eventually(lambda: "sim-2" not in console.ask("reachable"), within=2)
     eventually(lambda: "sim-2" not in one.ask("reachable"), within=2)
