@@ -6,9 +6,11 @@ Every name is loaded when it is first used, so that the package imports with no 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # importing typing would be most of this import's time
 if TYPE_CHECKING:
+    from typing import Any
+
     from strands_robots.hardware import HardwareRobot
     from strands_robots.robot import Robot, run
     from strands_robots.simulation import Simulation

@@ -5,9 +5,10 @@ Every name is loaded when it is first used, so the package imports with no extra
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # importing typing would be most of this import's time
 if TYPE_CHECKING:
+    from typing import Any
+
     from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh, mesh_disabled_by_env
 
 __all__ = ["Mesh", "get_local_robots", "init_mesh", "mesh_disabled_by_env"]
