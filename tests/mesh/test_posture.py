@@ -159,3 +159,14 @@ def test_every_topic_has_a_size_and_only_telemetry_is_thinned_out() -> None:
         assert topic.max_bytes > 0
         if topic.name in ("cmd", "broadcast", "response", "estop", "resume", "input"):
             assert topic.ceiling_hz is None
+
+
+def test_stated_endpoints_route_for_others_and_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
+    config = zenoh_config.explicit(posture.from_settings())
+    assert config["mode"] == "router"
+    assert config["connect"]["exit_on_failure"] is False
+    assert config["connect"]["timeout_ms"] == -1
+    assert config["connect"]["retry"] == {"period_init_ms": 1000, "period_max_ms": 8000, "period_increase_factor": 2}
+    for scout in ("gossip", "multicast"):
+        assert config["scouting"][scout]["autoconnect"]["router"] == ["router", "peer"]

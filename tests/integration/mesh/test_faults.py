@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import psutil
+import pytest
+import zenoh
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import accepts, eventually
 from tests.integration.mesh.conftest import Join
@@ -129,3 +133,27 @@ def test_stated_endpoints_connect_in_any_order_and_outlive_the_listener(join: Jo
     one.ask("start", "wave")
     assert {each["responder_id"] for each in two.ask("estop")[1]} == {"console", "sim-1", "sim-2"}
     eventually(lambda: one.ask("moving") == [], within=2, what="it stands still")
+
+
+@pytest.mark.parametrize("mode", ["peer", "client", "router"])
+def test_a_bare_session_of_any_mode_takes_part_through_the_listener(join: Join, port: int, mode: str) -> None:
+    endpoint = f"tcp/127.0.0.1:{port}"
+    console = join("console", "none", ZENOH_LISTEN=endpoint)
+    sim = join("sim-1", ZENOH_CONNECT=endpoint)
+    config: dict[str, Any] = {"mode": mode, "namespace": "strands", "connect": {"endpoints": [endpoint]}}
+    config["scouting"] = {"multicast": {"enabled": False}}
+    if mode != "client":
+        config["listen"] = {"endpoints": ["tcp/127.0.0.1:0"]}
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as bare:
+        heard: list[str] = []
+        bare.declare_subscriber("strands/*/presence", lambda sample: heard.append(str(sample.key_expr)))
+        eventually(lambda: {"strands/console/presence", "strands/sim-1/presence"} <= set(heard), within=5)
+
+        def seen() -> bool:
+            heartbeat = {"robot_id": "bare", "robot_type": "robot", "timestamp": time.time()}
+            source = zenoh.SourceInfo(bare.id, 0)
+            bare.put("strands/bare/presence", json.dumps(heartbeat).encode(), source_info=source)
+            return all("bare" in peer.ask("reachable") for peer in (console, sim))
+
+        eventually(seen, within=5)
+        assert sim.ask("zid", "bare") == console.ask("zid", "bare") == str(bare.id.zid)

@@ -43,11 +43,13 @@ def explicit(posture: Posture, session: str | None = None) -> dict[str, Any]:
     """A session with the endpoints the operator stated; a listener must bind, a connection may come later.
 
     It is a router, because of two peers that are connected to a third, Zenoh lets neither hear the other. Like a peer
-    it connects to those that gossip tells of. Measured on 1.10 with peers, clients and routers on either side.
+    it connects to those that gossip tells of, or multicast where that is on. Measured on 1.10 with peers, clients and
+    routers on either side.
     """
     found = _base(posture, session)
     found["mode"] = "router"
-    found["scouting"]["gossip"]["autoconnect"] = {role: ["router", "peer"] for role in ("router", "peer")}
+    for scout in found["scouting"].values():
+        scout["autoconnect"] = {role: ["router", "peer"] for role in ("router", "peer")}
     found["listen"] = {"endpoints": list(posture.listen), "exit_on_failure": True}
     backing_off = {**_RETRY, "period_init_ms": 1000, "period_max_ms": 8000, "period_increase_factor": 2}
     found["connect"] = {
