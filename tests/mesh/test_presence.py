@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from typing import Any
 
 import pytest
@@ -9,8 +11,14 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Clock, Fleet
 
+from strands_robots.mesh import presence, topics
+from strands_robots.mesh.context import Context
 from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
+from strands_robots.mesh.presence import Herald
+from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
+from strands_robots.mesh.wire_identity import Identity
 
 
 def heartbeat(peers: Fleet, peer: str, **fields: Any) -> dict[str, Any]:
@@ -144,3 +152,61 @@ def test_subscriptions_deliver_objects_and_end_with_the_stay(peers: Fleet) -> No
     assert one.inbox == {}
     one.start()
     assert one.alive
+
+
+class Linked(MemoryTransport):
+    """A session that depends on a hub, which a test takes away and gives back."""
+
+    lost_link_at = -math.inf
+    up = True
+
+    def anchored(self) -> bool:
+        return self.up
+
+
+def watched(bus: MemoryBus) -> tuple[Linked, Herald, PeerRegistry]:
+    """A watcher on such a session that knows arm-1 of session ``aa``."""
+    transport, registry = Linked(bus), PeerRegistry()
+    transport.connect()
+    registry.update("arm-1", "robot", "host", {}, session="aa")
+    context = Context("console", registry, Recorder("console"), Identity(), transport=transport)
+    herald = Herald(context, "robot", dict)
+    herald.start()
+    return transport, herald, registry
+
+
+def reachable(registry: PeerRegistry) -> bool:
+    return bool(registry.all()[0]["reachable"])
+
+
+def test_a_token_that_went_with_our_own_link_says_nothing_until_the_link_is_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(presence, "RETURN_S", 0.2)
+    transport, herald, registry = watched(MemoryBus())
+    key = topics.token("arm-1", "aa")
+    transport.up, transport.lost_link_at = False, time.monotonic()
+    herald.on_token(key, there=False)
+    herald.judge_tokens()
+    transport.up = True
+    herald.judge_tokens()
+    assert reachable(registry)
+    herald.on_token(key, there=True)
+    time.sleep(0.25)
+    herald.judge_tokens()
+    assert reachable(registry)
+    herald.stop()
+
+
+def test_who_does_not_come_back_with_the_link_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(presence, "RETURN_S", 0.05)
+    transport, herald, registry = watched(MemoryBus())
+    transport.lost_link_at = time.monotonic()
+    herald.on_token(topics.token("arm-1", "aa"), there=False)
+    herald.judge_tokens()
+    assert reachable(registry)
+    time.sleep(0.06)
+    herald.judge_tokens()
+    assert not reachable(registry)
+    assert registry.conflicts("arm-1", "bb") is None
+    herald.stop()

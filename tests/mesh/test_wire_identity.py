@@ -16,6 +16,7 @@ from fixtures.mesh_robots import Arm, World
 from tests.mesh.peers import Clock, Fleet
 
 from strands_robots.mesh import keys
+from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
 
 BODY = {"robot_id": "arm-1", "timestamp": 1.5, "nested": {"b": [1, "é"], "a": None}}
@@ -162,3 +163,27 @@ def test_in_signed_mode_an_unsigned_peer_is_listed_but_bound_to_nothing(peers: F
     assert console.ping("plain", timeout=0.2)["status"] == "timeout"
     assert peers.events("presence_unverified")
     assert peers.events("response_hijack_rejected")
+
+
+def test_an_unsigned_heartbeat_does_not_rewrite_a_certified_living_peer(peers: Fleet, folder: Path) -> None:
+    roots, clock = (folder / "ca.pem").read_bytes(), peers.clock
+
+    def identity(name: str) -> Identity:
+        return Identity(signer(folder, name, clock), Verifier(roots, clock, clock), required=True)
+
+    console = peers.join(None, "arm-1", identity=identity("arm-1"), sessionless=True)
+    arm = peers.join(World("left"), "arm-2", "sim", identity=identity("arm-2"), sessionless=True)
+    thief = MemoryTransport(peers.bus, sessionless=True)
+    thief.connect()
+    heartbeat = {"robot_id": "arm-2", "robot_type": "impostor", "timestamp": clock()}
+    for topic in ("arm-2", "thief"):
+        thief.put(f"strands/{topic}/presence", heartbeat)
+    assert console.peers_by_id["arm-2"]["type"] == "sim"
+    assert console.peer_cert("arm-2") is not None
+    assert peers.events("presence_identity_conflict")
+    assert peers.events("presence_rejected")[0]["reason"] == "the topic and the body disagree"
+    arm.stop()
+    clock.pass_(10.5)
+    thief.put("strands/arm-2/presence", {**heartbeat, "timestamp": clock()})
+    assert console.peers_by_id["arm-2"]["type"] == "impostor"
+    assert console.peer_cert("arm-2") is None
