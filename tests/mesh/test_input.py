@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -159,6 +160,24 @@ def test_a_null_action_an_old_frame_and_a_burst_move_nothing(stream: Stream) -> 
         stream.leader.put("strands/lead/input/leader", stream.frame(seq=number))
     eventually(lambda: stream.stat("rate_dropped")() >= 70, within=2)
     assert len(stream.arm.actions) <= 25
+
+
+def test_frames_that_waited_for_a_slow_bus_are_no_flood(stream: Stream) -> None:
+    free = threading.Event()
+    taken: list[dict[str, float]] = []
+
+    def slow(body: Any, action: dict[str, float]) -> None:
+        free.wait(5)
+        taken.append(action)
+
+    receiver = InputReceiver(stream.follower, stream.arm, "lead", apply_fn=slow)
+    stream.receiver.stop()
+    receiver.start()
+    for _ in range(25):
+        stream.send()
+    free.set()
+    eventually(lambda: len(taken) == 25, within=2)
+    assert receiver.stop()["rate_dropped"] == 0
 
 
 def test_a_joint_commanded_too_fast_is_refused(stream: Stream) -> None:

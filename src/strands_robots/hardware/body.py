@@ -127,13 +127,13 @@ class DeviceBody:
             self._latest = (began, numbers(observation))
             return observation
 
-    def get_joints(self) -> dict[str, float]:
+    def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
         """The joints now. An answer that is lost is asked for again, unless a stop waits for the bus.
 
         Raises what the device raises.
         """
         with self.lock:
-            return self._joints(READ_TRIES)
+            return self._joints(tries)
 
     def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
         with self.lock:

@@ -13,7 +13,7 @@ from typing import Any, cast
 from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.hardware.body import STOP_LEVELS, DeviceBody, StopLevel
+from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
 from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks, ended
 from strands_robots.policies.actions import checked_action
@@ -190,7 +190,8 @@ class HardwareRobot(Tasks):
         if not self._body.lock.acquire(timeout=within_s):
             return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
         try:
-            self._body.get_joints()
+            # Whoever drives it waits meanwhile: for one lost answer, not for three.
+            self._body.get_joints(1 if self._body.driven else READ_TRIES)
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
             problem = f"The joints could not be read: {type(exc).__name__}: {exc}"
             if problem != self._unread:

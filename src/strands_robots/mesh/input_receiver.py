@@ -126,7 +126,8 @@ class InputReceiver:
             # Not queued, so that a stranger's flood displaces none of the leader's frames.
             self._counts["source"] += 1
             return
-        lane.submit(lambda: self._take(sample))
+        heard = time.monotonic()
+        lane.submit(lambda: self._take(sample, heard))
 
     def _open(self) -> str | None:
         session = self._mesh.peer_wire_zid(self._source)
@@ -160,7 +161,7 @@ class InputReceiver:
             if self._lane is not None:
                 self._lane.close()
 
-    def _take(self, sample: Sample) -> None:
+    def _take(self, sample: Sample, heard: float) -> None:
         if not self._running:
             return
         permit = self._permit
@@ -178,11 +179,11 @@ class InputReceiver:
         except wire.WireError:
             self._counts["invalid"] += 1
             return
-        action = self._checked(frame)
+        action = self._checked(frame, heard)
         if action is not None:
             self._do(action)
 
-    def _checked(self, frame: Mapping[str, Any]) -> dict[str, float] | None:
+    def _checked(self, frame: Mapping[str, Any], heard: float) -> dict[str, float] | None:
         """The action of a frame that passed every guard, in the wire's order; else None, counted."""
         stamp = wire.finite(frame.get("t"))
         if stamp is None or not wire.fresh(stamp, self._mesh.now()):
@@ -201,9 +202,10 @@ class InputReceiver:
         now = time.monotonic()
         cap = settings.number("STRANDS_MESH_INPUT_MAX_HZ")
         if cap > 0:
-            # A few frames may come together where a link or a scheduler held them up; a flood may not.
-            self._tokens = min(BURST, self._tokens + (now - self._refilled) * cap)
-            self._refilled = now
+            # A few frames may come together where a link or a scheduler held them up; a flood may not. Counted as they
+            # arrive: those that waited here for a slow bus were none.
+            self._tokens = min(BURST, self._tokens + (heard - self._refilled) * cap)
+            self._refilled = heard
             if self._tokens < 1.0:
                 self._counts["rate_dropped"] += 1
                 return None
