@@ -54,3 +54,10 @@ def test_with_json_only_json_reaches_stdout(capsys: pytest.CaptureFixture[str]) 
     screen.fail(Failure("no", Exit.SILENT, who="arm"))
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert lines == [{"a": "\x1b"}, {"status": "error", "reason": "no", "exit": 3, "who": "arm"}]
+
+
+def test_what_is_to_be_pasted_is_never_broken_at_the_width_of_the_terminal() -> None:
+    sink = io.StringIO()
+    line = f"export NAME={'x' * 100}"
+    Screen(console=Console(file=sink, width=40)).copyable(line)
+    assert sink.getvalue() == line + "\n"

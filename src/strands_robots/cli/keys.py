@@ -53,4 +53,4 @@ def _make(screen: Screen, file: Path, passphrase_file: Path | None, setting: str
         raise Failure(f"{file} was not written: {exc}") from exc
     screen.data({"status": "success", "file": str(file), setting: public})
     screen.say(f"The key is {file}. Keep it and its passphrase to yourself; on each robot's machine set:", "green")
-    screen.say(f"export {setting}={public}")
+    screen.copyable(f"export {setting}={public}")

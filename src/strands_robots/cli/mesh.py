@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shlex
 import signal
 import time
 from collections.abc import Iterator
@@ -58,7 +59,7 @@ def issue(
     made = _made(lambda: keys.issue(folder.resolve(), peer_id, hosts or []))
     screen.data({"status": "success", **made.settings()})
     for name, value in made.settings().items():
-        screen.say(f"export {name}={value}")
+        screen.copyable(f"export {name}={shlex.quote(str(value))}")
 
 
 def acl(
@@ -77,7 +78,7 @@ def acl(
     rules = _made(lambda: keys.acl(robots or [], operators or [], relays))
     file.write_text(rules, encoding="utf-8")
     screen.data({"status": "success", "STRANDS_MESH_ACL_FILE": str(file.resolve())})
-    screen.say(f"export STRANDS_MESH_ACL_FILE={file.resolve()}")
+    screen.copyable(f"export STRANDS_MESH_ACL_FILE={shlex.quote(str(file.resolve()))}")
 
 
 def serve_on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> None:

@@ -75,6 +75,11 @@ class Screen:
         if not self.machine:
             self.out.print(label(text, style))
 
+    def copyable(self, text: str) -> None:
+        """One line for people to paste elsewhere: never broken at the width of the terminal."""
+        if not self.machine:
+            self.out.print(label(text), soft_wrap=True)
+
     def show(self, thing: RenderableType) -> None:
         """A table or panel for people."""
         if not self.machine:
