@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -130,6 +131,9 @@ def _serve(screen: Screen, network: Network, link: LinkConfig, body: Any, *, wan
             raise Failure(f"The robot is not on the network: {exc}") from exc
         try:
             _announce(screen, str(runtime.device_id), link, driver, network)
+            # What importing left behind stays: looking through it again would hold a control loop up for 10 ms or more.
+            gc.collect()
+            gc.freeze()
             heard = _wait(asked, piped)
         finally:
             still = _halt(screen, body)
@@ -199,11 +203,13 @@ def _first(description: str) -> str:
 
 def _halt(screen: Screen, body: Any) -> bool:
     """Stop the robot and say so; True when it is known to stand still."""
+    from strands_robots.contract import adapt, put_away  # noqa: PLC0415 - loaded when it is used
+
     screen.say("Stopping the robot...")
+    # The device is still on the network: what is asked for after this halt would outlive the process.
+    put_away(getattr(body, "robot", body))
     halt = getattr(body, "halt", None)
     if not callable(halt):
-        from strands_robots.contract import adapt  # noqa: PLC0415 - foreign robots only
-
         halt = adapt(body).halt
     told = halt("the operator ended serve").envelope()
     screen.data({"event": "stopped", **{key: told[key] for key in ("status", "stopped", "halted") if key in told}})
