@@ -113,6 +113,22 @@ def test_a_stop_needs_no_handshake_and_inside_one_ends_it() -> None:
     robot.disconnect()
 
 
+def test_a_stop_while_the_operator_is_asked_arms_nothing() -> None:
+    """Asking takes as long as the operator takes; the handshake is part of the drive that was stopped meanwhile."""
+    robot = car(command_gate=CommandGate(lambda _: (), lambda: False))
+
+    class Operator:
+        def interrupt(self, name: str, reason: Any = None) -> bool:
+            if "manual_drive" in name:
+                robot.halt("while they think")
+            return True
+
+    assert "halted after it was asked for" in robot.drive(0.5, tool_context=Operator())["reason"]
+    assert robot.link.called == []  # type: ignore[attr-defined]
+    assert {m["throttle"] for m in sent(robot)} == {0.0}
+    robot.disconnect()
+
+
 def test_its_drive_tool_tells_the_turning_radius_and_it_has_no_pose() -> None:
     robot = car()
     assert robot.min_radius_m == pytest.approx(0.164 / math.tan(0.5236))

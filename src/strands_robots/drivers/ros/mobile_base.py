@@ -280,7 +280,9 @@ class MobileBaseRobot:
         try:
             permit = self.gate.permit("drive")
             refusal = self.command_gate.refusal(self._topic, self._kind, "drive", tool_context)
-            refusal = refusal or self.handshake(tool_context)
+            # Asking may take minutes: a stop meanwhile ends the handshake too, which would arm the vehicle.
+            with permit.inside():
+                refusal = refusal or self.handshake(tool_context)
             if refusal is not None:
                 return refusal
             self._watch_odometry()
