@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.cli.mesh import joined
+from strands_robots.cli.mesh import joined, own_id
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.envelope import is_error, text_of
 from strands_robots.policies.actions import numbers
@@ -126,7 +125,7 @@ def lead_far(
     from strands_robots.mesh.input import InputPublisher  # noqa: PLC0415
 
     rate, speed = number("hz", hz, low=1, high=1000), number("max_speed", max_speed, above=0, high=20)
-    with joined(None, f"lead-{secrets.token_hex(4)}", "tool") as mesh:
+    with joined(None, own_id("lead"), "tool") as mesh:
         if not wait_for_peer(mesh, peer, FOUND_S):
             raise Failure(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
         far = FarBody(mesh, peer)
@@ -167,7 +166,7 @@ def _open(far: FarBody, leader: str) -> None:
         except Failure as refused:
             if "announced" not in refused.reason or time.monotonic() > deadline:
                 raise
-            time.sleep(_LOOK_S)
+            time.sleep(_ASK_EVERY_S)
         else:
             return
 

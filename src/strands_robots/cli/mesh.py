@@ -103,7 +103,7 @@ def serve_on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> 
 
 def peers_on_mesh(screen: Screen, timeout: float) -> None:
     """List the peers that announce themselves within ``timeout`` seconds."""
-    with joined(None, f"console-{secrets.token_hex(4)}", "tool") as mesh:
+    with joined(None, own_id("console"), "tool") as mesh:
         time.sleep(timeout)
         rows = [row for row in mesh.peers if row["reachable"]]
     if not rows:
@@ -111,6 +111,20 @@ def peers_on_mesh(screen: Screen, timeout: float) -> None:
     screen.data({"status": "success", "peers": rows})
     cells = ((r["peer_id"], r["type"], r["hostname"], r.get("task_status", ""), f"{r['age']:.1f} s") for r in rows)
     screen.show(table("", ("peer", "type", "host", "status", "heard"), cells))
+
+
+def own_id(word: str) -> str:
+    """An id for a command's stay on the mesh, which the certificate speaks for where there is one."""
+    from strands_robots.mesh.transport.base import TransportError  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport.posture import credentials_from_settings  # noqa: PLC0415 - as above
+    from strands_robots.mesh.wire_identity import IdentityError, Signer  # noqa: PLC0415
+
+    own = f"{word}-{secrets.token_hex(4)}"
+    try:
+        files = credentials_from_settings()
+        return own if files is None else f"{Signer(files.cert, files.key).common_name}__{own}"
+    except (TransportError, IdentityError) as exc:
+        raise Failure(str(exc), Exit.USAGE) from exc
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import secrets
 import time
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import typer
 
 from strands_robots.cli.command import command
 from strands_robots.cli.fleet import reached
-from strands_robots.cli.mesh import joined
+from strands_robots.cli.mesh import joined, own_id
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.cli.recorded import lossless, told
@@ -51,7 +50,7 @@ def record(
     recorder = Recorder(out)
     with contextlib.ExitStack() as stack:
         if on_mesh:
-            mesh = stack.enter_context(joined(None, f"record-{secrets.token_hex(4)}", "tool"))
+            mesh = stack.enter_context(joined(None, own_id("record"), "tool"))
         else:
             fleet = stack.enter_context(reached(network))
         stack.enter_context(recorder)

@@ -15,6 +15,7 @@ import typer
 
 from strands_robots.cli.command import command
 from strands_robots.cli.far import MESH, known_to, lead_far, leads
+from strands_robots.cli.mesh import own_id
 from strands_robots.cli.output import Failure, Screen, table
 from strands_robots.cli.published import NOBODY, NoBody, follow_far, publish_far
 from strands_robots.cli.recorded import recorded
@@ -157,7 +158,7 @@ def _follow(
     record: Path | None,
 ) -> None:
     """Let a leader that a peer of the mesh publishes drive a follower of this machine."""
-    robot = _made(follower, options, mesh=True)
+    robot = _made(follower, options, mesh=True, peer_id=own_id("follow"))
     try:
         with recorded(screen, robot, robot.tool_name_str, record):
             why, stats = follow_far(screen, peer, robot, partial(_until, screen), seconds=seconds, max_speed=max_speed)

@@ -128,7 +128,9 @@ def acl(
     ]
     subjects, policies = [], []
     for peer in everybody:
-        own = [f"{prefix}/{peer}/**", f"{prefix}/*/response/{peer}/**"]
+        # A certificate speaks for its name, and for what its owner calls NAME__something.
+        names = (peer, f"{peer}__$*")
+        own = [key for name in names for key in (f"{prefix}/{name}/**", f"{prefix}/*/response/{name}/**")]
         rules.append(_rule(f"own-{peer}", ["put", "delete", "liveliness_token"], ["ingress"], own))
         subjects.append({"id": peer, "cert_common_names": [peer]})
         granted = ["hear", "be-told", "safety", f"own-{peer}"]

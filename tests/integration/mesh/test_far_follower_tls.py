@@ -1,0 +1,63 @@
+"""A follower is led by an operator whose certificate speaks for the command, under rules that deny everything else."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+from fixtures.waiting import free_port
+
+from strands_robots.leaders import write_csv
+from strands_robots.mesh import keys
+
+pytest.importorskip("cryptography")
+
+COMMAND = [sys.executable, "-m", "strands_robots.cli"]
+
+
+@pytest.fixture
+def side(tmp_path: Path) -> Callable[..., Mapping[str, str]]:
+    """The settings of one side, with its own certificate and the rules of both."""
+    keys.init(tmp_path / "keys")
+
+    def made(peer: str, relay: str, **more: str) -> Mapping[str, str]:
+        rules = tmp_path / "rules.json5"
+        rules.write_text(keys.acl(["arm-1"], ["console"], [relay]), encoding="utf-8")
+        state = tmp_path / peer
+        state.mkdir(mode=0o700)
+        issued = keys.issue(tmp_path / "keys", peer, ["127.0.0.1"]).settings()
+        own = {"STRANDS_STATE_DIR": str(state), "STRANDS_MESH_ACL_FILE": str(rules)}
+        return {**os.environ, **own, **{name: str(value) for name, value in issued.items()}, **more}
+
+    return made
+
+
+@pytest.mark.parametrize("hub", ["console", "arm-1"])
+def test_an_operator_leads_a_certified_peer(hub: str, side: Callable[..., Mapping[str, str]], tmp_path: Path) -> None:
+    write_csv(tmp_path / "pan.csv", [(0.1 * step, {"shoulder_pan": 0.01 * step}) for step in range(6)])
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    way = {True: {"ZENOH_LISTEN": endpoint}, False: {"ZENOH_CONNECT": endpoint}}
+    serving = subprocess.Popen(
+        [*COMMAND, "serve", "so100", "--mesh", "--peer-id", "arm-1", "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=side("arm-1", hub, **way[hub == "arm-1"]),
+    )
+    try:
+        assert serving.stdout is not None
+        assert json.loads(serving.stdout.readline())["peer_id"] == "arm-1"
+        line = [*COMMAND, "replay", str(tmp_path / "pan.csv"), "--to", "mesh:arm-1", "--json"]
+        environment = side("console", hub, **way[hub == "console"])
+        done = subprocess.run(line, stdout=subprocess.PIPE, text=True, env=environment, check=False, timeout=40)
+    finally:
+        serving.kill()
+        serving.communicate()
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert done.returncode == 0, told
+    assert told["stopped"] is True
+    assert told["frames"] > 10
