@@ -11,8 +11,9 @@ from fixtures.bodies import RecordingBody, ScriptedPolicy, StepClock
 from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
-from strands_robots.rollout import Clock, Observers, Rollout
+from strands_robots.rollout import Clock, Observers, Rollout, loop_options
 from strands_robots.safety.gate import MotionGate
+from strands_robots.utils import ValidationError
 
 
 def rollout(body: RecordingBody, policy: Any, gate: MotionGate | None = None, **more: Any) -> Rollout:
@@ -40,6 +41,26 @@ def test_a_rollout_ends_when_its_duration_is_over() -> None:
     assert (one.state, one.step_count) == ("completed", 10)
     assert one.elapsed_s == pytest.approx(1.0)
     assert body.holds == 1
+
+
+def test_a_rollout_ends_after_the_steps_it_was_asked_for() -> None:
+    one, body = run(ScriptedPolicy([], always={"a": 0.5}), duration=9.0, steps=3)
+    assert (one.state, one.step_count, len(body.writes), body.holds) == ("completed", 3, 3, 1)
+
+
+def test_the_rate_and_the_steps_are_taken_from_the_options_of_a_policy() -> None:
+    options = {"control_frequency": 20, "n_steps": 7, "policy_port": 5000}
+    assert loop_options(options, 50.0) == (20.0, 7)
+    assert options == {"policy_port": 5000}
+    assert loop_options({}, 50.0) == (50.0, None)
+
+
+@pytest.mark.parametrize(
+    "option", [{"control_frequency": 50.1}, {"control_frequency": 0}, {"n_steps": 0}, {"n_steps": 2.0}]
+)
+def test_a_rate_above_the_robots_own_and_steps_that_are_none_are_refused(option: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(option))):
+        loop_options(option, 50.0)
 
 
 def test_ticks_are_at_absolute_times_and_missed_ones_are_dropped() -> None:

@@ -20,14 +20,32 @@ from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
 from strands_robots.policies.actions import checked_action, numbers
 from strands_robots.policies.base import Action, Policy, PolicyError, Ranges
 from strands_robots.safety.gate import Permit, PermitVoidError
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, number, whole
 
 logger = logging.getLogger(__name__)
 
 State = Literal["idle", "running", "completed", "stopped", "error"]
 
+STEPS_MAX = 10_000_000
+"""Most actions a rollout can be asked for."""
+
 STOP_JOIN_S = 2.0
 """How long :meth:`Rollout.stop` waits for the loop by default."""
+
+
+def loop_options(options: dict[str, Any], hz: float) -> tuple[float, int | None]:
+    """Take from a policy's ``options`` what is the loop's own: its rate in Hz and how many actions end it.
+
+    Args:
+        options: ``control_frequency``, 0.1 to ``hz``, and ``n_steps``, 1 to 10,000,000; each is taken out, where it is.
+        hz: the robot's own rate.
+
+    Raises:
+        ValidationError: a value outside its domain.
+    """
+    rate = number("control_frequency", options.pop("control_frequency", hz), low=min(0.1, hz), high=hz)
+    steps = options.pop("n_steps", None)
+    return rate, None if steps is None else whole("n_steps", steps, low=1, high=STEPS_MAX)
 
 
 class Body(Protocol):
@@ -117,6 +135,7 @@ class Rollout:
         instruction: what the policy is told.
         policy_name: how the policy is called in events and answers.
         duration: seconds, or None for no end.
+        steps: actions, or None for no end.
         hz: control rate. Ticks are at absolute times; one that is missed is dropped, never made up in a burst.
         observers: who is told of events.
         clock: the time the loop keeps.
@@ -131,6 +150,7 @@ class Rollout:
         instruction: str = "",
         policy_name: str = "policy",
         duration: float | None = None,
+        steps: int | None = None,
         hz: float = 50.0,
         observers: Observers | None = None,
         clock: Clock | None = None,
@@ -138,6 +158,7 @@ class Rollout:
         self.instruction = instruction
         self.policy_name = policy_name
         self.duration = duration
+        self._steps = steps
         self.state: State = "idle"
         self.error = ""
         self.step_count = 0
@@ -248,6 +269,8 @@ class Rollout:
         while self._permit.valid:
             # A duration begins with the first tick: loading a policy is not part of it.
             if self.duration is not None and self._clock.now() - started >= self.duration:
+                return "completed"
+            if self._steps is not None and self.step_count >= self._steps:
                 return "completed"
             observation = self._observe()
             if not chunk:

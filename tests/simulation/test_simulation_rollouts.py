@@ -105,6 +105,14 @@ def test_run_policy_waits_and_reports(world: Simulation) -> None:
     assert answer["step"] >= 5
 
 
+def test_a_rollout_is_given_its_rate_and_its_steps_by_the_caller(world: Simulation) -> None:
+    answer = world.run_policy("left", "wave", duration=5.0, control_frequency=25, n_steps=4)
+    assert (answer["state"], answer["step"]) == ("completed", 4)
+    refused = world.start_policy("left", "wave", control_frequency=1000)
+    assert refused["status"] == "error"
+    assert "control_frequency" in refused["reason"]
+
+
 def test_reads_are_quick_during_a_rollout(world: Simulation) -> None:
     world.start_policy("left", "wave")
     reads = 0

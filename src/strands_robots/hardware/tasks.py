@@ -13,7 +13,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import DeviceBody
 from strands_robots.hardware.freezer import Freezer, NoAnswerError
 from strands_robots.policies.registry import create_policy, resolve_provider
-from strands_robots.rollout import Observers, Rollout
+from strands_robots.rollout import Observers, Rollout, loop_options
 from strands_robots.safety.gate import MotionGate, MotionRefused, Waiting
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
@@ -69,7 +69,8 @@ class Tasks(TeleopMixin):
             policy_provider: a registered policy, such as mock, remote or lerobot_local.
             duration: seconds, above 0 up to a day.
             policy_port: port of the policy's server; 0 for the provider's own.
-            policy: what that policy's constructor takes besides.
+            policy: what that policy's constructor takes besides, ``control_frequency`` (Hz, at most the robot's rate)
+                and ``n_steps`` (actions after which it ends).
         """
         task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
         if isinstance(task, dict):
@@ -141,6 +142,7 @@ class Tasks(TeleopMixin):
         seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
         whole("policy_port", options["policy_port"], low=0, high=65535)
         name = resolve_provider(provider)
+        hz, steps = loop_options(options, self.control_hz)
         # Before the line for the robot: a stop that comes while this waits, connects or loads is newer.
         permit = self.gate.permit("start_task")
         with self._waiting.until_begun(permit), self.starting:
@@ -159,7 +161,8 @@ class Tasks(TeleopMixin):
                 instruction=task,
                 policy_name=name,
                 duration=seconds,
-                hz=self.control_hz,
+                steps=steps,
+                hz=hz,
                 observers=self.observers,
             )
             self._task = rollout

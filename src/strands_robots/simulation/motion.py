@@ -12,7 +12,7 @@ from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.registry import create_policy
-from strands_robots.rollout import STOP_JOIN_S, Observers, Rollout
+from strands_robots.rollout import STOP_JOIN_S, Observers, Rollout, loop_options
 from strands_robots.safety.gate import Waiting
 from strands_robots.simulation.arguments import answered
 from strands_robots.simulation.body import RobotBody
@@ -59,7 +59,8 @@ class Rollouts(Pictures, TeleopMixin):
             instruction: what it shall do, 1 to 2000 characters.
             policy_provider: a registered policy, such as mock.
             duration: seconds, above 0 up to a day.
-            policy: what that policy's constructor takes.
+            policy: what that policy's constructor takes; besides, ``control_frequency`` (Hz, at most the robot's rate)
+                and ``n_steps`` (actions after which it ends).
         """
         rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
         return success(
@@ -127,6 +128,7 @@ class Rollouts(Pictures, TeleopMixin):
         seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
         if not whole("policy_port", options.get("policy_port", 0), low=0, high=65535):
             options.pop("policy_port", None)
+        hz, steps = loop_options(options, settings.number("STRANDS_CONTROL_HZ"))
         permit = self.gate.permit("start_policy")
         with self._waiting.until_begun(permit, self.body(robot_name).name):
             try:
@@ -146,7 +148,8 @@ class Rollouts(Pictures, TeleopMixin):
                     instruction=task,
                     policy_name=provider,
                     duration=seconds,
-                    hz=settings.number("STRANDS_CONTROL_HZ"),
+                    steps=steps,
+                    hz=hz,
                     observers=self.observers,
                 )
                 self._rollouts[body.name] = rollout
