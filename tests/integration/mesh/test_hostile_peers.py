@@ -151,13 +151,16 @@ def test_a_recorded_command_moves_nothing_when_it_is_played_back(net: OverZenoh,
     assert console.ask("send", "sim-1", step, 5)["result"]["status"] == "success"
     assert console.ask("send", "arm-1", WAVE, 5)["result"]["status"] == "success"
     assert console.ask("send", "arm-1", {"action": "stop"}, 5)["result"]["ok"] is True
-    recorded = {}
-    for sample in eventually(lambda: len(heard) >= 3 and list(heard), within=3) or []:
-        recorded.setdefault(str(sample.key_expr), (sample.payload.to_bytes(), sample.source_info))
+
+    def recorded() -> dict[str, Any] | None:
+        found = {json.loads(sample.payload.to_bytes())["command"]["action"]: sample for sample in list(heard)}
+        return found if {"step", "start"} <= set(found) else None
+
+    tapes = eventually(recorded, within=3) or {}
     steps = sim.ask("steps")
-    for key, (body, source) in recorded.items():
-        for stolen in (None, source):
-            attacker.put(key, body, stolen)
+    for tape in (tapes["step"], tapes["start"]):
+        for stolen in (None, tape.source_info):
+            attacker.put(str(tape.key_expr), tape.payload.to_bytes(), stolen)
     audited(net, "sim-1", "command_refused")
     assert console.ask("send", "arm-1", {"action": "status"}, 5)["type"] == "response"
     assert sim.ask("steps") == steps
