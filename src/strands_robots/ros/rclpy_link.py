@@ -281,16 +281,24 @@ class _Sending:
             self.goal.reject(f"{self._action} refused the goal.")
         else:
             self._handle = handle
-            handle.get_result_async().add_done_callback(self._ended)
+            self._ask_for_end()
             if self._cancelled:
-                handle.cancel_goal_async()
+                self._cancel()
         self.answered.set()
+
+    def _ask_for_end(self) -> None:
+        self._handle.get_result_async().add_done_callback(self._ended)
 
     def _cancel(self) -> None:
         # One that is not taken yet is cancelled when it is.
         self._cancelled = True
         if self._handle is not None:
-            self._handle.cancel_goal_async()
+            self._handle.cancel_goal_async().add_done_callback(self._cancel_answered)
+
+    def _cancel_answered(self, future: Any) -> None:
+        # A goal that is not being cancelled may be over, its end told before anybody could hear it: it is kept.
+        if future.exception() is None and not future.result().goals_canceling and not self.goal.done.is_set():
+            self._ask_for_end()
 
     def _ended(self, future: Any) -> None:
         _settle(future, self.goal, lambda answer: plain(answer.result), lambda answer: int(answer.status))

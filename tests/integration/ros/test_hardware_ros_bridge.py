@@ -1,0 +1,230 @@
+"""Arms and simulations on a ROS 2 graph through rclpy's shape, with a bare DDS peer as the graph's other side."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fixtures.devices import RecordingDevice
+from fixtures.waiting import eventually
+
+from fixtures import rclpy_stand_in
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.hardware import HardwareRobot
+from strands_robots.hardware_ros_bridge import HardwareRosBridge
+from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.link import RosError
+from strands_robots.ros_telemetry import INSECURE, MAX_QOS_HISTORY_DEPTH
+from strands_robots.simulation import Simulation
+from strands_robots.simulation.ros_bridge import SimRosBridge
+from strands_robots.utils import ValidationError
+
+DOMAIN = 99
+JOINTS = "sensor_msgs/msg/JointState"
+IMAGE = "sensor_msgs/msg/Image"
+SECURITY = ("ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY", "ROS_SECURITY_KEYSTORE")
+
+
+@pytest.fixture(autouse=True)
+def confined(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    for name in ("CYCLONEDDS_URI", "ROS_DOMAIN_ID", INSECURE, *SECURITY):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def sourced() -> Iterator[None]:
+    """A ROS 2 that is sourced, as far as our code can tell."""
+    with rclpy_stand_in.installed():
+        yield
+
+
+class Arm:
+    """Takes actions and keeps them; refuses while locked."""
+
+    tool_name_str = "my arm"
+
+    def __init__(self) -> None:
+        self.taken: list[dict[str, float]] = []
+        self.locked = False
+
+    def send_action(self, action: dict[str, float]) -> dict[str, Any]:
+        if self.locked:
+            return error("locked")
+        self.taken.append(action)
+        return success("taken")
+
+
+@pytest.fixture
+def peer() -> Iterator[DdsLink]:
+    link = DdsLink(DOMAIN, match_s=5.0)
+    yield link
+    link.close()
+
+
+def test_a_joint_command_of_a_dds_peer_drives_the_arm_whole_or_not_at_all(
+    sourced: None, peer: DdsLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(INSECURE, "1")
+    arm = Arm()
+    bridge = HardwareRosBridge(arm, domain_id=DOMAIN, joint_limits={"a.pos": (-1.0, 1.0)}, spin_period=0.005)
+    try:
+        for bad in (
+            {"name": ["b.pos", "a.pos"], "position": [0.1, 1.5]},
+            {"name": ["a.pos", "b.pos"], "position": [0.1]},
+            {"name": ["a.pos"], "position": [float("nan")]},
+        ):
+            peer.publish("/my_arm/joint_command", JOINTS, bad)
+        last = {"name": ["a.pos", "b.pos"], "position": [0.5, 7.0]}
+
+        def taken() -> bool:
+            peer.publish("/my_arm/joint_command", JOINTS, last)
+            return bool(arm.taken)
+
+        eventually(taken)
+        assert {tuple(each.items()) for each in arm.taken} == {(("a.pos", 0.5), ("b.pos", 7.0))}
+        arm.locked = True
+        assert bridge.apply(last) is False
+    finally:
+        bridge.shutdown()
+        bridge.shutdown()
+    assert not [t for t in threading.enumerate() if t.name.startswith(("strands_hardware", "rclpy-strands_hardware"))]
+
+
+def test_a_bridge_without_a_robot_tells_joints_and_images_to_a_dds_peer(sourced: None, peer: DdsLink) -> None:
+    bridge = HardwareRosBridge(domain_id=DOMAIN)
+    heard: dict[str, Any] = {}
+    peer.watch("/my_arm/joint_states", JOINTS, lambda m: heard.update(joints=m))
+    peer.watch("/my_arm/front/image_raw", IMAGE, lambda m: heard.update(image=m))
+    picture = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
+
+    def told() -> bool:
+        bridge.publish_joint_states("my arm", ["a.pos"], [0.25])
+        bridge.publish_joint_states("my arm", ["a.pos", "b.pos"], [9.0])
+        bridge.publish_image("my arm", "front", picture)
+        bridge.publish_image("my arm", "front", picture[:, :, 0])
+        return len(heard) == 2
+
+    try:
+        eventually(told)
+        joints, image = heard["joints"], heard["image"]
+        assert (joints["name"], joints["position"], joints["header"]["stamp"]["sec"] > 0) == (["a.pos"], [0.25], True)
+        assert (image["height"], image["width"], image["step"], image["encoding"]) == (2, 4, 12, "rgb8")
+        assert (image["header"]["frame_id"], image["data"]) == ("front", picture.tobytes())
+    finally:
+        bridge.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"enable_commands": "false"}, "enable_commands"),
+        ({"domain_id": 233}, "domain_id"),
+        ({"domain_id": True}, "domain_id"),
+        ({"qos_depth": 0}, "qos_depth"),
+        ({"qos_depth": MAX_QOS_HISTORY_DEPTH + 1}, "qos_depth"),
+        ({"spin_period": 0}, "spin_period"),
+        ({"spin_period": float("inf")}, "spin_period"),
+        ({"node_name": "no node"}, "node_name"),
+        ({"command_robot_name": 0}, "command_robot_name"),
+        ({"joint_limits": {"a": (1.0, float("nan"))}}, "joint_limits"),
+        ({"joint_limits": {"a": (2.0, 1.0)}}, "joint_limits"),
+        ({"joint_limits": [1]}, "joint_limits"),
+    ],
+)
+def test_a_bridge_that_cannot_be_is_refused_before_ros_2_is_looked_for(
+    options: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(INSECURE, "1")
+    before, threads = dict(os.environ), threading.active_count()
+    with pytest.raises(ValidationError, match=named):
+        HardwareRosBridge(Arm(), **{"domain_id": DOMAIN, **options})
+    assert (dict(os.environ), threading.active_count()) == (before, threads)
+
+
+def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists_or_secures_it(
+    sourced: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    secured = dict(zip(SECURITY, ("true", "Enforce", str(tmp_path)), strict=True))
+    for weak in ({}, {"ROS_SECURITY_ENABLE": "True"}, {"ROS_SECURITY_STRATEGY": "enforce"}, {SECURITY[2]: "/nowhere"}):
+        with monkeypatch.context() as patched:
+            for name, value in {**secured, **weak}.items() if weak else []:
+                patched.setenv(name, value)
+            with pytest.raises(ValidationError, match=INSECURE):
+                HardwareRosBridge(Arm(), domain_id=DOMAIN)
+    HardwareRosBridge(Arm(), domain_id=DOMAIN, enable_commands=False).shutdown()
+    for name, value in secured.items():
+        monkeypatch.setenv(name, value)
+    # The graph counts as secured; joining it is the middleware's, and the stand-in joins open ones only.
+    with pytest.raises(RosError, match="open graphs only"):
+        HardwareRosBridge(Arm(), domain_id=DOMAIN)
+
+
+def test_without_a_ros_2_each_bridge_says_so_in_one_sentence() -> None:
+    for make in (HardwareRosBridge, SimRosBridge):
+        with pytest.raises(RosError, match="source a ROS 2 installation"):
+            make(domain_id=DOMAIN)
+
+
+def test_a_simulation_tells_its_joints_and_a_camera_to_a_dds_peer(sourced: None, peer: DdsLink) -> None:
+    world = Simulation("bench")
+    world.add_robot("arm", "so100")
+    bridge = SimRosBridge(world, domain_id=DOMAIN)
+    heard: dict[str, Any] = {}
+    peer.watch("/arm/joint_states", JOINTS, lambda m: heard.update(joints=m))
+    peer.watch("/bench/overview/image_raw", IMAGE, lambda m: heard.update(image=m))
+    try:
+        bridge.start(20.0, ["overview"])
+        with pytest.raises(ValidationError, match="called before"):
+            bridge.start()
+        eventually(lambda: len(heard) == 2, within=20.0)
+        observed = world.get_observation("arm")
+        told = dict(zip(heard["joints"]["name"], heard["joints"]["position"], strict=True))
+        assert told == pytest.approx({name: observed[name] for name in told}, abs=0.05)
+        assert len(told) == 6
+        assert (heard["image"]["width"], heard["image"]["height"]) == (320, 240)
+    finally:
+        bridge.shutdown()
+        bridge.shutdown()
+        world.cleanup()
+
+
+class Locked:
+    """A lockout."""
+
+    def refusal(self, verb: str) -> Envelope | None:
+        return error(f"{verb} is locked")
+
+
+def test_a_real_robots_class_is_told_driven_and_locked_over_the_graph(
+    sourced: None, peer: DdsLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(INSECURE, "1")
+    device = RecordingDevice()
+    robot = HardwareRobot(device, "arm", control_hz=200)
+    robot.connect()
+    bridge = HardwareRosBridge(robot, domain_id=DOMAIN, spin_period=0.005)
+    heard: list[Any] = []
+    peer.watch("/arm/joint_states", JOINTS, heard.append)
+    try:
+        bridge.start(50.0)
+        told = eventually(lambda: heard)[-1]
+        command = {"name": told["name"], "position": [25.0] * len(told["name"])}
+
+        def obeyed() -> bool:
+            peer.publish("/arm/joint_command", JOINTS, command)
+            return bool(heard[-1]["position"] == command["position"])
+
+        eventually(obeyed)
+        robot.gate.attach(Locked())
+        peer.publish("/arm/joint_command", JOINTS, {**command, "position": [50.0] * len(told["name"])})
+        assert bridge.apply({**command, "position": [50.0] * len(told["name"])}) is False
+        assert heard[-1]["position"] == command["position"]
+    finally:
+        bridge.shutdown()
+        robot.cleanup()
