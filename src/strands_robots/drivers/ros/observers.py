@@ -61,6 +61,8 @@ class Observers:
         self._tell("finished", motion, {})
 
     def _tell(self, kind: Literal["started", "finished"], motion: Motion, action: Mapping[str, float]) -> None:
+        if not self._all:
+            return
         answer = motion.answer
         event = RolloutEvent(
             kind=kind,
