@@ -74,7 +74,7 @@ def stat(pair: ArmPair, name: str) -> Callable[[], int]:
 
 
 def goals(pair: ArmPair, after: float = 0.0) -> int:
-    return sum(write.servo == SERVO for write in pair.following.written_after(after))
+    return len(pair.following.written_after(after, servo=SERVO))
 
 
 def leading(pair: ArmPair) -> None:
