@@ -1,13 +1,17 @@
 """The other end of the mesh's measurements: a raw Zenoh echo, and processes of many peers.
 
-``python -m benchmarks.mesh_children echo PORT`` answers what it hears on ``strands/bench/ask`` and reports on
-``strands/bench/heard`` when each input frame arrived; ``fleet PREFIX COUNT`` joins that many peers.
+``python -m benchmarks.mesh_children echo PORT`` answers what it hears on ``strands/bench/ask`` and tells when
+each input frame arrived; ``fleet PREFIX COUNT`` joins that many peers, ``follow LEADER`` follows one, ``crowd COUNT``
+pretends to be that many, and ``listen`` hears them.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
 import sys
+import threading
 import time
 from typing import Any
 
@@ -94,5 +98,42 @@ def follow(source: str) -> None:
     mesh.close()
 
 
+def crowd(count: str) -> None:
+    """Presence of that many peers, each at 2 Hz, evenly spread, from one bare session."""
+    import zenoh  # noqa: PLC0415 - only this role needs it
+
+    endpoint = f"tcp/127.0.0.1:{os.environ['STRANDS_MESH_PORT']}"
+    facts = {"robot_type": "robot", "hostname": "host", "tool_name": "so100", "task_status": "idle", "connected": True}
+    over = threading.Event()
+    with zenoh.open(zenoh.Config.from_json5(raw_config(endpoint, listen=False))) as session:
+
+        def announce() -> None:
+            pause, source = 0.5 / int(count), zenoh.SourceInfo(session.id, 0)
+            for turn in itertools.cycle(range(int(count))):
+                if over.wait(pause):
+                    return
+                body = {**facts, "robot_id": f"p{turn}", "timestamp": time.time()}
+                session.put(f"strands/p{turn}/presence", json.dumps(body).encode(), source_info=source)
+
+        announcing = threading.Thread(target=announce)
+        announcing.start()
+        print(json.dumps({"ready": True}), flush=True)
+        sys.stdin.read()
+        over.set()
+        announcing.join()
+
+
+def listen() -> None:
+    """A peer without a robot that tells the CPU seconds of all its threads, and how many peers it sees."""
+    from strands_robots.mesh import init_mesh  # noqa: PLC0415 - only this role needs it
+
+    mesh = init_mesh(None, "listener")
+    assert mesh is not None
+    print(json.dumps({"ready": mesh.alive}), flush=True)
+    for _ in sys.stdin:
+        print(json.dumps([time.process_time(), sum(row["reachable"] for row in mesh.peers)]), flush=True)
+    mesh.close()
+
+
 if __name__ == "__main__":
-    {"echo": echo, "fleet": fleet, "follow": follow}[sys.argv[1]](*sys.argv[2:])
+    {"echo": echo, "fleet": fleet, "follow": follow, "crowd": crowd, "listen": listen}[sys.argv[1]](*sys.argv[2:])
