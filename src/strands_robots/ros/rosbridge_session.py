@@ -54,6 +54,7 @@ class Session:
         self._connect_s = connect_s
         self._opened, self._received, self._lost = opened, received, lost
         self._lock = threading.Lock()
+        self._writing = threading.Lock()
         self._thread: threading.Thread | None = None
         self._socket: Any = None
         self._settled = threading.Event()
@@ -99,6 +100,11 @@ class Session:
             self._closing.set()
             socket = self._socket
         if socket is not None:
+            # Saying goodbye needs the turn of a write, which a clogged connection does not give.
+            if self._writing.acquire(timeout=_CLOSE_S):
+                self._writing.release()
+            else:
+                self.cut()
             socket.close()
         if thread is not None and thread is not threading.current_thread():
             thread.join(self._connect_s + 2 * _CLOSE_S)
@@ -162,7 +168,8 @@ class Session:
 
     def _send(self, socket: Any, frame: str) -> None:
         try:
-            socket.send(frame)
+            with self._writing:
+                socket.send(frame)
         except Exception as exc:
             raise RosError(f"The connection to rosbridge at {self.url} broke: {exc}") from exc
 

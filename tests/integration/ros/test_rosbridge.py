@@ -288,6 +288,22 @@ def test_a_clogged_connection_holds_up_neither_a_stop_nor_its_verdict(server: Ro
         robot.disconnect()
 
 
+def test_a_clogged_link_is_closed_all_the_same(server: RosbridgeServer, link: RosbridgeLink) -> None:
+    chatter = threading.Thread(target=lambda: stuffed(link, {"data": bytes(12 * 2**20)}))
+    link.publish("/chatter", "std_msgs/String", {"data": "first"})
+    chatter.start()
+    server.clog()
+    eventually(lambda: stuck_in(chatter))
+    link.close()
+    chatter.join(10)
+    assert not chatter.is_alive()
+
+
+def stuck_in(thread: threading.Thread) -> bool:
+    thread.join(1.0)
+    return thread.is_alive()
+
+
 def stuck(robot: RosbridgeRobot) -> bool:
     sent = robot.get_task_status()["step_count"]
     time.sleep(0.3)
