@@ -44,7 +44,8 @@ class Mesh(SensorLoopsMixin):
         parts: clock, transport, registry, audit and safety plane, where they are not the process's own.
 
     Raises:
-        ValueError: ``peer_id`` is no identifier or a reserved word, or ``robot`` is no robot.
+        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process, or
+            ``robot`` is no robot.
     """
 
     def __init__(self, robot: Any, peer_id: str, peer_type: str = "robot", *, parts: Parts | None = None) -> None:
@@ -295,7 +296,7 @@ def init_mesh(robot: Any, peer_id: str | None = None, peer_type: str = "robot", 
         peer_id: default ``<tool_name_str or "robot">-<8 hex>``.
 
     Raises:
-        ValueError: ``peer_id`` is no identifier or a reserved word.
+        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process.
     """
     if not mesh or mesh_disabled_by_env():
         return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import Protocol
 
@@ -13,9 +12,6 @@ from strands_robots.safety.orders import StopOrder
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import ValidationError
-
-logger = logging.getLogger(__name__)
 
 Verdict = Callable[[], StopVerdict | None]
 
@@ -27,7 +23,11 @@ class SafetyDoor(Protocol):
     """What the mesh needs of the safety plane, for the robot of one peer."""
 
     def open(self) -> None:
-        """Put this peer's robot on the plane; twice is once."""
+        """Put this peer's robot on the plane; twice is once.
+
+        Raises:
+            ValidationError: another robot of this process has this name.
+        """
 
     def epochs(self) -> tuple[str, ...]:
         """The epochs held, oldest first; empty while the robot may move."""
@@ -82,7 +82,7 @@ class PlaneDoor:
 
     def open(self) -> None:
         if self._entry is None:
-            self._entry = self._register()
+            self._entry = self._plane.register(self._peer_id, self._robot, key=self._key)
 
     def epochs(self) -> tuple[str, ...]:
         return self._entry.epochs if self._entry is not None else ()
@@ -110,12 +110,3 @@ class PlaneDoor:
         entry, self._entry = self._entry, None
         if entry is not None:
             entry.close()
-
-    def _register(self) -> Registered:
-        try:
-            return self._plane.register(self._peer_id, self._robot, key=self._key)
-        except ValidationError:
-            # Its other network wrapped the same foreign robot anew; both wrappers are locked by every stop.
-            name = f"{self._peer_id}.mesh"
-            logger.warning("%s is in the safety plane already; the mesh's road to it is %s.", self._peer_id, name)
-            return self._plane.register(name, self._robot)
