@@ -141,8 +141,11 @@ def lead_far(
                 leads(screen, leader, peer, source)
                 why = wait(_end(far, mesh.peer_id, bounded, seconds, told), getattr(source, "duration", None) or 0.0)
             finally:
-                stopped = _stop(screen, far)
-                sent = publisher.stop()
+                # The follower first, and the frames end even where it does not answer.
+                try:
+                    stopped = _stop(screen, far)
+                finally:
+                    sent = publisher.stop()
     row = {"frames": sent["frames"], "errors": policy.errors, "applied": told.get("frames_received", 0)}
     screen.data({"event": "ended", **row, "why": why, "stopped": stopped})
     if bounded.error:

@@ -98,6 +98,19 @@ def test_ctrl_c_stops_the_follower_first(join: Join, replay: Any, wave: Path) ->
     assert len(arm.ask("halts")[0]) == 1
 
 
+def test_a_follower_that_is_lost_is_told_as_one_whose_stop_was_not_answered(
+    join: Join, replay: Any, wave: Path
+) -> None:
+    arm = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive")
+    replaying = replay(str(wave), "--to", "mesh:arm-1")
+    followed(arm, 5)
+    arm.kill()
+    code, [told] = ended(replaying)
+    assert code in (1, 3)
+    assert "stop" in told["reason"]
+    assert "arm-1" in told["reason"]
+
+
 def test_a_follower_that_is_not_there_is_one_sentence(replay: Any, wave: Path) -> None:
     code, [told] = ended(replay(str(wave), "--to", "mesh:nobody-1"))
     assert code == 3
