@@ -394,3 +394,23 @@ def test_the_tools_are_named_by_the_robot_and_describe_every_parameter(made: Mad
         for name, parameter in spec["inputSchema"]["json"]["properties"].items():
             assert len(parameter["description"]) > 10, name
             assert not parameter["description"].startswith("Parameter")
+
+
+def test_a_drive_that_gets_no_thread_leaves_the_base_free(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = made()
+
+    def none_left(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", none_left)
+        assert "could not begin" in robot.start_drive(0.1, 0.0, 0.01)["reason"]
+    assert robot.halt().stopped
+    assert robot.drive(0.1, 0.0, duration=0.01)["status"] == "success"
+
+
+def test_zeros_come_once_a_second_at_least_however_slow_the_rate(made: Made) -> None:
+    link = MemoryLink()
+    robot = made(link, publish_rate=1e-300)
+    assert robot.halt().stopped
+    eventually(lambda: len(link.sent) >= 2, within=4)

@@ -140,7 +140,13 @@ class MobileBaseRobot:
         burst = self._begin(linear, angular, seconds, 1, tool_context)
         if not isinstance(burst, Burst):
             return burst
-        threading.Thread(target=self._run, args=(burst,), name=f"drive-{self.node_name}", daemon=True).start()
+        try:
+            threading.Thread(target=self._run, args=(burst,), name=f"drive-{self.node_name}", daemon=True).start()
+        except RuntimeError as exc:
+            # No thread is to be had: the drive never began, and the next one must not wait for its end.
+            burst.ended.set()
+            self._slot.release()
+            return error(f"The drive could not begin: {exc}.")
         order = burst.order
         return success(
             f"Driving at {order.linear:g} m/s and {order.angular:g} rad/s for {seconds:g} s.",

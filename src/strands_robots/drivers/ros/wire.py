@@ -86,7 +86,8 @@ class Hold:
 
     def __init__(self, wire: VelocityWire, rate_hz: float, still: Callable[[], bool | None], name: str) -> None:
         self._wire = wire
-        self._period_s = 1 / rate_hz
+        # However rarely a base is driven, its zeros come once a second at least.
+        self._period_s = min(1.0, 1 / rate_hz)
         self._still = still
         self._cancelled = threading.Event()
         self.tried = threading.Event()
