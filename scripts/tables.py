@@ -28,7 +28,7 @@ EXTRA_MEANINGS = {
     "record": "recordings of robots as MCAP files",
     "dataset": "episodes of LeRobot's datasets as leaders (not in `all`)",
     "lerobot": "real arms through LeRobot, and its checkpoints (brings torch; not in `all`)",
-    "all": "everything but `lerobot`",
+    "all": "everything but `dataset` and `lerobot`",
 }
 
 
