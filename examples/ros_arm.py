@@ -11,9 +11,9 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from fixtures import rclpy_stand_in
 from fixtures.waiting import eventually
 
-from fixtures import rclpy_stand_in
 from strands_robots.hardware_ros_bridge import HardwareRosBridge
 from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
 from strands_robots.ros.dds import DdsLink

@@ -12,10 +12,10 @@ from __future__ import annotations
 import os
 import threading
 
+from fixtures import rclpy_stand_in
 from fixtures.nav2_process import nav2
 from fixtures.waiting import eventually
 
-from fixtures import rclpy_stand_in
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.envelope import text_of
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures import rclpy_stand_in
 from fixtures.rclpy_stand_in.idl import MESSAGES
 from fixtures.rclpy_stand_in.interfaces import message_class, to_idl
 
-from fixtures import rclpy_stand_in
 from strands_robots.ros import dds_fields
 from strands_robots.ros.dds_types import KINDS
 from strands_robots.ros.link import RosError

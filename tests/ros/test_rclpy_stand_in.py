@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures import rclpy_stand_in
 from fixtures.rclpy_stand_in import idl
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from fixtures import rclpy_stand_in
 from strands_robots.ros.dds_types import Header, PoseStamped, Time
 from strands_robots.ros.rclpy_session import sourced
 

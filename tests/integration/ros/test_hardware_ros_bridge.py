@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures import rclpy_stand_in
 from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
-from fixtures import rclpy_stand_in
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware_ros_bridge import HardwareRosBridge

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from fixtures import rclpy_stand_in
 from fixtures.nav2_process import nav2
 from fixtures.waiting import eventually
 
-from fixtures import rclpy_stand_in
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.goals import run_goal
 from strands_robots.ros.link import Goal, Heard, MemoryLink, Message, RosError, RosLink

@@ -14,12 +14,12 @@ from cyclonedds import domain
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from fixtures import rclpy_stand_in
 from fixtures.dds_nav2 import RELIABLE, Service
 from fixtures.nav2_process import nav2
 from fixtures.rclpy_stand_in.idl import SERVICES, ServoCtrlMsg
 from fixtures.waiting import eventually
 
-from fixtures import rclpy_stand_in
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.envelope import Envelope
