@@ -12,6 +12,7 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -34,9 +35,9 @@ PARTS = {
 
 INTRODUCTION = """# Benchmarks
 
-`make bench` measures every claim of speed on your machine and rewrites nothing; `make bench ARGS="--markdown
-docs/benchmarks.md"` wrote this page. Each row sets ours beside the bare part in the same run, in turns, so take the
-ratios: the absolute figures are those of one shared machine with {cores} cores, Python {python}. Loopback only.
+`make bench` measures every claim of speed on your machine; `make bench ARGS="PART... --markdown docs/benchmarks.md"` also
+puts the tables of those parts here. Each row sets ours beside the bare part in the same run, in turns, so take the ratios:
+the absolute figures are those of one shared machine with {cores} cores, Python {python}. Loopback only.
 
 The bare framework records a trace span for every message where the OpenTelemetry SDK is installed, as it is in the
 development environment; ours sets tracing up only where an OTLP endpoint is named.
@@ -53,6 +54,19 @@ def shown(title: str, rows: list[Row]) -> Table:
     return table
 
 
+def write(page: Path, measured: Mapping[str, str]) -> None:
+    """Put the measured tables into the page; what else stands there under a heading of its own is kept."""
+    before = page.read_text(encoding="utf-8").split("\n## ")[1:] if page.exists() else []
+    found = dict(section.split("\n\n", 1) for section in before)
+    sections = {**{title: found[title] for title in PARTS.values() if title in found}, **measured}
+    ordered = [title for title in PARTS.values() if title in sections]
+    by_hand = {title: body for title, body in found.items() if title not in sections}
+    introduction = INTRODUCTION.format(cores=os.cpu_count(), python=platform.python_version())
+    texts = [*((title, sections[title]) for title in ordered), *by_hand.items()]
+    tables = (f"## {title}\n\n{body.rstrip()}\n" for title, body in texts)
+    page.write_text("\n".join([introduction, *tables]), encoding="utf-8")
+
+
 def main() -> int:
     here = Path(__file__).parent
     available = [name for name in PARTS if (here / f"{name}.py").exists()]
@@ -64,17 +78,17 @@ def main() -> int:
     if unknown := set(options.parts) - set(available):
         parser.error(f"no such part: {', '.join(sorted(unknown))}; there are {', '.join(available)}")
 
-    console, pages, kept = Console(), [], True
+    console, kept = Console(), True
+    pages: dict[str, str] = {}
     for name in options.parts or available:
         started = time.monotonic()
         rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run(quick=options.quick)
         kept = kept and all(row.ok for row in rows)
         console.print(shown(PARTS[name], rows))
         console.print(f"[dim]{time.monotonic() - started:.0f} s, Python {platform.python_version()}[/]\n")
-        pages.append(f"## {PARTS[name]}\n\n`make bench ARGS={name}`\n\n{markdown(rows)}\n")
+        pages[PARTS[name]] = f"`make bench ARGS={name}`\n\n{markdown(rows)}\n"
     if options.markdown:
-        introduction = INTRODUCTION.format(cores=os.cpu_count(), python=platform.python_version())
-        options.markdown.write_text("\n".join([introduction, *pages]), encoding="utf-8")
+        write(options.markdown, pages)
     return 0 if kept else 1
 
 
