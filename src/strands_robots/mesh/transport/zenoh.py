@@ -25,24 +25,6 @@ OPEN_S = 5.0
 RESCUE_EVERY_S = 0.1
 STEADY_LOOKS = 10
 PUBLISHERS_MAX = 256
-THREADED = frozenset({"response"})
-"""Topics heard on a thread of their subscriber's own, where a message does not cost a new thread state.
-
-Commands are not among them: a motion that waits for a thread could be overtaken by the stop that came after it.
-"""
-
-
-class Handle:
-    """A subscriber that was declared, or will be in a moment."""
-
-    def __init__(self) -> None:
-        self.open = True
-        self.declared: Any = None
-
-    def undeclare(self) -> None:
-        self.open = False  # what still waits for the subscriber's thread is not delivered
-        if self.declared is not None:
-            self.declared.undeclare()
 
 
 class ZenohTransport:
@@ -157,10 +139,8 @@ class ZenohTransport:
             raise TransportError(f"{key}: {exc}") from None
 
     def declare_subscriber(self, key: str, callback: Callback) -> Any:
-        handle, put = Handle(), self._zenoh.SampleKind.PUT if self._zenoh is not None else None
-
         def heard(sample: Any) -> None:
-            if sample.kind != put or not handle.open:
+            if sample.kind != self._zenoh.SampleKind.PUT:
                 return
             source = sample.source_info
             session = str(source.source_id.zid) if source is not None else None
@@ -169,11 +149,7 @@ class ZenohTransport:
             except Exception:
                 logger.exception("A subscriber of %s failed.", key)
 
-        threaded = topics.topic_of(key).name in THREADED
-        handle.declared = self._declare(
-            lambda session, called: session.declare_subscriber(key, called), heard, key, threaded=threaded
-        )
-        return handle
+        return self._declare(lambda session, direct: session.declare_subscriber(key, direct), heard, key)
 
     def declare_token(self, key: str) -> Any:
         session = self._require()
@@ -204,12 +180,13 @@ class ZenohTransport:
             raise TransportError("the Zenoh session is closed.")
         return session
 
-    def _declare(self, declare: Any, heard: Any, key: str, *, threaded: bool = False) -> Any:
+    def _declare(self, declare: Any, heard: Any, key: str) -> Any:
         session = self._require()
-        # A direct callback runs on Zenoh's own thread; an indirect one costs a thread for each subscriber.
-        called = self._zenoh.handlers.Callback(heard, indirect=threaded)
+        # On Zenoh's own thread. An indirect callback has one that the interpreter waits for before it ends, so a
+        # process whose mesh is still open would never end; and a motion that waits there is overtaken by its stop.
+        direct = self._zenoh.handlers.Callback(heard, indirect=False)
         try:
-            return declare(session, called)
+            return declare(session, direct)
         except self.errors() as exc:
             raise TransportError(f"{key}: {exc}") from None
 
