@@ -35,9 +35,9 @@ PARTS = {
 
 INTRODUCTION = """# Benchmarks
 
-`make bench` measures every claim of speed on your machine; `make bench ARGS="PART... --markdown docs/benchmarks.md"` also
-puts the tables of those parts here. Each row sets ours beside the bare part in the same run, in turns, so take the ratios:
-the absolute figures are those of one shared machine with {cores} cores, Python {python}. Loopback only.
+`make bench` measures every claim of speed on your machine; `make bench ARGS="PART... --markdown docs/benchmarks.md"`
+puts the tables of those parts here. Each row sets ours beside the bare part in the same run, in turns, so take the
+ratios: the absolute figures are those of one shared machine with {cores} cores, Python {python}. Loopback only.
 
 The bare framework records a trace span for every message where the OpenTelemetry SDK is installed, as it is in the
 development environment; ours sets tracing up only where an OTLP endpoint is named.
