@@ -101,3 +101,39 @@ def test_lerobots_motor_modes_are_ranges() -> None:
 def test_what_nobody_knows_is_infinite_and_what_the_device_declares_counts() -> None:
     assert action_ranges(SimpleNamespace(action_features={"a": float})) == {"a": (-math.inf, math.inf)}
     assert action_ranges(RecordingDevice()) == dict(RANGES)
+
+
+class Pair:
+    """Two arms in one device, as LeRobot pairs them, with a camera that gives an error."""
+
+    def __init__(self) -> None:
+        self.left_arm, self.right_arm = BlindDevice(), BlindDevice()
+        self.cameras = {"front": object()}
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        joints = self.left_arm.positions
+        return {f"{side}_{key}": float for side in ("left", "right") for key in joints} | {"front": (480, 640, 3)}
+
+    def get_observation(self) -> dict[str, Any]:
+        raise TimeoutError("camera front gave no frame in 200 ms")
+
+
+def test_a_pair_of_arms_is_read_without_its_failing_camera() -> None:
+    pair = Pair()
+    pair.right_arm.positions["pan.pos"] = 20.0
+    joints = read_joints(pair)
+    assert joints.keys() == {f"{side}_{name}.pos" for side in ("left", "right") for name in ("pan", "lift", "grip")}
+    assert (joints["left_pan.pos"], joints["right_pan.pos"]) == (10.0, 20.0)
+
+
+def test_several_buses_of_one_device_are_each_read() -> None:
+    def bus(**positions: float) -> Any:
+        return SimpleNamespace(motors=dict.fromkeys(positions), sync_read=lambda register: positions)
+
+    features = {"pan.pos": float, "wheel.pos": float, "front": (4, 4, 3)}
+    device = SimpleNamespace(arm=bus(pan=1), wheels=bus(wheel=2), observation_features=features, get_observation=None)
+    device.get_observation = lambda: {"pan.pos": 5.0, "wheel.pos": 5.0, "speed": 7.0}
+    assert read_joints(device) == {"pan.pos": 1.0, "wheel.pos": 2.0}
+    device.observation_features = {**features, "speed": float}
+    assert read_joints(device) == {"pan.pos": 5.0, "wheel.pos": 5.0, "speed": 7.0}, "the buses do not know the speed"

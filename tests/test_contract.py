@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import pytest
+from fixtures.devices import BlindDevice
 
+from strands_robots.bus_access import bus_lock, read_joints
 from strands_robots.contract import AdaptedRobot, TaskRobot, adapt, put_away
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate
@@ -146,3 +149,56 @@ def test_a_robot_that_is_put_away_begins_nothing_until_it_is_taken_back() -> Non
     assert "taken off its network" in AdaptedRobot(foreign).start_task("wave")["reason"]
     free()
     assert AdaptedRobot(foreign).gate.permit("start_task").valid
+
+
+def test_the_joints_of_a_foreign_robot_are_read_by_who_adapts_it() -> None:
+    class Native(Foreign):
+        def get_observation(self) -> dict[str, Any]:
+            return {"pan.pos": 4.0, "front": [[0]]}
+
+    class Wrapper(Foreign):
+        def __init__(self) -> None:
+            super().__init__()
+            self.robot = BlindDevice()
+
+    state = adapt(Native(), read_joints).get_state()
+    assert (state["status"], state["joints"]) == ("success", {"pan.pos": 4.0})
+    assert state["task"] == {"task_status": "idle"}
+    assert adapt(Wrapper(), read_joints).get_state()["joints"]["pan.pos"] == 10.0, "whose camera fails"
+    assert adapt(Foreign(), read_joints).get_state()["joints"] == {}
+
+
+def test_a_foreign_robot_is_read_in_its_turn_on_the_bus() -> None:
+    class Native(Foreign):
+        held: bool | None = None
+
+        def get_observation(self) -> dict[str, Any]:
+            free = threading.Thread(target=self.look)
+            free.start()
+            free.join()
+            return {}
+
+        def look(self) -> None:
+            self.held = not bus_lock(self).acquire(blocking=False)
+
+    native = Native()
+    adapt(native, read_joints).get_state()
+    assert native.held is True
+
+
+def test_joints_that_cannot_be_read_are_told_beside_the_task() -> None:
+    class Dead(Foreign):
+        def get_observation(self) -> dict[str, Any]:
+            raise ConnectionError("no status packet")
+
+    state = adapt(Dead(), read_joints).get_state()
+    assert "no status packet" in state["joints_error"]
+    assert (state["joints"], state["task"]["task_status"]) == ({}, "idle")
+
+
+def test_a_foreign_robot_that_tells_its_state_is_not_read() -> None:
+    class Telling(Foreign):
+        def get_state(self) -> Envelope:
+            return success("Told.", joints={"a": 1.0})
+
+    assert adapt(Telling(), read_joints).get_state()["joints"] == {"a": 1.0}

@@ -58,8 +58,10 @@ def read_joints(device: Any) -> dict[str, float]:
     """Joint positions by observation key, in the device's unit, read under the bus lock and without its cameras.
 
     From ``get_joints()`` where the device has it and answers with numbers (a native driver that answers with an
-    envelope names its motors there, not its action keys), from the motor bus alone where it is a LeRobot device with
-    one bus, else the numbers of a whole observation. Raises what the device raises.
+    envelope names its motors there, not its action keys), from the motor buses alone where those of a LeRobot device
+    give every number that it observes: one bus, several, or those of arms in a pair (``left_arm``, ``right_arm``).
+    Else, as of a base that computes its speed, the numbers of a whole observation, which a failing camera fails.
+    Raises what the device raises.
     """
     source = joint_read_source(device)
     if source is None:
@@ -69,11 +71,14 @@ def read_joints(device: Any) -> dict[str, float]:
         told = own() if callable(own) else None
         if told is not None and "status" not in told:
             return numbers(told)
-        motors = _motors(source)
-        if motors is not None:
-            positions = source.bus.sync_read("Present_Position")
-            return numbers({f"{name}.pos": positions[name] for name in motors})
-        return numbers(source.get_observation())
+        buses = _buses(source)
+        if not buses:
+            return numbers(source.get_observation())
+        joints: dict[str, float] = {}
+        for prefix, bus in buses:
+            positions = bus.sync_read("Present_Position")
+            joints |= numbers({f"{prefix}{name}.pos": positions[name] for name in bus.motors})
+        return joints
 
 
 def action_ranges(device: Any) -> dict[str, tuple[float, float]]:
@@ -110,13 +115,34 @@ def _motor_range(device: Any, motor: str, motors: Mapping[str, Any]) -> tuple[fl
 
 def _motors(device: Any) -> Mapping[str, Any] | None:
     """The motors of a device whose one bus gives every number of its observation; else None."""
-    bus = getattr(device, "bus", None)
-    motors = getattr(bus, "motors", None)
-    if not isinstance(motors, Mapping) or not callable(getattr(bus, "sync_read", None)):
+    bus: Any = getattr(device, "bus", None)
+    if not _is_bus(bus) or _scalars(device) != {f"{name}.pos" for name in bus.motors}:
         return None
+    motors: Mapping[str, Any] = bus.motors
+    return motors
+
+
+def _buses(device: Any) -> list[tuple[str, Any]]:
+    """The motor buses that give every number of a device's observation, each with the prefix of its keys; else none."""
+    if _motors(device) is not None:
+        return [("", device.bus)]
+    found: list[tuple[str, Any]] = []
+    for name, part in getattr(device, "__dict__", {}).items():
+        if _is_bus(part):
+            found.append(("", part))
+        elif _is_bus(getattr(part, "bus", None)):
+            found.append((f"{name.removesuffix('_arm')}_", part.bus))
+    keys = [f"{prefix}{motor}.pos" for prefix, bus in found for motor in bus.motors]
+    return found if len(keys) == len(set(keys)) and set(keys) == _scalars(device) else []
+
+
+def _is_bus(candidate: Any) -> bool:
+    return isinstance(getattr(candidate, "motors", None), Mapping) and callable(getattr(candidate, "sync_read", None))
+
+
+def _scalars(device: Any) -> set[str]:
     features = getattr(device, "observation_features", {})
-    scalars = {key for key, kind in features.items() if not isinstance(kind, tuple | list)}
-    return motors if scalars == {f"{name}.pos" for name in motors} else None
+    return {key for key, kind in features.items() if not isinstance(kind, tuple | list)}
 
 
 def _may_be_device(candidate: Any) -> bool:

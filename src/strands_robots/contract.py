@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
-from strands_robots.envelope import Envelope, error
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.utils import ValidationError, shown
@@ -124,11 +124,18 @@ class WorldRobot(Haltable, Protocol):
         """Tell ``observer`` of every rollout event until the returned callable is called."""
 
 
+JointReader = Callable[[Any], Mapping[str, float]]
+"""Reads a robot's joints, by name in its own unit; empty where it has none. Raises what the robot raises."""
+
 _TASK_VERBS = ("start_task", "stop_task", "get_task_status", "get_features")
 
 
-def adapt(robot: Any) -> TaskRobot:
+def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
     """``robot`` itself when it fits :class:`TaskRobot`, else a wrapper that gives it what it lacks.
+
+    Args:
+        robot: what is to fit.
+        joints: reads the joints of a robot that has no ``get_state`` of its own; without it those are none.
 
     Raises:
         ValidationError: ``robot`` lacks one of start_task, stop_task, get_task_status, get_features.
@@ -138,7 +145,7 @@ def adapt(robot: Any) -> TaskRobot:
     missing = [verb for verb in _TASK_VERBS if not callable(getattr(robot, verb, None))]
     if missing:
         raise ValidationError(f"robot must have {', '.join(_TASK_VERBS)}; {shown(robot)} lacks {', '.join(missing)}.")
-    return AdaptedRobot(robot)
+    return AdaptedRobot(robot, joints)
 
 
 class _PutAway:
@@ -173,8 +180,9 @@ def _gate_of(robot: Any) -> MotionGate:
 class AdaptedRobot:
     """A foreign robot behind the contract: gated, haltable, with its own optional verbs used where it has them."""
 
-    def __init__(self, robot: Any) -> None:
+    def __init__(self, robot: Any, joints: JointReader | None = None) -> None:
         self.wrapped = robot
+        self._read_joints = joints
         self.tool_name_str: str = str(getattr(robot, "tool_name_str", "") or "robot")
         self.gate = _gate_of(robot)
 
@@ -208,9 +216,18 @@ class AdaptedRobot:
         return answer
 
     def get_state(self) -> Envelope:
-        reader = getattr(self.wrapped, "get_state", None)
-        answer: Envelope = reader() if callable(reader) else {"joints": {}, "task": self.get_task_status()}
-        return answer
+        """The robot's own state where it tells one, else its joints and task; ``joints_error`` says why it has none."""
+        own = getattr(self.wrapped, "get_state", None)
+        if callable(own):
+            answer: Envelope = own()
+            return answer
+        fields: dict[str, Any] = {"joints": {}, "task": _facts(self.get_task_status())}
+        try:
+            if self._read_joints is not None:
+                fields["joints"] = dict(self._read_joints(self.wrapped))
+        except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the answer says what
+            fields["joints_error"] = f"The joints could not be read: {type(exc).__name__}: {exc}"
+        return success(fields.get("joints_error") or f"{len(fields['joints'])} joints.", **fields)
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
         subscribe = getattr(self.wrapped, "subscribe", None)
@@ -230,3 +247,9 @@ class AdaptedRobot:
         if callable(teleop):
             sources["teleoperation"] = teleop
         return halt_each(sources)
+
+
+def _facts(answer: object) -> dict[str, Any]:
+    """What an envelope tells, without its form; a foreign robot may answer with something else."""
+    told = answer if isinstance(answer, Mapping) else {}
+    return {key: value for key, value in told.items() if key not in ("status", "content")}

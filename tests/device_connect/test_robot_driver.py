@@ -391,6 +391,9 @@ async def test_any_object_with_the_four_verbs_is_a_robot() -> None:
         def get_features(self) -> Any:
             return {"observation_features": {"a": float}, "action_features": {}}
 
+        def get_observation(self) -> Any:
+            return {"a": 1.5}
+
     foreign = Foreign()
     async with DriverBench(drive(foreign)) as bench:
         assert (await bench.call("execute", instruction="wave"))["status"] == "success"
@@ -398,6 +401,8 @@ async def test_any_object_with_the_four_verbs_is_a_robot() -> None:
         assert foreign.stopped == 1
         assert (await bench.call("getStatus"))["task_status"] == "idle"
         assert (await bench.call("getFeatures"))["status"] == "success"
+        state = await bench.call("getState")
+        assert (state["joints"], state["task"]) == ({"a": 1.5}, {"task_status": "idle"})
 
 
 def test_an_object_that_is_no_robot_is_refused_by_what_it_lacks() -> None:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 from device_connect_edge.types import DeviceIdentity
 
+from strands_robots.bus_access import read_joints
 from strands_robots.contract import AdaptedRobot, RolloutEvent, adapt
 from strands_robots.device_connect.base_driver import Call, RobotDriver
 from strands_robots.device_connect.declare import Labels, emit, rpc
@@ -53,7 +54,7 @@ class RobotDeviceDriver(RobotDriver):
         authorization: Authorization | None = None,
         approval: Approval | None = None,
     ) -> None:
-        task_robot = adapt(robot)
+        task_robot = adapt(robot, read_joints)
         super().__init__(task_robot, hardware=hardware, authorization=authorization, approval=approval)
         self.task_robot = task_robot
         self._model = task_robot.tool_name_str

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from strands_robots.bus_access import read_joints
 from strands_robots.contract import RolloutEvent, TaskRobot, WorldRobot, adapt
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mesh.security import policy_host_refusal
@@ -42,7 +43,7 @@ def fit(robot: Any) -> Robot | None:
     """
     if robot is None:
         return None
-    return robot if isinstance(robot, WorldRobot) else adapt(robot)
+    return robot if isinstance(robot, WorldRobot) else adapt(robot, read_joints)
 
 
 class Dispatcher:
