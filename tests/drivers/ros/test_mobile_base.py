@@ -15,7 +15,7 @@ from strands_robots.contract import TaskRobot
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import EarlierRefusedError, MemoryLink, RosError
+from strands_robots.ros.link import EarlierRefusedError, Heard, MemoryLink, RosError, Unwatch
 from strands_robots.utils import ValidationError
 
 TOPIC = "/cmd_vel"
@@ -264,6 +264,92 @@ def test_a_blind_base_is_told_zeros_for_its_time_and_no_longer(made: Made, monke
     robot.halt()
     eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()), within=2)
     assert 8 <= len(memory(robot).sent) <= 12
+
+
+def test_a_link_that_returns_after_the_blind_hold_still_gets_zeros_for_its_whole_time(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.2)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    link = FaultyLink(tuple(range(1, 10_000)))
+    robot = made(link, publish_rate=50.0)
+    assert robot.halt().stopped is False
+    eventually(lambda: link.tries > 25, what="tries beyond the time of a blind hold")
+    link.faults = ()
+    eventually(lambda: not robot.holding, within=2)
+    assert 6 <= len(link.sent) <= 12, "as many as a link that was never down gets"
+
+
+def test_a_link_that_drops_out_within_the_hold_gets_zeros_for_its_whole_time_again(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.2)
+    link = FaultyLink(tuple(range(4, 30)))
+    robot = made(link, publish_rate=50.0)
+    assert robot.halt().stopped
+    eventually(lambda: not robot.holding, within=3)
+    assert 9 <= len(link.sent) <= 15, "three before the drop-out and the whole time after it"
+
+
+def test_a_hold_on_a_link_that_never_returns_ends_with_the_base(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.05)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    robot = made(FaultyLink(tuple(range(1, 10_000))), publish_rate=50.0)
+    robot.halt()
+    time.sleep(0.2)
+    assert robot.holding
+    robot.disconnect()
+    assert not robot.holding
+
+
+def test_a_moving_base_whose_odometry_falls_silent_is_held_for_the_blind_time_from_its_last_word(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.3)
+    monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 0.05)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom", publish_rate=100.0)
+    wheels = Wheels(link, 1.0, 0.0)
+    try:
+        robot.halt()
+        time.sleep(0.5)
+    finally:
+        wheels.close()
+    silent_from = len(velocities(link))
+    eventually(lambda: not robot.holding, within=2)
+    assert len(velocities(link)) - silent_from >= 15
+
+
+def test_a_graph_that_is_asked_for_a_type_for_seconds_does_not_delay_the_zeros(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+
+    class Slow(MemoryLink):
+        free = threading.Event()
+        watchers = 0
+
+        def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+            self.free.wait(10)
+            unwatch = super().watch(topic, kind, heard)
+            self.watchers += 1
+
+            def done() -> None:
+                unwatch()
+                self.watchers -= 1
+
+            return done
+
+    link = Slow()
+    robot = made(link, odom_topic="/odom", publish_rate=100.0)
+    assert robot.halt().stopped is None
+    try:
+        eventually(lambda: len(link.sent) > 10, within=2, what="zeros while the watch still blocks")
+    finally:
+        link.free.set()
+    robot.disconnect()
+    assert link.watchers == 0, "a watch that came late does not outlive the base"
 
 
 def test_a_halt_on_a_link_that_blocks_answers_in_time_that_it_did_not_stop(

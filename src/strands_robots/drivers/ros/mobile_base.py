@@ -291,7 +291,7 @@ class MobileBaseRobot:
                 refusal = refusal or self.handshake(tool_context)
             if refusal is not None:
                 return refusal
-            self._watch_odometry()
+            self._odometry.start()
             self._holds.end_for(permit)
             burst = self._burst = Burst(order, self._wire, permit)
             held = True
@@ -335,14 +335,8 @@ class MobileBaseRobot:
             self._observers.finished(burst)
         return answer
 
-    def _watch_odometry(self) -> None:
-        try:
-            self._odometry.start()
-        except UNREACHABLE as exc:
-            logger.warning("%s drives without its odometry: %s", self.tool_name_str, exc)
-
     def _still_now(self) -> bool | None:
-        self._watch_odometry()
+        self._odometry.start_behind()
         return self._odometry.still
 
     def _verdict(self, hold: Hold, burst: Burst | None, driven: bool, deadline: float) -> StopVerdict:

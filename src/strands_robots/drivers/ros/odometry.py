@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.ros.link import Message, RosLink, Unwatch
+from strands_robots.ros.link import Message, RosError, RosLink, Unwatch
+from strands_robots.utils import MissingExtraError
+
+logger = logging.getLogger(__name__)
 
 STILL_LINEAR = 0.01
 """m/s below which a base counts as still."""
@@ -21,6 +25,9 @@ STILL_SAMPLES = 2
 
 FRESH_S = 1.0
 """Seconds after which a sample says nothing about now."""
+
+AGAIN_S = 0.5
+"""Seconds between two tries to watch a graph that could not be watched."""
 
 
 def speeds(message: Message) -> tuple[float, float] | None:
@@ -49,22 +56,62 @@ class Odometry:
         self._kind = kind
         self._lock = threading.Lock()
         self._unwatch: Unwatch | None = None
+        self._starting = threading.Lock()
+        self._closings = 0
+        self._tried_at = -math.inf
+        self._problem = ""
         self._speeds: tuple[float, float] | None = None
         self._at = -math.inf
         self._still_in_a_row = 0
 
+    @property
+    def watched(self) -> bool:
+        """Samples are asked for, or there is no topic to ask for."""
+        return self.topic is None or self._unwatch is not None
+
     def start(self) -> None:
-        """Watch from now on. Raises what the link raises; a second call does nothing."""
-        with self._lock:
-            if self.topic is not None and self._unwatch is None:
-                self._unwatch = self._link.watch(self.topic, self._kind, self._heard)
+        """Watch from now on; a second call does nothing. A graph that cannot be watched is told to the log."""
+        self._start(self._closings)
+
+    def start_behind(self) -> None:
+        """The same on a thread of its own, because a graph may be asked for the topic's type for seconds."""
+        if self.watched or time.monotonic() - self._tried_at < AGAIN_S or not self._starting.acquire(blocking=False):
+            return
+        closings = self._closings
+
+        def run() -> None:
+            try:
+                self._start(closings)
+            finally:
+                self._starting.release()
+
+        try:
+            threading.Thread(target=run, name="odometry-start", daemon=True).start()
+        except RuntimeError as exc:
+            self._starting.release()
+            logger.warning("%s is not watched: %s", self.topic, exc)
 
     def close(self) -> None:
         """Watch no more."""
         with self._lock:
+            self._closings += 1
             unwatch, self._unwatch = self._unwatch, None
         if unwatch is not None:
             unwatch()
+
+    def _start(self, closings: int) -> None:
+        with self._lock:
+            # One that was asked for before a close must not open the graph again after it.
+            if self.topic is None or self._unwatch is not None or closings != self._closings:
+                return
+            problem = ""
+            try:
+                self._unwatch = self._link.watch(self.topic, self._kind, self._heard)
+            except (RosError, MissingExtraError) as exc:
+                problem = str(exc)
+            if problem and problem != self._problem:
+                logger.warning("%s is not watched: %s", self.topic, problem)
+            self._problem, self._tried_at = problem, time.monotonic()
 
     def expect_stillness(self) -> None:
         """Forget the samples so far: only what arrives from now on says that the base stands."""

@@ -210,7 +210,7 @@ class RosBridgedRobot(MobileBaseRobot):
             refusal = self.command_gate.refusal(self.nav_action, self.nav_action_type, "navigate_to", tool_context)
             if refusal is not None:
                 return refusal
-            self._watch_odometry()
+            self._odometry.start()
             self._holds.end_for(permit)
             self._burst = None
             going = self._navigation = Navigation(self.link, self.nav_action, self.nav_action_type, to, permit)

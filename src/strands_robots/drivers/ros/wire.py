@@ -15,8 +15,7 @@ from strands_robots.safety.gate import Permit, PermitVoidError
 logger = logging.getLogger(__name__)
 
 BLIND_HOLD_S = 5.0
-"""Seconds of zeros for a base whose odometry says nothing."""
-
+"""Seconds of zeros, taken without a failure, for a base whose odometry says nothing."""
 
 CLOGGED_S = 0.1
 """Seconds after which a connection that does not take a zero is given up, with the commands that it still holds."""
@@ -80,8 +79,10 @@ class VelocityWire:
 class Hold:
     """Zeros at the base's publish rate on a thread of their own, the first at once, until the base is still.
 
-    ``still`` answers True, False or, where no odometry speaks, None; the last ends the hold after
-    :data:`BLIND_HOLD_S`. A zero that fails is tried again at the next turn.
+    ``still`` answers True, False or, where no odometry speaks, None, and returns at once. None ends the hold after
+    :data:`BLIND_HOLD_S`, counted from the first zero that was taken, from the last one that was not and from the
+    last word of odometry, whichever was latest. A hold whose zeros fail goes on until they are taken, because the link
+    may come back to a base that still moves; :meth:`cancel` ends every hold.
     """
 
     def __init__(self, wire: VelocityWire, rate_hz: float, still: Callable[[], bool | None], name: str) -> None:
@@ -110,21 +111,35 @@ class Hold:
         self._thread.join(within_s)
 
     def _run(self) -> None:
-        began = time.monotonic()
+        blind_since: float | None = None
         while True:
-            try:
-                self._wire.halt()
-                self.problem = ""
-                self.sent.set()
-            except Exception as exc:  # noqa: BLE001 - whatever the link raises, the next zero is tried and the verdict says so
-                self.problem = str(exc) or type(exc).__name__
-                logger.warning("A zero on %s failed: %s", self._wire.topic, self.problem)
+            problem = self._send()
+            self.problem = problem
             self.tried.set()
             still = self._still() if self.sent.is_set() else None
-            if still or (still is None and time.monotonic() - began >= BLIND_HOLD_S):
+            now = time.monotonic()
+            if problem:
+                blind_since = None
+            elif still:
+                return
+            elif blind_since is None or still is not None:
+                blind_since = now
+            elif now - blind_since >= BLIND_HOLD_S:
                 return
             if self._cancelled.wait(self._period_s):
                 return
+
+    def _send(self) -> str:
+        """One zero; why it was not taken, or ""."""
+        try:
+            self._wire.halt()
+        except Exception as exc:  # noqa: BLE001 - whatever the link raises, the next zero is tried and the verdict says so
+            problem = str(exc) or type(exc).__name__
+            if problem != self.problem:
+                logger.warning("A zero on %s failed: %s", self._wire.topic, problem)
+            return problem
+        self.sent.set()
+        return ""
 
 
 class Holds:
