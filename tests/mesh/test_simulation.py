@@ -54,3 +54,24 @@ def test_a_provider_that_the_robot_lacks_is_its_own_answer(peers: Fleet, arm: Si
     reply = console.send("sim-1", {"action": "start", "instruction": "x", "policy_provider": "groot"}, timeout=5)
     assert reply["type"] == "response"
     assert reply["result"]["status"] == "error"
+
+
+def test_the_steps_of_a_rollout_are_published_without_anybody_asking(peers: Fleet, arm: Simulation) -> None:
+    steps: list[dict[str, Any]] = []
+    mesh = peers.join(arm, "sim-1", "sim")
+    console = peers.join(None, "console")
+    console.on_stream("sim-1", lambda key, data: steps.append(data))
+    start = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 20}
+    assert console.send("sim-1", start, timeout=10)["result"]["status"] == "success"
+    eventually(lambda: len(steps) > 5, within=5)
+    first = steps[0]
+    assert set(first) == {"peer_id", "step", "t", "instruction", "policy", "observation", "action"}
+    assert (first["peer_id"], first["instruction"], first["policy"]) == ("sim-1", "wave", "mock")
+    assert set(first["observation"]) == set(arm.get_observation())
+    assert set(first["action"]) <= set(arm.get_features()["robots"]["so100"]["action_features"])
+    assert [body["step"] for body in steps] == sorted({body["step"] for body in steps})
+    mesh.stop()
+    told = len(steps)
+    assert arm.list_policies_running(), "leaving the mesh ends no rollout"
+    eventually(lambda: arm.list_policies_running()[0]["step"] > first["step"] + 20, within=5)
+    assert len(steps) == told

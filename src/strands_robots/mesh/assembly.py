@@ -25,7 +25,7 @@ from strands_robots.mesh.safety import FleetSafety
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.serving import Line, MotionDoor, Server
 from strands_robots.mesh.state import StateReader, describe
-from strands_robots.mesh.stream import Limiter
+from strands_robots.mesh.stream import StepFeed
 from strands_robots.mesh.subscriptions import Subscriptions
 from strands_robots.mesh.teleop import TeleopDesk
 from strands_robots.mesh.transport.base import Sample, Transport
@@ -84,7 +84,7 @@ class Assembled:
     state: StateReader
     teleop: TeleopDesk
     subscriptions: Subscriptions
-    stream_limit: Limiter
+    steps: StepFeed
     identity_of: Callable[[Transport], Identity]
     inputs: dict[str, dict[str, Any]]
     sensors: list[str] = field(default_factory=list)
@@ -115,6 +115,7 @@ class Assembled:
         if frames is not None:
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), lambda: self._publish_frames(frames))
         self.scheduler.start()
+        self.steps.start()
         # A robot whose bus is wedged is announced all the same, by its name alone.
         self.herald.described.wait(DESCRIBE_S)
         every("presence", rates["presence"].rate_hz, self.herald.announce, quick=True)
@@ -126,6 +127,7 @@ class Assembled:
         deadline = time.monotonic() + timeout
         self.teleop.close()
         alive = self.scheduler.stop(max(0.0, deadline - time.monotonic()))
+        alive += self.steps.stop(max(0.0, deadline - time.monotonic()))
         self.caller.close()
         dropped = self.subscriptions.clear()
         if dropped:
@@ -218,7 +220,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         state=StateReader(peer, robot, parts.clock),
         teleop=teleop,
         subscriptions=Subscriptions(lanes.delivery),
-        stream_limit=Limiter(settings.number("STRANDS_MESH_STREAM_HZ")),
+        steps=StepFeed(context, robot, settings.number("STRANDS_MESH_STREAM_HZ")),
         identity_of=parts.identity or identity_of,
         inputs=inputs,
     )

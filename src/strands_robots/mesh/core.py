@@ -17,11 +17,9 @@ from strands_robots.mesh.assembly import Parts, assemble
 from strands_robots.mesh.dispatch import fit
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import SensorLoopsMixin
-from strands_robots.mesh.stream import step_message
 from strands_robots.mesh.subscriptions import DataCallback, SampleCallback
 from strands_robots.mesh.topics import stream
-from strands_robots.mesh.transport.base import Sample, TransportError
-from strands_robots.mesh.wire import WireError
+from strands_robots.mesh.transport.base import Sample
 from strands_robots.utils import number
 
 logger = logging.getLogger(__name__)
@@ -215,22 +213,11 @@ class Mesh(SensorLoopsMixin):
         instruction: str = "",
         policy: str = "",
     ) -> None:
-        """Publish one policy step; more than ``STRANDS_MESH_STREAM_HZ`` a second are thinned out."""
-        if not self.alive or not self._assembled.stream_limit.admit():
-            return
-        body = step_message(
-            self.peer_id,
-            self.now(),
-            step,
-            observation=observation,
-            action=action,
-            instruction=instruction,
-            policy=policy,
-        )
-        try:
-            self.publish(stream(self.peer_id), body)
-        except (TransportError, WireError) as exc:
-            logger.warning("%s: step %d was not published: %s", self.peer_id, step, exc)
+        """Publish one policy step; more than ``STRANDS_MESH_STREAM_HZ`` a second are thinned out.
+
+        The rollouts of this peer's own robot are published without it, at the same rate.
+        """
+        self._assembled.steps.publish(step, observation, action, instruction, policy)
 
     def on_stream(self, peer_id: str, callback: DataCallback | None = None) -> str | None:
         """Hear another peer's policy steps."""
