@@ -77,7 +77,7 @@ class AckermannRosRobot(MobileBaseRobot):
             scan_type=scan_type,
             publish_rate=publish_rate,
             max_linear=self.max_speed,
-            max_duration=max_duration,
+            max_duration=number("max_duration", max_duration, above=0),
             command_gate=command_gate,
         )
         self.safety_key = f"ackermann:{node_name}:{servo_topic}"

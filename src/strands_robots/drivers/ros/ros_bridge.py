@@ -77,7 +77,7 @@ class RosBridgedRobot(MobileBaseRobot):
             link or road,
             cmd_vel_topic,
             cmd_vel_type,
-            odom_topic=odom_topic,
+            odom_topic=graph_name("odom_topic", odom_topic),
             odom_type=odom_type,
             scan_topic=scan_topic,
             scan_type=scan_type,

@@ -7,7 +7,9 @@ from typing import Any
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
+from strands_robots.ros.names import graph_name
 from strands_robots.ros.rosbridge import RosbridgeLink
+from strands_robots.utils import number
 
 ROS1_TWIST = "geometry_msgs/Twist"
 CURIOSITY = "/curiosity_mars_rover"
@@ -25,7 +27,8 @@ class RosbridgeRobot(MobileBaseRobot):
         odom_topic: odometry or pose; with it a stop waits to see the base still. The server finds the types of
             this topic and of ``scan_topic`` where they are not given.
         host: bare hostname or IP address of the server. ``port``: 1 to 65535.
-        max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds.
+        max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds. All three
+            are above 0 and owed: this class has no unlimited drive.
         publish_rate: Hz of a drive that is held.
         link: another road in place of the connection to ``host`` and ``port``.
         command_gate: asks the operator's leave; that of the settings by default.
@@ -59,14 +62,14 @@ class RosbridgeRobot(MobileBaseRobot):
             link or road,
             cmd_vel_topic,
             cmd_vel_type,
-            odom_topic=odom_topic,
+            odom_topic=graph_name("odom_topic", odom_topic),
             odom_type=odom_type,
             scan_topic=scan_topic,
             scan_type=scan_type,
             publish_rate=publish_rate,
-            max_linear=max_linear,
-            max_angular=max_angular,
-            max_duration=max_duration,
+            max_linear=number("max_linear", max_linear, above=0),
+            max_angular=number("max_angular", max_angular, above=0),
+            max_duration=number("max_duration", max_duration, above=0),
             command_gate=command_gate,
         )
         self.safety_key = f"rosbridge:{road.url}{cmd_vel_topic}"
