@@ -34,16 +34,30 @@ Refusal = dict[str, Any]
 
 @dataclass(slots=True)
 class Turn:
-    """One question under way. ``arrived`` gives the replies that count, in turn, and None when the mesh was stopped."""
+    """One question under way. ``arrived`` gives the replies that count, in turn, and None when the mesh was stopped.
+
+    A question that is asked again has another id: a receiver refuses the second command of one id as a replay.
+
+    Attributes:
+        ids: every id that it was asked under.
+        via: ``direct`` where the transport tells whether anybody takes the command, else ``publish``.
+        confirmed: the transport said that somebody takes it.
+    """
 
     expected: str
+    ids: list[str] = field(default_factory=list)
     arrived: SimpleQueue[dict[str, Any] | None] = field(default_factory=SimpleQueue)
-    answered: set[tuple[str | None, str]] = field(default_factory=set)
+    answered: set[tuple[str | None, str, str]] = field(default_factory=set)
     via: str = "publish"
+    confirmed: bool = False
 
     def next(self, seconds: float) -> dict[str, Any] | None:
         """The next reply. Raises Empty after ``seconds`` without one."""
         return self.arrived.get(timeout=min(seconds, threading.TIMEOUT_MAX))
+
+    def delivery(self) -> dict[str, Any]:
+        """How the command travelled, for whoever sent it."""
+        return {"via": self.via, "confirmed": self.confirmed}
 
 
 class Caller:
@@ -55,29 +69,32 @@ class Caller:
         self._lock = threading.Lock()
 
     def send(self, target: object, command: object, timeout: object) -> dict[str, Any]:
-        """The raw reply of ``target``; or status ``timeout``; or status ``error`` with the refused precondition."""
+        """The raw reply of ``target``; or status ``timeout``; or status ``error`` with the refused precondition.
+
+        What was sent is told how: ``via`` and ``confirmed`` are ours, whatever a reply says under these names.
+        """
         prepared = self._prepare(target, command, timeout)
         if isinstance(prepared, str):
             return refused(prepared)
         peer, clean, seconds = prepared
-        turn_id, turn = self._open(peer)
+        turn = Turn(peer)
         try:
-            problem = self._publish(topics.command(peer), clean, turn_id, turn, seconds)
+            problem = self._publish(topics.command(peer), clean, turn, seconds)
             if problem is not None:
-                return refused(problem) | ({"via": turn.via} if problem == OFFLINE else {})
+                return refused(problem) | (turn.delivery() if problem == OFFLINE else {})
             reply = turn.next(seconds)
-            return reply if reply is not None else refused("the mesh was stopped while the reply was awaited.")
+            return (reply or refused("the mesh was stopped while the reply was awaited.")) | turn.delivery()
         except Empty:
-            return {"status": "timeout", "target": peer, "turn_id": turn_id}
+            return {"status": "timeout", "target": peer, "turn_id": turn.ids[0], **turn.delivery()}
         finally:
-            self._close(turn_id)
+            self._close(turn)
 
     def ping(self, target: object, timeout: object) -> dict[str, Any]:
         """One ping: status ok, timeout or error; the round trip in milliseconds; how it was delivered."""
         started = time.perf_counter()
         reply = self.send(target, {"action": "ping"}, timeout)
         latency = round((time.perf_counter() - started) * 1000, 3)
-        via = "direct" if self._confirms(target) else "publish"
+        via = reply.get("via")
         if reply.get("error") == OFFLINE and "type" not in reply:
             return {"status": OFFLINE, "latency_ms": latency, "via": via, "reason": OFFLINE}
         if reply.get("status") == "error" and "type" not in reply:
@@ -86,56 +103,62 @@ class Caller:
             return {"status": "timeout", "latency_ms": latency, "via": via}
         if reply.get("type") == "error":
             return {"status": "error", "error": reply.get("error", ""), "latency_ms": latency, "via": via}
-        return {"status": "ok", "latency_ms": latency, "via": via, "confirmed": via == "direct"}
+        return {"status": "ok", "latency_ms": latency, "via": via, "confirmed": reply["confirmed"]}
 
     def broadcast(
         self, command: object, timeout: object, missing: Callable[[list[dict[str, Any]]], set[str]] | None = None
     ) -> list[dict[str, Any]]:
-        """Every reply that came within ``timeout``; ``[]`` for a refused precondition.
+        """The reply of each that answered within ``timeout``; ``[]`` for a refused precondition.
 
         Args:
-            missing: the peers still to answer. The collection ends when there is none, and until then the command
-                is sent to each of them again twice a second.
+            missing: the peers still to answer, by the results so far. The collection ends when there is none, and
+                until then the command is sent to each of them again twice a second. A peer's result stands over an
+                error of it.
         """
         prepared = self._prepare("all", command, timeout)
         if isinstance(prepared, str):
             logger.warning("broadcast: %s", prepared)
             return []
         _, clean, seconds = prepared
-        turn_id, turn = self._open(BROADCAST_RESPONDER)
+        turn = Turn(BROADCAST_RESPONDER)
         try:
-            problem = self._publish(topics.broadcast(), clean, turn_id, turn)
+            problem = self._publish(topics.broadcast(), clean, turn)
             if problem is not None:
                 logger.warning("broadcast: %s", problem)
                 return []
-            return self._collect(turn, turn_id, clean, seconds, missing)
+            return self._collect(turn, clean, seconds, missing)
         finally:
-            self._close(turn_id)
+            self._close(turn)
 
     def _collect(
         self,
         turn: Turn,
-        turn_id: str,
         command: dict[str, Any],
         seconds: float,
         missing: Callable[[list[dict[str, Any]]], set[str]] | None,
     ) -> list[dict[str, Any]]:
-        replies: list[dict[str, Any]] = []
+        replies: dict[str, dict[str, Any]] = {}
+
+        def absent() -> set[str]:
+            return missing([each for each in replies.values() if each["type"] == "response"]) if missing else set()
+
         now = time.monotonic()
         deadline = now + seconds
         again = now + REPEAT_S if missing is not None else deadline
-        while now < deadline and (missing is None or missing(replies)):
+        while now < deadline and (missing is None or absent()):
             with contextlib.suppress(Empty):  # nobody answered in this stretch
                 reply = turn.next(min(deadline, again) - now)
                 if reply is None:
                     break
-                replies.append(reply)
+                who = str(reply["responder_id"])
+                if who not in replies or (replies[who]["type"], reply["type"]) == ("error", "response"):
+                    replies[who] = reply
             now = time.monotonic()
             if missing is not None and now >= again:
                 again = now + REPEAT_S
-                for peer in missing(replies):
-                    self._publish(topics.command(peer), command, turn_id, turn)
-        return replies
+                for peer in absent():
+                    self._publish(topics.command(peer), command, turn)
+        return list(replies.values())
 
     def on_response(self, sample: Sample) -> None:
         """A sample on our response topic: counted, or refused and audited."""
@@ -181,7 +204,7 @@ class Caller:
         return None
 
     def _count(self, sample: Sample, reply: wire.Reply, turn: Turn, body: dict[str, Any]) -> None:
-        who = (sample.session, reply.responder_id)
+        who = (sample.session, reply.responder_id, reply.turn_id)
         with self._lock:
             duplicate = who in turn.answered
             counts = not duplicate and len(turn.answered) < REPLIES_MAX
@@ -207,35 +230,33 @@ class Caller:
             return f"target must be a peer id, not {shown(target)}."
         return target, clean, seconds
 
-    def _confirms(self, target: object) -> bool:
-        """Whether this target's commands go by a transport that tells if anybody takes them."""
-        return callable(getattr(self._context.transport, "put_confirmed", None)) and isinstance(target, str)
-
-    def _publish(
-        self, key: str, command: dict[str, Any], turn_id: str, turn: Turn, seconds: float | None = None
-    ) -> str | None:
+    def _publish(self, key: str, command: dict[str, Any], turn: Turn, seconds: float | None = None) -> str | None:
         context = self._context
-        request = wire.Request(context.peer_id, turn_id, command, context.clock())
+        request = wire.Request(context.peer_id, self._open(turn), command, context.clock())
         confirmed: PutConfirmed | None = getattr(context.transport, "put_confirmed", None)
         try:
             body = context.identity.sign(request.to_wire())
             if seconds is not None and confirmed is not None:
                 turn.via = "direct"
-                return None if confirmed(key, body, seconds) is not False else OFFLINE
+                taken = confirmed(key, body, seconds)
+                turn.confirmed = taken is True
+                return None if taken is not False else OFFLINE
             context.put(key, body)
         except (wire.WireError, TransportError) as exc:
             return str(exc)
         return None
 
-    def _open(self, expected: str) -> tuple[str, Turn]:
-        turn_id, turn = uuid.uuid4().hex, Turn(expected)
+    def _open(self, turn: Turn) -> str:
+        turn_id = uuid.uuid4().hex
         with self._lock:
+            turn.ids.append(turn_id)
             self._turns[turn_id] = turn
-        return turn_id, turn
+        return turn_id
 
-    def _close(self, turn_id: str) -> None:
+    def _close(self, turn: Turn) -> None:
         with self._lock:
-            self._turns.pop(turn_id, None)
+            for turn_id in turn.ids:
+                self._turns.pop(turn_id, None)
 
 
 def refused(why: str) -> Refusal:
