@@ -42,6 +42,11 @@ class InputSink(Protocol):
         """Carry one frame; ``events`` is None when the leader has none or reading them failed."""
 
 
+def named_events(events: Mapping[Any, Any]) -> dict[str, Any]:
+    """The events of a leader by name; LeRobot's are named by a plain enumeration."""
+    return {str(getattr(key, "value", key)): value for key, value in dict(events).items()}
+
+
 class ScriptedLeader:
     """A leader without hardware: every key follows a sine around a centre.
 
@@ -171,7 +176,7 @@ class LeaderPolicy:
         if not callable(read):
             return None
         try:
-            return {str(getattr(key, "value", key)): value for key, value in dict(read()).items()}
+            return named_events(read())
         except Exception as exc:
             self.last_error = f"get_teleop_events: {type(exc).__name__}: {exc}"
             logger.debug("The events of %s could not be read.", self._device, exc_info=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from enum import Enum
 from typing import Any
 
 import pytest
@@ -59,6 +60,19 @@ def stream(peers: Fleet) -> Iterator[Stream]:
     assert made.receiver.start_refusal is None
     yield made
     made.receiver.stop()
+
+
+def heard(peers: Fleet, teleoperator: Any) -> dict[str, Any]:
+    """The first frame that a leader's publisher puts on the mesh."""
+    frames: list[Any] = []
+    listener, lead = peers.join(None, "listener"), peers.join(None, "lead")
+    publisher = InputPublisher(lead, teleoperator, hz=50)
+    assert listener.subscribe(publisher.topic, lambda key, data: frames.append(data))
+    publisher.start()
+    eventually(lambda: frames, within=5)
+    publisher.stop()
+    frame: dict[str, Any] = frames[0]
+    return frame
 
 
 def test_a_leaders_actions_reach_the_follower_in_order(peers: Fleet) -> None:
@@ -244,6 +258,18 @@ def test_a_device_without_actions_and_a_wildcard_name_are_refused(peers: Fleet) 
         InputPublisher(mesh, Leader(), device_name="*")
     with pytest.raises(ValidationError):
         InputReceiver(mesh, Arm(), "**")
+
+
+def test_events_named_by_an_enumeration_travel_under_their_own_names(peers: Fleet) -> None:
+    class TeleopEvents(Enum):
+        TERMINATE_EPISODE = "terminate_episode"
+
+    class Pad(Leader):
+        def get_teleop_events(self) -> dict[Any, Any]:
+            return {TeleopEvents.TERMINATE_EPISODE: 1, "success": False}
+
+    told = heard(peers, Pad())
+    assert told["events"] == {"terminate_episode": True, "success": False}
 
 
 def test_a_device_that_fails_is_counted_and_goes_on(peers: Fleet) -> None:

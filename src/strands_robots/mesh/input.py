@@ -18,6 +18,7 @@ from strands_robots.mesh.security import validate_mesh_identifier
 from strands_robots.mesh.stream import numbers
 from strands_robots.mesh.transport.base import TransportError
 from strands_robots.mesh.wire import WireError
+from strands_robots.teleop import named_events
 from strands_robots.utils import number, teleoperator_contract_error, text
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ class InputPublisher:
             return None
         try:
             events = read()
-            return {str(key): bool(value) for key, value in events.items()} if events is not None else None
+            return None if events is None else {key: bool(value) for key, value in named_events(events).items()}
         except Exception as exc:  # noqa: BLE001 - counted and told; the action is still good
             self._event_errors += 1
             if self._event_errors <= LOGGED_ERRORS:
