@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from importlib.metadata import EntryPoint
 from typing import Any
 
 import pytest
@@ -11,7 +12,10 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
+from strands_robots.mesh.context import registered_providers
+from strands_robots.mesh.security import ValidationError, validate_command
 from strands_robots.mesh.transport.memory import MemoryTransport
+from strands_robots.policies import registry as policy_registry
 from strands_robots.safety.approval import Grants, state_dir
 
 
@@ -304,3 +308,55 @@ def test_without_sessions_a_reply_is_the_brokers_word(peers: Fleet) -> None:
     peers.join(World("left"), "sim-1", "sim", sessionless=True)
     console = peers.join(None, "console", sessionless=True)
     assert console.ping("sim-1")["status"] == "ok"
+
+
+@pytest.mark.parametrize("command", [{"action": "stop", "duration": -1}, {"action": "teleop_stop", "steps": 2.5}])
+def test_what_takes_energy_away_is_refused_for_no_field_that_it_does_not_use(
+    peers: Fleet, command: dict[str, Any]
+) -> None:
+    peers.join(Arm(), "arm-1")
+    reply = ask(peers, peers.stranger(), "arm-1", {"command": command})[0]
+    assert reply["type"] == "response"
+    named = ask(peers, peers.stranger(), "arm-1", {"command": {"action": "stop", "robot_name": "a/b"}})[0]
+    assert named["error"].startswith("validation: robot_name")
+
+
+@pytest.mark.parametrize("action", ["stop", "teleop_stop"])
+def test_what_takes_energy_away_asks_for_no_clock_and_is_done_again(peers: Fleet, action: str) -> None:
+    peers.join(Arm(), "arm-1")
+    for shift in (-3600, 3600, 0, 0):
+        body = {"command": {"action": action}, "timestamp": peers.clock() + shift}
+        assert ask(peers, peers.stranger(), "arm-1", body)[0]["type"] == "response"
+
+
+def test_a_plug_ins_policy_is_known_on_the_wire(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World("left")
+    peers.join(world, "sim-1", "sim")
+    console = peers.join(None, "console")
+    start = {"action": "start", "instruction": "wave", "policy_provider": "house_made"}
+    refused = console.send("sim-1", start, timeout=5)
+    assert refused["error"].startswith("validation: policy_provider must be one of")
+    entry = EntryPoint("house_made", "house:Made", "strands_robots.policies")
+    monkeypatch.setattr(policy_registry, "entry_points", lambda group: [entry])
+    registered_providers.cache_clear()
+    try:
+        assert console.send("sim-1", start, timeout=5)["result"]["status"] == "success"
+    finally:
+        registered_providers.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["pi0", "groot", "cosmos3", "smolvla"])
+def test_a_provider_of_other_builds_validates(name: str) -> None:
+    assert validate_command({"action": "start", "policy_provider": name})["policy_provider"] == name
+
+
+def test_a_provider_that_the_operator_lists_validates_and_an_unknown_one_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(ValidationError) as refused:
+        validate_command({"action": "start", "policy_provider": "own"})
+    assert refused.value.code == "POLICY_TYPE_NOT_ALLOWED"
+    monkeypatch.setenv("STRANDS_MESH_POLICY_TYPE_ALLOW", "own")
+    assert validate_command({"action": "start", "policy_provider": "own"})["policy_provider"] == "own"
+    with pytest.raises(ValidationError):
+        validate_command({"action": "start", "policy_provider": "pi0"})

@@ -40,6 +40,31 @@ def test_an_emergency_stop_halts_and_locks_everybody_under_one_epoch(peers: Flee
     assert (recorded["responses_received"], recorded["peers_not_stopped"], recorded["peers_silent"]) == (3, 0, 0)
 
 
+def test_a_console_has_nothing_to_halt_and_answers_nothing(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    assert console.emergency_stop() == []
+    peers.join(Arm("arm-1"), "arm-1")
+    assert [answer["responder_id"] for answer in console.emergency_stop()] == ["arm-1"]
+    assert [each["responses_received"] for each in peers.events("emergency_stop")] == [0, 1]
+
+
+@pytest.mark.parametrize("assertion", [None, "no object", 5, {"v": 1}])
+def test_a_resume_that_is_none_is_rejected_like_every_other_and_counted(
+    peers: Fleet, key: Any, assertion: object
+) -> None:
+    arm = peers.join(Arm("arm-1"), "arm-1")
+    arm.emergency_stop()
+    console = peers.join(None, "console")
+    for _ in range(5):
+        reply = console.send("arm-1", {"action": "resume", "assertion": assertion, "duration": -1}, timeout=5)
+        assert reply["result"] == {"status": "error", "error": "resume rejected"}
+    # The sixth is refused whatever it holds: the five were counted.
+    good = sign(key, arm.lockout_epoch, ["arm-1"])[0]
+    refused = console.send("arm-1", {"action": "resume", "assertion": good}, timeout=5)
+    assert refused["result"]["error"] == "resume rejected"
+    assert arm.lockout_epoch is not None
+
+
 def test_hardware_is_kept_locked_under_its_own_key_whatever_it_is_called(peers: Fleet, tmp_path: Path) -> None:
     arm = Arm("arm-1")
     arm.safety_key = "hardware:so101:left"  # type: ignore[attr-defined]  # as real robots have it
@@ -68,7 +93,7 @@ def test_the_envelope_goes_out_at_once_and_again_with_the_counts(peers: Fleet) -
     seen: list[dict[str, Any]] = []
     peers.stranger().declare_subscriber("strands/safety/estop", lambda sample: seen.append(json.loads(sample.payload)))
     console.emergency_stop()
-    assert [body["responses_received"] for body in seen] == [0, 2]
+    assert [body["responses_received"] for body in seen] == [0, 1]
     assert len({body["estop_id"] for body in seen}) == 1
     assert seen[0]["source_zid"] == peers.transports["console"].session_id
     assert set(seen[1]) == {

@@ -172,7 +172,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     key = _safety_key(robot, peer, keep=parts.keep)
     door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
     caller = Caller(context)
-    safety = FleetSafety(context, door, caller, lanes.stop_lane)
+    safety = FleetSafety(context, door, caller, lanes.stop_lane, robot=robot is not None)
     teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, _body(robot), source, device))
     inputs: dict[str, dict[str, Any]] = {}
 

@@ -251,7 +251,7 @@ class Mesh(SensorLoopsMixin):
         return next(iter(self._assembled.door.epochs()), None)
 
     def emergency_stop(self) -> list[dict[str, Any]]:
-        """Stop and lock this robot and every peer; the local answer first, then each peer's.
+        """Stop and lock this robot and every peer; the answer of the robot here, if any, then each peer's.
 
         A peer that did not stop or did not answer is named at CRITICAL.
 

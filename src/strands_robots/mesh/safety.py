@@ -40,13 +40,15 @@ class FleetSafety:
 
     Args:
         lane: where a relayed resume is checked, off the transport's thread.
+        robot: this peer has one, whose answer to an e-stop comes first.
     """
 
-    def __init__(self, context: Context, door: SafetyDoor, caller: Caller, lane: Lane) -> None:
+    def __init__(self, context: Context, door: SafetyDoor, caller: Caller, lane: Lane, *, robot: bool = True) -> None:
         self._context = context
         self._door = door
         self._caller = caller
         self._lane = lane
+        self._robot = robot
         self._pursuit = Pursuit(context, caller, f"mesh-{context.peer_id}-pursuit")
         self._recent: deque[str] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
@@ -58,7 +60,7 @@ class FleetSafety:
     # Issuing.
 
     def emergency_stop(self) -> list[dict[str, Any]]:
-        """Stop this robot and every peer; the local answer first, then each attributed reply."""
+        """Stop this robot and every peer; the answer of the robot here, if any, then each attributed reply."""
         context = self._context
         order = StopOrder(new_epoch(), context.peer_id, "emergency stop", "mesh", issued=context.clock())
         # The halt is set going, and the fleet hears of it while the local robot stops.
@@ -78,11 +80,8 @@ class FleetSafety:
             return absent
 
         replies = self._caller.broadcast({"action": "stop"}, COLLECT_S, missing)
-        verdict = (local() if local is not None else None) or StopVerdict(unknown={context.peer_id: "no answer"})
-        own = wire.Reply(
-            "response", context.peer_id, order.epoch, dispatch.told(verdict), timestamp=context.clock()
-        ).to_wire()
-        responses = [own, *replies]
+        verdict = local() if local is not None else None
+        responses = [*self._own(order, verdict), *replies]
         not_stopped = [str(each["responder_id"]) for each in responses if not _stopped(each)]
         silent = sorted(roster - {str(each["responder_id"]) for each in replies})
         for peer in not_stopped:
@@ -114,6 +113,14 @@ class FleetSafety:
             lockout_engaged=self.locked(),
         )
         return responses
+
+    def _own(self, order: StopOrder, verdict: StopVerdict | None) -> list[dict[str, Any]]:
+        """What the robot here answers, as a peer would; a peer without one has nothing to halt and says nothing."""
+        if not self._robot:
+            return []
+        context = self._context
+        told = dispatch.told(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
+        return [wire.Reply("response", context.peer_id, order.epoch, told, timestamp=context.clock()).to_wire()]
 
     def _publish_estop(self, order: StopOrder, counts: dict[str, Any]) -> None:
         context = self._context

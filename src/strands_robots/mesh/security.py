@@ -60,15 +60,25 @@ BUILT_IN_ORGS = frozenset({"nvidia", "huggingface", "lerobot"})
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 PROVIDERS = frozenset({"mock", "remote", "lerobot_local", "lerobot"})
 PROVIDERS_ELSEWHERE = frozenset(
-    {"groot", "cosmos3", "cosmos", "openpi", "openvla", "smolvla", "dreamzero", "dreamgen", "gr00t", "lerobot_async"}
+    {"act", "cosmos", "cosmos3", "diffusion", "dreamgen", "dreamzero", "gr00t", "groot", "lerobot_async", "openpi"}
+    | {"openvla", "pi0", "pi05", "pi0_fast", "pi0fast", "rdt", "sac", "smolvla", "sonic", "tdmpc", "vqbet", "wbc"}
 )
-"""Providers that peers of other builds have: they validate, and the robot answers that it has none of the name."""
+"""Providers that peers of other builds have: they validate, and the robot answers that it has none of the name.
+
+A name outside the table is added to it by the operator, in ``STRANDS_MESH_POLICY_TYPE_ALLOW``, or by a plug-in.
+"""
 
 INPUT_KEYS = 64
 INPUT_KEY_CHARACTERS = 64
 INPUT_VALUE_ABS = 720.0
 
 _REPO = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,95})/([A-Za-z0-9][A-Za-z0-9._-]{0,95})\Z")
+
+STOP_FIELDS: Mapping[str, frozenset[str]] = {
+    "stop": frozenset({"robot_name"}),
+    "teleop_stop": frozenset({"source_peer_id", "device_name"}),
+}
+"""All that is looked at in what only takes energy away: nothing else in the message may keep it from doing so."""
 
 Check = Callable[[str, object], Any]
 
@@ -90,12 +100,15 @@ def validate_peer_id(value: object) -> str:
     return peer
 
 
-def validate_command(command: object, *, providers: Sequence[str] = ()) -> dict[str, Any]:
+def validate_command(command: object, *, providers: Sequence[str] | Callable[[], Sequence[str]] = ()) -> dict[str, Any]:
     """The command with defaults filled in and unknown keys dropped.
 
     Args:
         command: an object with ``action`` and that action's fields.
-        providers: policy providers that plug-ins added to the table.
+        providers: policy providers that plug-ins added to the table, or what gives them; asked for a name that is
+            in no table of ours.
+
+    A resume's assertion is passed on as it is: whoever checks it counts what it refuses.
 
     Raises:
         ValidationError: naming the field, the value and its domain.
@@ -105,9 +118,12 @@ def validate_command(command: object, *, providers: Sequence[str] = ()) -> dict[
     if not isinstance(action, str) or action not in ACTIONS:
         raise ValidationError(f"action must be one of {', '.join(ACTIONS)}, not {shown(action)}.")
     clean: dict[str, Any] = {"action": action}
+    if action == "resume":
+        return {**clean, "assertion": given.get("assertion")}
+    looked_at = STOP_FIELDS.get(action, _FIELDS.keys())
     for name, value in given.items():
         check = _FIELDS.get(name)
-        if check is not None and value is not None:
+        if check is not None and value is not None and name in looked_at:
             clean[name] = check(name, value)
     if action in ("execute", "start"):
         clean["policy_provider"] = _provider(given.get("policy_provider"), providers)
@@ -117,8 +133,6 @@ def validate_command(command: object, *, providers: Sequence[str] = ()) -> dict[
         clean.pop("policy_provider", None)
     if action == "teleop_receive" and "source_peer_id" not in clean:
         raise ValidationError("source_peer_id must name the leader for teleop_receive, not None.")
-    if action == "resume":
-        clean["assertion"] = mapping("assertion", given.get("assertion"))
     return clean
 
 
@@ -160,12 +174,17 @@ def validate_input_frame(action: object, *, limit: float | None = None) -> dict[
         raise ValidationError(str(exc), TELEOP_VALUE_OUT_OF_RANGE) from None
 
 
-def _provider(value: object, registered: Sequence[str]) -> str:
+def _provider(value: object, providers: Sequence[str] | Callable[[], Sequence[str]]) -> str:
     name = identifier("policy_provider", value)
-    if name not in PROVIDERS and name not in PROVIDERS_ELSEWHERE and name not in registered:
-        known = ", ".join(sorted(PROVIDERS | set(registered)))
-        raise ValidationError(f"policy_provider must be one of {known}, not {shown(value)}.", POLICY_TYPE_NOT_ALLOWED)
-    refusal = provider_refusal(name, settings.items("STRANDS_MESH_POLICY_TYPE_ALLOW"))
+    allow = settings.items("STRANDS_MESH_POLICY_TYPE_ALLOW")
+    if name not in PROVIDERS and name not in PROVIDERS_ELSEWHERE and name not in allow:
+        registered = providers() if callable(providers) else providers
+        if name not in registered:
+            known = ", ".join(sorted(PROVIDERS | set(registered)))
+            raise ValidationError(
+                f"policy_provider must be one of {known}, not {shown(value)}.", POLICY_TYPE_NOT_ALLOWED
+            )
+    refusal = provider_refusal(name, allow)
     if refusal is not None:
         raise ValidationError(refusal, POLICY_TYPE_NOT_ALLOWED)
     return name

@@ -14,7 +14,7 @@ from strands_robots.mesh import topics, wire
 from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lanes
-from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, validate_command
+from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, STOP_FIELDS, validate_command
 from strands_robots.mesh.transport.base import Sample, TransportError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate
@@ -226,14 +226,15 @@ class Server:
         if not isinstance(request.command, dict):
             raise Refused(MISSING_COMMAND)
         try:
-            command = validate_command(request.command, providers=self._context.providers())
+            command = validate_command(request.command, providers=self._context.providers)
         except ValidationError as exc:
             raise Refused(f"validation: {exc}") from None
         action = command["action"]
         if action not in ANSWERED_WHILE_LOCKED and self._locked():
             raise Refused(LOCKED, reason="locked by an emergency stop")
-        # A stop that comes twice stops twice: refusing one as a replay could only leave a robot moving.
-        if action in CHANGING and action != "stop":
+        # What only takes energy away is done twice, and whatever the sender's clock says: refusing one as a replay
+        # could only leave a robot moving.
+        if action in CHANGING and action not in STOP_FIELDS:
             if request.timestamp is None or not wire.fresh(request.timestamp, self._context.clock()):
                 raise Refused(REPLAYED, reason="the timestamp is not fresh")
             if not self._replays.first(request.sender_id, request.turn_id):
