@@ -106,6 +106,8 @@ class LeaderPolicy:
         self.frames = 0
         self.errors = 0
         self.sink_errors = 0
+        self.event_errors = 0
+        """Frames that went to the sink without events because reading those failed."""
         self.last_error = ""
         self._leader = leader
         self._device, self._method = device, method
@@ -164,20 +166,26 @@ class LeaderPolicy:
         if self._sink is None:
             return
         try:
-            self._sink.publish(self._device, self._method, numbers(frame), self.events())
+            self._sink.publish(self._device, self._method, numbers(frame), self._readable_events())
         except Exception:
             self.sink_errors += 1
             if self.sink_errors == 1:
                 logger.exception("The frames of %s do not reach the network; the follower goes on.", self._device)
 
     def events(self) -> dict[str, Any] | None:
-        """What the leader tells besides its targets; None where it tells nothing, or the reading failed."""
+        """What the leader tells besides its targets; None where it tells nothing. Raises what the leader raises."""
         read = getattr(self._leader, "get_teleop_events", None)
-        if not callable(read):
-            return None
+        events = read() if callable(read) else None
+        return None if events is None else named_events(events)
+
+    def _readable_events(self) -> dict[str, Any] | None:
         try:
-            return named_events(read())
+            return self.events()
         except Exception as exc:
+            self.event_errors += 1
             self.last_error = f"get_teleop_events: {type(exc).__name__}: {exc}"
-            logger.debug("The events of %s could not be read.", self._device, exc_info=True)
+            if self.event_errors == 1:
+                logger.warning(
+                    "The events of %s cannot be read; its frames go on without.", self._device, exc_info=True
+                )
             return None

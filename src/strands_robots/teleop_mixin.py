@@ -145,7 +145,7 @@ class TeleopMixin:
         return success(f"Stopped {', '.join(asked)}.", **fields)
 
     def teleop_status(self) -> Envelope:
-        """One row for each leader that leads or has led: robot, frames, errors, state, steps and rate."""
+        """One row for each leader that leads or has led: robot, frames, errors, ``event_read_errors``, state, steps, rate."""
         rows = self._teleop_rows({name: rollout for name, (rollout, _) in self._teleop_sessions.items()})
         return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
 
@@ -229,6 +229,7 @@ class TeleopMixin:
                 "error": rollout.error or policy.last_error,
                 "frames": policy.frames,
                 "errors": policy.errors,
+                "event_read_errors": policy.event_errors,
                 "hz_actual": round(rollout.step_count / rollout.elapsed_s, 2) if rollout.elapsed_s > 0 else 0.0,
             }
         return rows

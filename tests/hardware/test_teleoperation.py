@@ -184,3 +184,23 @@ def test_events_of_a_leader_go_with_its_frames() -> None:
     policy.reset("", {"a": (-1.0, 1.0)})
     policy.act({"a": 0.0})
     assert sink.frames[0][3] == {"terminate_episode": True}
+
+
+def test_events_that_cannot_be_read_are_counted_told_once_and_shown(
+    robot: HardwareRobot, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Mute(Leader):
+        def get_teleop_events(self) -> dict[str, bool]:
+            raise OSError("no events")
+
+    sink = Sink()
+    robot.input_sink = sink
+    robot.attach_teleop(Mute({"pan.pos": 10.0}))
+    robot.teleoperate(publish=True)
+    eventually(lambda: len(sink.frames) >= 3)
+    robot.stop_teleoperate()
+    row = robot.teleop_status()["leaders"]["leader"]
+    assert row["event_read_errors"] == row["frames"] == len(sink.frames)
+    assert row["errors"] == 0
+    assert {frame[3] for frame in sink.frames} == {None}
+    assert sum("cannot be read" in line.message for line in caplog.records) == 1

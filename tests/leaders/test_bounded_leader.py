@@ -65,3 +65,13 @@ def test_a_leader_that_fails_for_long_is_given_up_with_its_reason() -> None:
         leader.get_action()
     assert leader.done.is_set()
     assert "unplugged" in leader.error
+
+
+def test_a_failed_reading_of_its_events_is_told_to_who_counts_it() -> None:
+    class Pad(Leader):
+        def get_teleop_events(self) -> dict[str, bool]:
+            raise OSError("no events")
+
+    leader = BoundedLeader(LeaderPolicy(Pad(dict)), {"pan.pos": 0.0}, RANGES)
+    with pytest.raises(OSError, match="no events"):
+        leader.get_teleop_events()

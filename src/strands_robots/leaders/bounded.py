@@ -57,7 +57,7 @@ class BoundedLeader:
         return dict(decided)
 
     def get_teleop_events(self) -> dict[str, Any] | None:
-        """What the leader itself tells besides its targets."""
+        """What the leader itself tells besides its targets. Raises what the leader raises."""
         return self._policy.events()
 
     def _held(self) -> Action:
