@@ -186,6 +186,6 @@ class LeaderPolicy:
             self.last_error = f"get_teleop_events: {type(exc).__name__}: {exc}"
             if self.event_errors == 1:
                 logger.warning(
-                    "The events of %s cannot be read; its frames go on without.", self._device, exc_info=True
+                    "The events of %s cannot be read; frames go on without.", self._device, exc_info=True
                 )
             return None

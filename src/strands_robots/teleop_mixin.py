@@ -145,7 +145,7 @@ class TeleopMixin:
         return success(f"Stopped {', '.join(asked)}.", **fields)
 
     def teleop_status(self) -> Envelope:
-        """One row for each leader that leads or has led: robot, frames, errors, ``event_read_errors``, state, steps, rate."""
+        """One row for each leader that leads or has led: robot, frames, its counted errors, state, steps and rate."""
         rows = self._teleop_rows({name: rollout for name, (rollout, _) in self._teleop_sessions.items()})
         return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
 

@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterator
 from enum import Enum
 from typing import Any
 
+import numpy as np
 import pytest
 from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
+from strands_robots.mesh import input as input_module
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputPublisher, InputReceiver
 from strands_robots.mesh.security import ValidationError
@@ -270,6 +272,62 @@ def test_events_named_by_an_enumeration_travel_under_their_own_names(peers: Flee
 
     told = heard(peers, Pad())
     assert told["events"] == {"terminate_episode": True, "success": False}
+
+
+def test_what_travels_of_an_action_is_floats(peers: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+    class Odd(Leader):
+        def get_action(self) -> dict[str, Any]:
+            return {
+                "whole": 3,
+                "scalar": np.float32(0.5),
+                "lone": np.array([[2.0]]),
+                "several": np.array([1.0, 2.0]),
+                "flag": np.bool_(1),
+                "list": [1.0],
+                "hot": float("nan"),
+                "word": "x",
+            }
+
+    told = heard(peers, Odd())
+    assert told["action"] == {"whole": 3.0, "scalar": 0.5, "lone": 2.0}
+    assert all(type(value) is float for value in told["action"].values())
+    assert sum("flag, hot, list, several, word" in line.message for line in caplog.records) == 1
+
+
+@pytest.mark.parametrize("action", [{"a": "x"}, {"a": True}, {}, None, [1.0]])
+def test_an_action_without_a_number_is_an_error_and_no_frame(peers: Fleet, action: object) -> None:
+    leader = Leader()
+    leader.get_action = lambda: action  # type: ignore[method-assign, assignment, return-value]
+    publisher = InputPublisher(peers.join(None, "lead"), leader, hz=200)
+    publisher.start()
+    eventually(lambda: publisher.stats["errors"] >= 3, within=3)
+    assert publisher.stop()["frames"] == 0
+
+
+def test_a_publisher_whose_loop_outlived_its_stop_starts_no_second_one(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(input_module, "_INPUT_JOIN_TIMEOUT_S", 0.05)
+    free, asked = threading.Event(), threading.Event()
+
+    class Wedged(Leader):
+        def get_action(self) -> dict[str, float]:
+            asked.set()
+            free.wait(10)
+            return super().get_action()
+
+    publisher = InputPublisher(peers.join(None, "lead"), Wedged(), hz=200)
+    publisher.start()
+    assert asked.wait(3)
+    assert publisher.stop()["thread_alive"] is True
+    with pytest.raises(RuntimeError, match="stop it again"):
+        publisher.start()
+    free.set()
+    monkeypatch.undo()
+    assert publisher.stop()["thread_alive"] is False
+    publisher.start()
+    eventually(lambda: publisher.stats["frames"] >= 3, within=3)
+    assert publisher.stop()["thread_alive"] is False
 
 
 def test_a_device_that_fails_is_counted_and_goes_on(peers: Fleet) -> None:

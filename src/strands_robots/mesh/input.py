@@ -1,25 +1,25 @@
 """Teleoperation over the mesh: a leader publishes its actions, a follower applies them.
 
-A frame on ``strands/PEER/input/DEVICE`` is ``peer_id``, ``device``, ``method``, ``t``, ``seq``, ``action`` (numbers by
+A frame on ``strands/PEER/input/DEVICE`` is ``peer_id``, ``device``, ``method``, ``t``, ``seq``, ``action`` (floats by
 joint) and ``events`` (or null).
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.mesh import topics
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.mesh.security import validate_mesh_identifier
-from strands_robots.mesh.stream import numbers
 from strands_robots.mesh.transport.base import TransportError
 from strands_robots.mesh.wire import WireError
 from strands_robots.teleop import named_events
-from strands_robots.utils import number, teleoperator_contract_error, text
+from strands_robots.utils import ValidationError, number, shown, teleoperator_contract_error, text
 
 if TYPE_CHECKING:
     from strands_robots.mesh.core import Mesh
@@ -29,7 +29,8 @@ __all__ = ["INPUT_HZ_DEFAULT", "InputPublisher", "InputReceiver"]
 logger = logging.getLogger(__name__)
 
 INPUT_HZ_DEFAULT = 50.0
-INPUT_JOIN_TIMEOUT_S = 2.0
+_INPUT_JOIN_TIMEOUT_S = 2.0
+"""How long a stop waits for the publishing loop, in seconds."""
 LOGGED_ERRORS = 5
 
 
@@ -61,6 +62,7 @@ class InputPublisher:
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._frames = self._errors = self._event_errors = 0
+        self._left_out: list[str] = []
         self._started = self._ended = 0.0
 
     @property
@@ -92,9 +94,15 @@ class InputPublisher:
         }
 
     def start(self) -> None:
-        """Start publishing; already running is fine."""
+        """Start publishing; already running is fine.
+
+        Raises:
+            RuntimeError: the loop of an earlier start outlived its stop; :meth:`stop` again waits for it once more.
+        """
         if self._running:
             return
+        if self._thread is not None and self._thread.is_alive():
+            raise RuntimeError(f"{self.topic}: the loop of the last start still waits for its leader; stop it again.")
         self._running = True
         self._stopping = threading.Event()
         self._frames = self._errors = self._event_errors = 0
@@ -113,7 +121,7 @@ class InputPublisher:
         self._stopping.set()
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
-            thread.join(INPUT_JOIN_TIMEOUT_S)
+            thread.join(_INPUT_JOIN_TIMEOUT_S)
             if thread.is_alive():
                 logger.warning("%s: the publishing loop outlived its stop; it may send one more frame.", self.topic)
         return self.stats
@@ -138,7 +146,7 @@ class InputPublisher:
                 "method": self._method,
                 "t": self._mesh.now(),
                 "seq": self._mesh.next_input(self._device),
-                "action": numbers(action),
+                "action": self._normalised(action),
                 "events": self._events(),
             }
             self._mesh.publish(self.topic, frame)
@@ -148,6 +156,19 @@ class InputPublisher:
             self._note(f"{type(exc).__name__}: {exc}")
         else:
             self._frames += 1
+
+    def _normalised(self, action: object) -> dict[str, float]:
+        """The action as floats by joint. Raises :class:`ValidationError` when it holds none."""
+        if not isinstance(action, Mapping):
+            raise ValidationError(f"action must be an object of numbers by joint, not {shown(action)}.")
+        found = {str(key): number for key, value in action.items() if (number := _float(value)) is not None}
+        left_out = sorted(str(key) for key in action if str(key) not in found)
+        if not found:
+            raise ValidationError(f"action must hold a finite number for at least one joint, not {shown(action)}.")
+        if left_out and left_out != self._left_out:
+            logger.warning("%s: no finite numbers, left out of the frames: %s", self.topic, ", ".join(left_out))
+            self._left_out = left_out
+        return found
 
     def _events(self) -> dict[str, Any] | None:
         read: Callable[[], Any] | None = getattr(self._teleoperator, "get_teleop_events", None)
@@ -166,3 +187,14 @@ class InputPublisher:
         self._errors += 1
         if self._errors <= LOGGED_ERRORS:
             logger.warning("%s: %s", self.topic, problem)
+
+
+def _float(value: Any) -> float | None:
+    """The finite number that ``value`` is, or holds as the one element of an array; a flag is none."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+        while isinstance(value, list) and len(value) == 1:
+            value = value[0]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if math.isfinite(value) else None
