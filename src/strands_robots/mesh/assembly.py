@@ -23,6 +23,7 @@ from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Caller
 from strands_robots.mesh.safety import FleetSafety
 from strands_robots.mesh.scheduler import Scheduler
+from strands_robots.mesh.sensors import SensorDesk
 from strands_robots.mesh.serving import Line, MotionDoor, Server
 from strands_robots.mesh.state import StateReader, describe
 from strands_robots.mesh.stream import StepFeed
@@ -85,9 +86,9 @@ class Assembled:
     teleop: TeleopDesk
     subscriptions: Subscriptions
     steps: StepFeed
+    sensors: SensorDesk
     identity_of: Callable[[Transport], Identity]
     inputs: dict[str, dict[str, Any]]
-    sensors: list[str] = field(default_factory=list)
     held: list[Any] = field(default_factory=list)
 
     def begin(self, transport: Transport) -> None:
@@ -106,7 +107,8 @@ class Assembled:
         ]
         self.herald.start()
         every, rates = self.scheduler.every, topics.BY_NAME
-        self.sensors = self.mesh.add_robot_sensors() if self.mesh.robot is not None else []
+        if self.mesh.robot is not None:
+            self.mesh.add_robot_sensors()
         every("describe", rates["presence"].rate_hz, self.herald.refresh)
         every("state", rates["state"].rate_hz, self._publish_state)
         every("tokens", TOKENS_HZ, self.herald.judge_tokens, quick=True)
@@ -127,6 +129,7 @@ class Assembled:
         deadline = time.monotonic() + timeout
         self.teleop.close()
         alive = self.scheduler.stop(max(0.0, deadline - time.monotonic()))
+        alive += self.sensors.stop(max(0.0, deadline - time.monotonic()))
         alive += self.steps.stop(max(0.0, deadline - time.monotonic()))
         self.caller.close()
         dropped = self.subscriptions.clear()
@@ -197,20 +200,22 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
 
     line = Line(None if robot is None else robot.gate)
     approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
-    assembled: Assembled
+    scheduler = Scheduler(f"mesh-{peer}")
+    sensors = SensorDesk(context, scheduler)
 
     def facts() -> dict[str, Any]:
         told = describe(robot)
         if inputs:
             told["inputs"] = list(inputs.values())
-        if assembled.sensors:
-            told["topics"] = assembled.sensors
+        spoken = sensors.topics()
+        if spoken:
+            told["topics"] = spoken
         return told
 
-    assembled = Assembled(
+    return Assembled(
         mesh=mesh,
         context=context,
-        scheduler=Scheduler(f"mesh-{peer}"),
+        scheduler=scheduler,
         lanes=lanes,
         door=door,
         caller=caller,
@@ -220,11 +225,11 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         state=StateReader(peer, robot, parts.clock),
         teleop=teleop,
         subscriptions=Subscriptions(lanes.delivery),
+        sensors=sensors,
         steps=StepFeed(context, robot, settings.number("STRANDS_MESH_STREAM_HZ")),
         identity_of=parts.identity or identity_of,
         inputs=inputs,
     )
-    return assembled
 
 
 def identity_of(transport: Transport) -> Identity:

@@ -55,7 +55,7 @@ class Mesh(SensorLoopsMixin):
         self._frames: dict[str, count[int]] = {}
         self._assembled = assemble(self, self._parts)
         self._context = self._assembled.context
-        self._scheduler = self._assembled.scheduler
+        self._sensors = self._assembled.sensors
 
     # Life.
 
@@ -89,7 +89,7 @@ class Mesh(SensorLoopsMixin):
                 self._assembled.door.close()
             self._assembled = assemble(self, self._parts, self._assembled)
             self._context = self._assembled.context
-            self._scheduler = self._assembled.scheduler
+            self._sensors = self._assembled.sensors
         with _local_lock:
             if _local.get(self.peer_id) is self:
                 del _local[self.peer_id]

@@ -110,7 +110,7 @@ class StepFeed:
             unsubscribe()
         return self._lane.stop(timeout)
 
-    def hear(self, event: RolloutEvent) -> None:
+    def hear(self, event: object) -> None:
         """A rollout event, on its control thread; returns at once."""
         if not isinstance(event, RolloutEvent):
             return
