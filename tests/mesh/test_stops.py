@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
+from collections import Counter
 from typing import Any
 
 import pytest
@@ -12,6 +14,9 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope, success
+from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.stops import EACH, MOST, Stops
+from strands_robots.safety.stopping import StopVerdict
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 30.0}
 
@@ -48,6 +53,85 @@ def test_a_stop_does_not_wait_for_a_stream_whose_frame_hangs(peers: Fleet, monke
     arm.let_go.set()
     asking.join(8)
     assert answers[0]["result"]["ok"] is True
+
+
+class Slow(World):
+    """A world whose halt takes a while."""
+
+    def __init__(self, *names: str) -> None:
+        super().__init__(*names)
+        self.let_go, self.halting = threading.Event(), threading.Semaphore(0)
+        self.halts = 0
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        self.halts += 1
+        self.halting.release()
+        self.let_go.wait(10)
+        return super().halt(reason)
+
+
+def test_no_stop_of_a_flood_is_refused_and_an_honest_one_gets_its_verdict(peers: Fleet) -> None:
+    world = Slow("left", "right")
+    peers.join(world, "sim-1", "sim")
+    console, flood = peers.join(None, "console"), peers.stranger()
+    said: dict[str, list[Any]] = {}
+
+    def heard(sample: Any) -> None:
+        reply = json.loads(sample.payload)
+        said.setdefault(sample.key.split("/")[1], []).append(reply.get("result") or reply)
+
+    flood.declare_subscriber("strands/*/response/**", heard)
+    head = {"timestamp": peers.clock()}
+
+    def pour(first: int) -> None:
+        for turn in range(first, first + 1000):
+            body = {**head, "sender_id": "flood", "turn_id": f"t{turn}", "command": {"action": "stop"}}
+            flood.put("strands/sim-1/cmd", body)
+
+    pour(0)
+    assert world.halting.acquire(timeout=5)
+    answers: list[Any] = []
+    commands = [{"action": "stop"}, {"action": "stop", "robot_name": "left"}]
+    asking = [
+        threading.Thread(target=lambda command=command: answers.append(console.send("sim-1", command, timeout=9)))
+        for command in commands
+    ]
+    for thread in asking:
+        thread.start()
+    server = peers.meshes[0]._assembled.server
+    eventually(lambda: any("console" in who for each in server._stops._waiting.values() for who in each), within=2)
+    pour(1000)
+    assert len(server._stops) <= EACH + len(commands)
+    world.let_go.set()
+    for thread in asking:
+        thread.join(9)
+    assert [answer["result"]["ok"] for answer in answers] == [True, True]
+    eventually(lambda: len(server._stops) == 0, within=5)
+    assert all(each["ok"] is True for each in said["flood"])
+    assert world.halts <= 4
+
+
+def test_a_flood_under_many_names_keeps_its_bound_and_the_fleet_stop() -> None:
+    lane, halted, begun, let_go = Lane("stops", 1, 2), Counter[str](), threading.Event(), threading.Event()
+
+    def halt(robot: str, askers: list[tuple[str, str]]) -> None:
+        begun.set()
+        let_go.wait(10)
+        halted[robot] += len(askers)
+
+    stops = Stops(lane, halt)
+    stops.add("", "first", "t")
+    assert begun.wait(5)
+    stops.add("", "console", "t")
+    for number in range(MOST + 500):
+        stops.add(f"robot-{number}", f"sender-{number % 100}", "t")
+    assert len(stops) <= MOST
+    let_go.set()
+    eventually(lambda: len(stops) == 0, within=5)
+    assert halted[""] == 2
+    assert stops.unanswered >= 500
+    lane.stop(2)
+    assert stops.add("", "late", "t") is False
 
 
 def test_the_stop_of_one_robot_reaches_its_start_that_stands_in_line(peers: Fleet) -> None:

@@ -29,7 +29,7 @@ from strands_robots.mesh.state import StateReader, describe
 from strands_robots.mesh.stream import StepFeed
 from strands_robots.mesh.subscriptions import Subscriptions
 from strands_robots.mesh.teleop import TeleopDesk
-from strands_robots.mesh.transport.base import Sample, Transport
+from strands_robots.mesh.transport.base import Transport
 from strands_robots.mesh.transport.posture import Posture, credentials_from_settings
 from strands_robots.mesh.wire_identity import Identity, from_settings
 from strands_robots.safety.halting import halt_of
@@ -175,7 +175,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     key = _safety_key(robot, peer, keep=parts.keep)
     door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
     caller = Caller(context)
-    safety = FleetSafety(context, door, caller, lanes.stop_lane, robot=robot is not None)
+    safety = FleetSafety(context, door, caller, lanes.resumes, robot=robot is not None)
     teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, _body(robot), source, device))
     inputs: dict[str, dict[str, Any]] = {}
 
@@ -191,7 +191,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         "resume": lambda command: safety.on_resume_command(command["assertion"]),
     }
 
-    def dispatch(command: dict[str, Any], sample: Sample) -> Any:
+    def dispatch(command: dict[str, Any]) -> Any:
         answer = (desk.get(command["action"]) or dispatcher)(command)
         if command["action"] == "stop":
             # After the halt, which voids their permits: it must not wait for a frame that a slow bus still takes.

@@ -105,20 +105,17 @@ class Lane:
 
 
 class Lanes:
-    """The lanes of one peer: commands (4 workers, 32 waiting), stops and resumes, and delivery to its user."""
+    """The lanes of one peer: commands (4 workers, 32 waiting), stops, relayed resumes, and delivery to its user."""
 
     def __init__(self, peer_id: str) -> None:
-        self.stop_lane = Lane(f"{peer_id}-stop", 1, 64)
+        self.stop_lane = Lane(f"{peer_id}-stop", 1, 2)
+        self.resumes = Lane(f"{peer_id}-resume", 1, 64)
         self.commands = Lane(f"{peer_id}-command", 4, 32)
         self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)
-
-    def of(self, action: object) -> Lane:
-        """The lane an action runs on."""
-        return self.stop_lane if action == "stop" else self.commands
 
     def stop(self, timeout: float) -> list[str]:
         deadline = time.monotonic() + timeout
         alive: list[str] = []
-        for lane in (self.commands, self.delivery, self.stop_lane):
+        for lane in (self.commands, self.delivery, self.resumes, self.stop_lane):
             alive += lane.stop(max(0.0, deadline - time.monotonic()))
         return alive

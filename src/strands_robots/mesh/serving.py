@@ -15,6 +15,7 @@ from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, STOP_FIELDS, validate_command
+from strands_robots.mesh.stops import Asker, Stops
 from strands_robots.mesh.transport.base import Sample, TransportError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate
@@ -33,7 +34,7 @@ PING = {"action": "ping"}
 REPLAY_S = wire.FRESH_S + wire.AHEAD_S
 REPLAYS_MAX = 4096
 
-Dispatch = Callable[[dict[str, Any], Sample], Any]
+Dispatch = Callable[[dict[str, Any]], Any]
 
 
 class Refused(Exception):  # noqa: N818 - a refusal, not a fault
@@ -162,6 +163,7 @@ class Server:
         self._dispatch = dispatch
         self._line = line or Line(None)
         self._replays = Replays(context.monotonic)
+        self._stops = Stops(lanes.stop_lane, self._halt)
 
     def on_command(self, sample: Sample) -> None:
         """A sample on our command topic or on the broadcast topic; returns at once."""
@@ -184,29 +186,50 @@ class Server:
             return
         if action == "stop":
             self._line.stopped(request.command)
+            self._take_stop(request, sample)
+            return
         asked = self._line.join(request.command)
 
         def serve() -> None:
             with asked:
                 self._serve(request, sample)
 
-        if not self._lanes.of(action).submit(serve):
+        if not self._lanes.commands.submit(serve):
             context.audit("command_refused", request.sender_id, reason=BUSY)
             self._reply(request, error=BUSY)
+
+    def _take_stop(self, request: wire.Request, sample: Sample) -> None:
+        try:
+            command, _ = self._admit(request, sample)
+        except Refused as refused:
+            self._refuse(request, refused)
+            return
+        if not self._stops.add(command.get("robot_name", ""), request.sender_id, request.turn_id):
+            self._context.audit("command_refused", request.sender_id, action="stop", reason=BUSY)
+            self._reply(request, error=BUSY)
+
+    def _halt(self, robot: str, askers: list[Asker]) -> None:
+        result, failed = None, ""
+        try:
+            result = self._dispatch({"action": "stop", **({"robot_name": robot} if robot else {})})
+        except Exception:
+            logger.exception("%s: a stop failed.", self._context.peer_id)
+            failed = DISPATCH
+        event = "command_refused" if failed or is_error(result) else "command_executed"
+        for sender, turn in askers:
+            self._answer(sender, turn, result=result, error=failed)
+            self._context.audit(event, sender, action="stop", turn_id=turn, **({"reason": failed} if failed else {}))
 
     def _serve(self, request: wire.Request, sample: Sample) -> None:
         audit = self._context.audit
         try:
             command, claim = self._admit(request, sample)
         except Refused as refused:
-            named = request.command.get("action") if isinstance(request.command, dict) else None
-            action = named if isinstance(named, str) else ""
-            audit(refused.event, request.sender_id, action=action[:32], reason=refused.reason)
-            self._reply(request, error=str(refused))
+            self._refuse(request, refused)
             return
         action = command["action"]
         try:
-            result = self._dispatch(command, sample)
+            result = self._dispatch(command)
         except Exception:
             logger.exception("%s: %s of %s failed.", self._context.peer_id, action, request.sender_id)
             claim.give_back()
@@ -241,17 +264,24 @@ class Server:
                 raise Refused(REPLAYED, reason="the turn was carried out before")
         return command, self._door.claim(action, request, sample)
 
+    def _refuse(self, request: wire.Request, refused: Refused) -> None:
+        named = request.command.get("action") if isinstance(request.command, dict) else None
+        action = named if isinstance(named, str) else ""
+        self._context.audit(refused.event, request.sender_id, action=action[:32], reason=refused.reason)
+        self._reply(request, error=str(refused))
+
     def _reply(self, request: wire.Request, *, result: Any = None, error: str = "") -> None:
+        self._answer(request.sender_id, request.turn_id, result=result, error=error)
+
+    def _answer(self, sender: str, turn: str, *, result: Any = None, error: str = "") -> None:
         context = self._context
-        reply = wire.Reply(
-            "error" if error else "response", context.peer_id, request.turn_id, result, error, context.clock()
-        )
-        key = topics.response(request.sender_id, context.peer_id, request.turn_id)
+        reply = wire.Reply("error" if error else "response", context.peer_id, turn, result, error, context.clock())
+        key = topics.response(sender, context.peer_id, turn)
         try:
             context.put(key, context.identity.sign(reply.to_wire()))
         except wire.WireError as exc:
-            logger.warning("%s: the reply to %s cannot be sent: %s", context.peer_id, request.sender_id, exc)
+            logger.warning("%s: the reply to %s cannot be sent: %s", context.peer_id, sender, exc)
             if not error:
-                self._reply(request, error=DISPATCH)
+                self._answer(sender, turn, error=DISPATCH)
         except TransportError as exc:
-            logger.warning("%s: the reply to %s was not sent: %s", context.peer_id, request.sender_id, exc)
+            logger.warning("%s: the reply to %s was not sent: %s", context.peer_id, sender, exc)
