@@ -83,6 +83,17 @@ def test_a_failed_handshake_sends_nothing_and_is_tried_again_from_its_start() ->
     assert [service for service, _ in link.called] == [STATE, STATE]
 
 
+@pytest.mark.parametrize("refused", [{"error": 1}, {"error": -2}, {"success": False}, {"error": "no calibration"}])
+def test_a_service_that_answers_a_failure_ends_the_handshake_and_latches_nothing(refused: dict[str, Any]) -> None:
+    link = MemoryLink({STATE: ok, ENABLE: lambda _: refused})
+    robot = car(link)
+    answer = robot.drive(0.5)
+    assert (answer["status"], answer["service"], sent(robot)) == ("error", ENABLE, [])
+    link.offer(ENABLE, lambda _: {"error": 0, "success": True})
+    assert robot.enable()["status"] == "success"
+    assert [service for service, _ in link.called] == [STATE, ENABLE, STATE, ENABLE]
+
+
 def test_a_car_that_nobody_approved_is_neither_armed_nor_driven() -> None:
     drive_only = CommandGate(lambda _: ("manual_drive",), lambda: False)
     robot = car(command_gate=drive_only)
@@ -131,6 +142,7 @@ def test_a_stop_while_the_operator_is_asked_arms_nothing() -> None:
 
 def test_its_drive_tool_tells_the_turning_radius_and_it_has_no_pose() -> None:
     robot = car()
+    assert not hasattr(robot, "get_pose")
     assert robot.min_radius_m == pytest.approx(0.164 / math.tan(0.5236))
     specs = {tool.tool_name: tool.tool_spec for tool in robot.tools}
     assert set(specs) == {"drive_racer", "stop_racer", "status_racer", "get_scan_racer"}

@@ -137,7 +137,10 @@ class AckermannRosRobot(MobileBaseRobot):
         }
 
     def enable(self, tool_context: Any = None) -> Envelope:
-        """Run the handshake, unless it has succeeded before. It ends at the first call that fails."""
+        """Run the handshake, unless it has succeeded before. It ends at the first call that fails.
+
+        An answer with ``success`` false or an ``error`` that is not zero is a call that failed.
+        """
         try:
             permit = self.gate.permit("enable")
         except MotionRefused as locked:
@@ -161,9 +164,11 @@ class AckermannRosRobot(MobileBaseRobot):
                 if not permit.valid:
                     return error(f"The handshake was stopped before {service}.")
                 try:
-                    self.link.call(service, kind, fields, SERVICE_S)
+                    answer = self.link.call(service, kind, fields, SERVICE_S)
                 except UNREACHABLE as exc:
                     return error(f"The handshake failed at {service}: {exc}", service=service)
+                if not answer.get("success", True) or answer.get("error"):
+                    return error(f"The handshake failed at {service}, which answered {shown(answer)}.", service=service)
             self._enabled = True
             return None
 
