@@ -34,6 +34,7 @@ ACTIONS = (
 COUNT_MAX = 1000
 RATE_MAX_HZ = 100.0
 TIMEOUT_MAX_S = 600.0
+RATE_MIN_HZ = 1 / TIMEOUT_MAX_S
 
 
 @runtime_checkable
@@ -113,7 +114,7 @@ def ros_action(
         name: topic, service or action, where the action needs one.
         type: its interface; what is published, called or sent as a goal needs one.
         fields: of the message, request or goal; what is left out is zero.
-        count: messages to read or publish, 1 to 1000. ``rate``: Hz of several, above 0 and at most 100.
+        count: messages to read or publish, 1 to 1000. ``rate``: Hz of several, 1/600 to 100.
         timeout: seconds to wait for each message, answer or end, above 0 and at most 600.
         backend: ``rclpy``, ``dds`` (topics alone), ``rosbridge``, or ``auto``: rclpy where a ROS 2 is sourced,
             else bare DDS.
@@ -135,7 +136,7 @@ def ros_action(
             return _echo(link, target, kind, messages, seconds)
         assert kind is not None
         body = mapping("fields", {} if fields is None else fields)
-        hertz = number("rate", rate, above=0, high=RATE_MAX_HZ)
+        hertz = number("rate", rate, low=RATE_MIN_HZ, high=RATE_MAX_HZ)
         refusal = (command_gate or CommandGate()).refusal(target, kind, wanted, tool_context)
         if refusal is not None:
             return refusal

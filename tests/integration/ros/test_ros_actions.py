@@ -125,6 +125,8 @@ def test_a_goal_tells_its_end(server: RosbridgeServer) -> None:
         ("publish", {"name": "/a"}, "type"),
         ("publish", {"name": "/a", "type": "p/T", "fields": [1]}, "fields"),
         ("publish", {"name": "/a", "type": "p/T", "rate": 0}, "rate"),
+        ("publish", {"name": "/a", "type": "p/T", "rate": 1e-300, "count": 2}, "rate"),
+        ("echo", {"name": "/a", "timeout": 1e300}, "timeout"),
         ("status", {"backend": "ros1"}, "backend"),
         ("status", {"backend": "rosbridge", "host": "a b"}, "host"),
         ("status", {"backend": "dds", "domain_id": 300}, "domain_id"),
