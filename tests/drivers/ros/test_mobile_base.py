@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +14,9 @@ from hypothesis import strategies as st
 
 from strands_robots.contract import TaskRobot
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.drivers.ros.posed_base import PosedBaseRobot
+from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
+from strands_robots.drivers.ros.tools import suffix_of
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import EarlierRefusedError, Heard, MemoryLink, RosError, Unwatch
@@ -21,7 +25,7 @@ from strands_robots.utils import ValidationError
 TOPIC = "/cmd_vel"
 OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 SHUT = CommandGate(lambda _: (), lambda: False)
-Made = Callable[..., MobileBaseRobot]
+Made = Callable[..., PosedBaseRobot]
 
 
 class FaultyLink(MemoryLink):
@@ -55,7 +59,7 @@ def made() -> Iterator[Made]:
 
     def make(link: MemoryLink | None = None, **options: Any) -> MobileBaseRobot:
         options = {"publish_rate": 1000.0, "command_gate": OPEN, **options}
-        robots.append(MobileBaseRobot("rover", link or MemoryLink(), TOPIC, **options))
+        robots.append(PosedBaseRobot("rover", link or MemoryLink(), TOPIC, **options))
         return robots[-1]
 
     yield make
@@ -482,17 +486,75 @@ def test_the_tools_are_named_by_the_robot_and_describe_every_parameter(made: Mad
             assert not parameter["description"].startswith("Parameter")
 
 
+def none_left(_: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
 def test_a_drive_that_gets_no_thread_leaves_the_base_free(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = made()
-
-    def none_left(_: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", none_left)
         assert "could not begin" in robot.start_drive(0.1, 0.0, 0.01)["reason"]
+    assert (robot.get_task_status()["task_status"], robot.holding) == ("error", False)
     assert robot.halt().stopped
     assert robot.drive(0.1, 0.0, duration=0.01)["status"] == "success"
+
+
+def test_a_drive_that_gets_no_thread_leaves_the_base_held_that_was_held(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = made(publish_rate=100.0)
+    robot.stop()
+    start = threading.Thread.start
+
+    def no_drive(thread: threading.Thread) -> None:
+        if thread.name.startswith("drive-"):
+            none_left(thread)
+        start(thread)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", no_drive)
+        assert "could not begin" in robot.start_drive(0.1, 0.0, 0.01)["reason"]
+    assert robot.holding
+    before = len(memory(robot).sent)
+    eventually(lambda: len(memory(robot).sent) > before + 3, what="zeros of the hold that goes on")
+    assert set(velocities(memory(robot))) == {(0.0, 0.0)}
+
+
+def test_a_halt_that_gets_no_thread_sends_its_one_zero_all_the_same(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = made()
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", none_left)
+        assert robot.halt().stopped
+    assert velocities(memory(robot)) == [(0.0, 0.0)]
+
+
+@pytest.mark.parametrize("huge", [1e308, 1e30])
+def test_a_time_that_nothing_can_wait_out_is_refused_by_name(made: Made, huge: float) -> None:
+    robot = made(odom_topic="/odom", scan_topic="/scan")
+    for answer in (robot.drive(0.1, duration=huge), robot.start_drive(0.1, 0.0, huge)):
+        assert "duration must be at most" in answer["reason"]
+    for answer in (robot.get_pose(huge), robot.get_scan(huge)):
+        assert "timeout" in answer["reason"]
+    assert memory(robot).sent == []
+
+
+@pytest.mark.parametrize("count", [10**13, 10**5000], ids=["many", "more"])
+def test_a_count_that_no_drive_ends_is_refused_by_name(made: Made, count: int) -> None:
+    robot = made(max_duration=1e308)
+    assert "count" in robot.drive(0.1, count=count)["reason"]
+    assert "duration" in robot.drive(0.1, duration=1e308)["reason"]
+    assert robot.drive(0.1)["status"] == "success"
+
+
+def test_a_rate_that_is_slower_than_any_clock_still_ends_with_a_stop(made: Made) -> None:
+    robot = made(publish_rate=1e-300)
+    assert robot.start_drive(0.1, 0.0, 5.0)["status"] == "success"
+    eventually(lambda: velocities(memory(robot)) == [(0.1, 0.0)])
+    assert robot.halt().stopped
+    assert robot.get_task_status()["task_status"] == "stopped"
 
 
 def test_zeros_come_once_a_second_at_least_however_slow_the_rate(made: Made) -> None:
@@ -500,3 +562,23 @@ def test_zeros_come_once_a_second_at_least_however_slow_the_rate(made: Made) -> 
     robot = made(link, publish_rate=1e-300)
     assert robot.halt().stopped
     eventually(lambda: len(link.sent) >= 2, within=4)
+
+
+def test_only_a_base_with_odometry_has_a_pose_to_ask_for() -> None:
+    assert not hasattr(MobileBaseRobot("rover", MemoryLink(), TOPIC), "get_pose")
+    assert PosedBaseRobot("rover", MemoryLink(), TOPIC, odom_topic="/odom", scan_topic="/s").reads == (
+        "get_pose",
+        "get_scan",
+    )
+
+
+def test_tool_names_are_what_model_apis_take_and_tell_robots_apart() -> None:
+    names = ["rover", "rover-2", "a.b", "a_b", "a-b", "x" * 55, "x" * 56, "x" * 128, "x" * 127 + ".", "a." * 60]
+    suffixes = [suffix_of(name) for name in names]
+    assert suffixes[:2] == ["rover", "rover-2"]
+    assert len(set(suffixes)) == len(names)
+    for name in names:
+        robot = PosedBaseRobot(name, MemoryLink(), TOPIC, odom_topic="/odom", scan_topic="/scan")
+        assert all(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", tool.tool_name) for tool in robot.tools)
+    robot = RosBridgedRobot("y" * 128, TOPIC, "/odom", nav_action="/navigate_to_pose")
+    assert all(len(tool.tool_name) <= 64 for tool in robot.tools)

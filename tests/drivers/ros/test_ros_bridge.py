@@ -174,7 +174,7 @@ def test_a_place_that_is_no_number_is_refused(made: Made, stack: Stack, argument
     assert stack.asked == []
 
 
-@pytest.mark.parametrize("bad", [0, -1, float("nan"), float("inf"), True])
+@pytest.mark.parametrize("bad", [0, -1, float("nan"), float("inf"), True, 1e308])
 def test_a_time_that_cannot_be_waited_out_is_refused(made: Made, stack: Stack, bad: Any) -> None:
     assert "timeout" in made().navigate_to(1.0, 2.0, timeout=bad)["reason"]
     assert "frame_id" in made().navigate_to(1.0, 2.0, frame_id="")["reason"]
@@ -204,6 +204,27 @@ def test_a_drive_and_a_goal_exclude_each_other(made: Made, stack: Stack) -> None
     assert robot.get_task_status()["instruction"].startswith("drive")
 
 
+def test_a_goal_that_gets_no_thread_leaves_the_base_free_and_held_as_it_was(
+    made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = made()
+    start = threading.Thread.start
+
+    def no_way(thread: threading.Thread) -> None:
+        if thread.name.startswith("navigate-"):
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", no_way)
+        answer = robot.start_navigation(1.0, 2.0)
+    assert ("could not begin" in answer["reason"], answer["goal_state"]) == (True, "not sent")
+    assert robot.get_task_status()["task_status"] == "error"
+    assert stack.goals == []
+    assert robot.stop()["stopped"] is True
+    assert robot.drive(0.1, duration=0.01)["status"] == "success"
+
+
 def test_leaving_the_graph_cancels_the_goal_first(made: Made, stack: Stack) -> None:
     robot = made()
     thread, answers = going(robot, stack)
@@ -219,8 +240,8 @@ def test_its_tools_are_named_by_it_and_describe_every_parameter(made: Made, stac
         "drive_rover",
         "stop_rover",
         "status_rover",
-        "get_pose_rover",
         "get_scan_rover",
+        "get_pose_rover",
         "navigate_rover",
     ]
     for each in robot.tools:

@@ -10,6 +10,19 @@ from typing import Any, NamedTuple
 from strands_robots.drivers.ros.wire import VelocityWire
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.utils import ValidationError
+
+COUNT_MAX = 10**12
+"""Most messages of one drive: three hundred years at 100 Hz, and still a number that every sentence can carry."""
+
+
+def messages_for(name: str, seconds: float, rate_hz: float) -> int:
+    """How many messages hold a velocity for so long. Raises :class:`ValidationError` beyond :data:`COUNT_MAX`."""
+    wanted = seconds * rate_hz
+    if wanted > COUNT_MAX:
+        most = COUNT_MAX / rate_hz
+        raise ValidationError(f"{name} must be at most {most:g} s at {rate_hz:g} Hz, not {seconds:g}.")
+    return max(1, round(wanted))
 
 
 class Order(NamedTuple):
@@ -65,6 +78,14 @@ class Burst:
         """Send nothing more but the zero."""
         self._stopped.set()
 
+    def never_began(self, why: str) -> Envelope:
+        """In place of :meth:`run`: nothing was sent, for this reason."""
+        self.state = "error"
+        self.answer = error(f"The drive could not begin: {why}.", messages=0)
+        self._took_s = 0.0
+        self.ended.set()
+        return self.answer
+
     def run(self) -> Envelope:
         """Send, and answer how it went; the answer is kept in ``answer``."""
         problem, halt_problem = "", ""
@@ -93,7 +114,7 @@ class Burst:
             due = max(due + period_s, time.monotonic())
             if self.order.latches:
                 return
-            if self._stopped.wait(due - time.monotonic()):
+            if self._stopped.wait(min(due - time.monotonic(), threading.TIMEOUT_MAX)):
                 raise PermitVoidError("the drive was stopped")
 
     def _halt(self) -> str:

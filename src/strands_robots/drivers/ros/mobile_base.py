@@ -11,8 +11,8 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
-from strands_robots.drivers.ros.burst import Burst, Order
-from strands_robots.drivers.ros.observers import Observers
+from strands_robots.drivers.ros.burst import COUNT_MAX, Burst, Order, messages_for
+from strands_robots.drivers.ros.observers import Observers, Unbegun
 from strands_robots.drivers.ros.odometry import Odometry
 from strands_robots.drivers.ros.wire import Hold, Holds, VelocityWire
 from strands_robots.envelope import Envelope, error, success
@@ -140,13 +140,9 @@ class MobileBaseRobot:
         burst = self._begin(linear, angular, seconds, 1, tool_context)
         if not isinstance(burst, Burst):
             return burst
-        try:
-            threading.Thread(target=self._run, args=(burst,), name=f"drive-{self.node_name}", daemon=True).start()
-        except RuntimeError as exc:
-            # No thread is to be had: the drive never began, and the next one must not wait for its end.
-            burst.ended.set()
-            self._slot.release()
-            return error(f"The drive could not begin: {exc}.")
+        refusal = self._run_behind(lambda: self._run(burst), burst, "drive")
+        if refusal is not None:
+            return refusal
         order = burst.order
         return success(
             f"Driving at {order.linear:g} m/s and {order.angular:g} rad/s for {seconds:g} s.",
@@ -183,10 +179,6 @@ class MobileBaseRobot:
 
     # Reads.
 
-    def get_pose(self, timeout: float = 5.0) -> Envelope:
-        """The next sample of the odometry topic, within ``timeout`` seconds, above 0."""
-        return self._read("get_pose", "odom_topic", (self._odometry.topic, self._odom_kind), timeout)
-
     def get_scan(self, timeout: float = 5.0) -> Envelope:
         """The next laser scan, within ``timeout`` seconds, above 0."""
         return self._read("get_scan", "scan_topic", self._scan, timeout)
@@ -200,9 +192,8 @@ class MobileBaseRobot:
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """The reads that this robot's topics allow: ``get_pose``, ``get_scan``."""
-        found = (("get_pose", self._odometry.topic), ("get_scan", self._scan[0]))
-        return tuple(verb for verb, topic in found if topic is not None)
+        """The reads that this robot's topics allow, such as ``get_scan``."""
+        return () if self._scan[0] is None else ("get_scan",)
 
     @property
     def holding(self) -> bool:
@@ -306,13 +297,14 @@ class MobileBaseRobot:
         asked = number("linear", linear), number("angular", angular)
         if duration is not None:
             seconds = number("duration", duration, above=0, high=self.max_duration)
-            messages = max(1, round(seconds * self.publish_rate))
+            messages = messages_for("duration", seconds, self.publish_rate)
         else:
-            messages = whole("count", count, low=1)
-            if self.max_duration is not None and messages > max(1, round(self.max_duration * self.publish_rate)):
+            messages = whole("count", count, low=1, high=COUNT_MAX)
+            most = COUNT_MAX if self.max_duration is None else min(COUNT_MAX, self.max_duration * self.publish_rate)
+            if messages > max(1, round(most)):
                 raise ValidationError(
-                    f"count must be at most {max(1, round(self.max_duration * self.publish_rate))}, what "
-                    f"{self.max_duration:g} s hold at {self.publish_rate:g} Hz, not {count}."
+                    f"count must be at most {max(1, round(most))}, what {self.max_duration:g} s hold at "
+                    f"{self.publish_rate:g} Hz, not {messages}."
                 )
         self.check_motion(*asked)
         sent = _clamped(asked[0], self.max_linear), _clamped(asked[1], self.max_angular)
@@ -324,6 +316,17 @@ class MobileBaseRobot:
             latches=duration is None and messages == 1,
             zero=not any(sent),
         )
+
+    def _run_behind(self, run: Callable[[], object], motion: Unbegun, what: str) -> Envelope | None:
+        """Run on a thread; where none is to be had, why, with the base as free and as held as before."""
+        try:
+            threading.Thread(target=run, name=f"{what}-{self.node_name}", daemon=True).start()
+        except RuntimeError as exc:
+            answer = motion.never_began(str(exc))
+            self._slot.release()
+            self._holds.resume()
+            return answer
+        return None
 
     def _run(self, burst: Burst) -> Envelope:
         self._observers.started(burst)
@@ -360,7 +363,7 @@ class MobileBaseRobot:
 
     def _read(self, verb: str, argument: str, source: tuple[str | None, str | None], timeout: object) -> Envelope:
         try:
-            seconds = number("timeout", timeout, above=0)
+            seconds = number("timeout", timeout, above=0, high=threading.TIMEOUT_MAX)
             if source[0] is None:
                 return error(f"{verb} needs {argument}, and {self.tool_name_str} was made without one.")
             message = self.link.read(source[0], source[1], seconds)

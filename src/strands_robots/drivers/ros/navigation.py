@@ -106,6 +106,14 @@ class Navigation:
             except RosError as exc:
                 logger.warning("The %s could not be cancelled: %s", self.instruction, exc)
 
+    def never_began(self, why: str) -> Envelope:
+        """In place of :meth:`run`: nothing was sent, for this reason."""
+        self.state = "error"
+        self.answer = error(f"The goal could not begin: {why}.", goal_state="not sent")
+        self._took_s = 0.0
+        self.ended.set()
+        return self.answer
+
     def run(self) -> Envelope:
         """Send, wait, and answer how it went; the answer is kept in ``answer``."""
         try:

@@ -36,6 +36,13 @@ class Motion(Protocol):
         """``linear`` in m/s and ``angular`` in rad/s, where those were ordered."""
 
 
+class Unbegun(Protocol):
+    """A motion that has leave to begin, and may get no thread to do it on."""
+
+    def never_began(self, why: str) -> Envelope:
+        """It ends here; the error to answer."""
+
+
 class Observers:
     """The observers of one base; one that raises is logged and the others are still told."""
 

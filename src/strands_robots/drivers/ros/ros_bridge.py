@@ -9,8 +9,9 @@ from dataclasses import replace
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.drivers.ros.mobile_base import ANSWER_SHARE, TWIST, MobileBaseRobot
+from strands_robots.drivers.ros.mobile_base import ANSWER_SHARE, TWIST
 from strands_robots.drivers.ros.navigation import Destination, Navigation
+from strands_robots.drivers.ros.posed_base import PosedBaseRobot
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
@@ -25,7 +26,7 @@ DISCONNECT_S = 1.0
 """Seconds that a goal has to end before the graph is left."""
 
 
-class RosBridgedRobot(MobileBaseRobot):
+class RosBridgedRobot(PosedBaseRobot):
     """A base on a ROS 2 graph, reached by rclpy where a ROS 2 is sourced, else over bare DDS (topics only).
 
     It is made without either; what is missing is said by the first verb. It declares no limits unless they are
@@ -129,9 +130,8 @@ class RosBridgedRobot(MobileBaseRobot):
         going = self._depart((x, y, yaw, frame_id, timeout), tool_context)
         if not isinstance(going, Navigation):
             return going
-        name = f"navigate-{self.node_name}"
-        threading.Thread(target=self._travel, args=(going,), name=name, daemon=True).start()
-        return success(f"On the way: {going.instruction}.", timeout=going.to.timeout_s)
+        refusal = self._run_behind(lambda: self._travel(going), going, "navigate")
+        return refusal or success(f"On the way: {going.instruction}.", timeout=going.to.timeout_s)
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Cancel the navigation goal and stop the base; see :meth:`MobileBaseRobot.halt`.
@@ -196,7 +196,7 @@ class RosBridgedRobot(MobileBaseRobot):
                 number("y", y),
                 number("yaw", yaw),
                 text("frame_id", frame_id, longest=255),
-                number("timeout", timeout, above=0),
+                number("timeout", timeout, above=0, high=threading.TIMEOUT_MAX),
             )
         except ValidationError as refused:
             return error(str(refused))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.drivers.ros.posed_base import PosedBaseRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name
@@ -15,7 +15,7 @@ ROS1_TWIST = "geometry_msgs/Twist"
 CURIOSITY = "/curiosity_mars_rover"
 
 
-class RosbridgeRobot(MobileBaseRobot):
+class RosbridgeRobot(PosedBaseRobot):
     """A base that is driven through rosbridge; its limits are this class's unless others are given.
 
     Nothing is dialled before the first verb. The connection proves nothing and is not encrypted: a server elsewhere

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from strands_robots.drivers.ros.mobile_base import TWIST, UNREACHABLE, MobileBaseRobot
+from strands_robots.drivers.ros.mobile_base import TWIST, UNREACHABLE
+from strands_robots.drivers.ros.posed_base import PosedBaseRobot
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.gate import CommandGate
 
 
-class RtpsRobot(MobileBaseRobot):
+class RtpsRobot(PosedBaseRobot):
     """A base that subscribes to velocities in a DDS domain. It declares no limits unless they are given.
 
     Nothing joins the domain before the first verb. A drive that nobody subscribes to is an error, and so is a stop.

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.agent_tool import ToolContext, tool
 
 if TYPE_CHECKING:
     from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+    from strands_robots.drivers.ros.posed_base import PosedBaseRobot
     from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 
 
+NAME_MAX = 55
+"""Longest robot name in a tool's, which model APIs bound at 64 characters: the longest verb takes nine."""
+
+_HASHED = 8
+
+
+def suffix_of(node_name: str) -> str:
+    """What a tool's name has of its robot's: the name itself where model APIs take it, else one that is as unique."""
+    plain = node_name.replace(".", "_")
+    if plain == node_name and len(plain) <= NAME_MAX:
+        return plain
+    digest = hashlib.sha256(node_name.encode()).hexdigest()[:_HASHED]
+    return f"{plain[: NAME_MAX - _HASHED - 1]}_{digest}"
+
+
 def tools_of(robot: MobileBaseRobot) -> list[Any]:
-    """``drive_<name>``, ``stop_<name>``, ``status_<name>`` and the reads that the robot's topics allow.
+    """``drive_<name>``, ``stop_<name>``, ``status_<name>`` and, where the robot has a scanner, ``get_scan_<name>``.
 
     The tool's ``drive`` needs a duration, starts and returns, so that an agent can stop what it began.
     """
-    name = robot.node_name.replace(".", "_")
+    name = suffix_of(robot.node_name)
 
     @tool(
         name=f"drive_{name}",
@@ -43,15 +60,6 @@ def tools_of(robot: MobileBaseRobot) -> list[Any]:
         """Tell the state."""
         return robot.get_task_status()
 
-    @tool(name=f"get_pose_{name}", description=f"Read where {robot.node_name} is and how it moves.")
-    def get_pose(timeout: float = 5.0) -> dict[str, Any]:
-        """Read the pose.
-
-        Args:
-            timeout: Seconds to wait for a sample, above 0.
-        """
-        return robot.get_pose(timeout)
-
     @tool(name=f"get_scan_{name}", description=f"Read one laser scan of {robot.node_name}.")
     def get_scan(timeout: float = 5.0) -> dict[str, Any]:
         """Read a scan.
@@ -61,15 +69,31 @@ def tools_of(robot: MobileBaseRobot) -> list[Any]:
         """
         return robot.get_scan(timeout)
 
-    reads = {"get_pose": get_pose, "get_scan": get_scan}
-    return [drive, stop, status, *(reads[verb] for verb in robot.reads)]
+    return [drive, stop, status, *([get_scan] if "get_scan" in robot.reads else [])]
+
+
+def pose_tool(robot: PosedBaseRobot) -> Any:
+    """``get_pose_<name>``: one sample of the robot's odometry."""
+
+    @tool(
+        name=f"get_pose_{suffix_of(robot.node_name)}", description=f"Read where {robot.node_name} is and how it moves."
+    )
+    def get_pose(timeout: float = 5.0) -> dict[str, Any]:
+        """Read the pose.
+
+        Args:
+            timeout: Seconds to wait for a sample, above 0.
+        """
+        return robot.get_pose(timeout)
+
+    return get_pose
 
 
 def navigate_tool(robot: RosBridgedRobot) -> Any:
     """``navigate_<name>``: a goal for the robot's own navigation stack, waited for."""
 
     @tool(
-        name=f"navigate_{robot.node_name.replace('.', '_')}",
+        name=f"navigate_{suffix_of(robot.node_name)}",
         description=f"Let {robot.node_name} navigate to a place around obstacles; returns when it arrived or gave up.",
         context=True,
     )

@@ -95,7 +95,12 @@ class Hold:
         self.sent = threading.Event()
         self.problem = ""
         self._thread = threading.Thread(target=self._run, name=f"hold-{name}", daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError as exc:
+            logger.warning("%s gets one zero alone: %s", wire.topic, exc)
+            self.problem = self._send()
+            self.tried.set()
 
     @property
     def running(self) -> bool:
@@ -108,7 +113,8 @@ class Hold:
 
     def join(self, within_s: float) -> None:
         """Wait for the thread's end."""
-        self._thread.join(within_s)
+        if self._thread.ident is not None:
+            self._thread.join(within_s)
 
     def _run(self) -> None:
         blind_since: float | None = None
@@ -149,6 +155,7 @@ class Holds:
         self._start = start
         self._lock = threading.Lock()
         self._current: Hold | None = None
+        self._ended_for: Permit | None = None
 
     @property
     def running(self) -> bool:
@@ -167,9 +174,17 @@ class Holds:
     def end_for(self, permit: Permit) -> None:
         """End the hold for a motion, unless a newer stop has voided the motion's permit."""
         with self._lock:
+            self._ended_for = None
             if permit.valid and self._current is not None:
+                self._ended_for = permit if self._current.running else None
                 self._current.cancel()
                 self._current = None
+
+    def resume(self) -> None:
+        """Begin the hold again that the last motion has ended: it never began. A newer stop has begun its own."""
+        with self._lock:
+            if self._ended_for is not None and self._ended_for.valid and self._current is None:
+                self._current = self._start()
 
     def close(self, within_s: float = 1.0) -> None:
         """End the hold and wait for its thread."""
