@@ -44,7 +44,7 @@ def test_a_refused_reading_is_not_published_and_told_once(peers: Fleet, caplog: 
             return error(f"IMU data is stale: {self.asked}.0 s old.")
 
     robot, imus = Deaf(), heard(peers, "strands/arm-1/imu")
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.INFO):
         mesh = peers.join(robot, "arm-1")
         console = peers.join(None, "console")
         eventually(lambda: robot.asked > 5, within=3)

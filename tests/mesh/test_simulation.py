@@ -75,3 +75,13 @@ def test_the_steps_of_a_rollout_are_published_without_anybody_asking(peers: Flee
     assert arm.list_policies_running(), "leaving the mesh ends no rollout"
     eventually(lambda: arm.list_policies_running()[0]["step"] > first["step"] + 20, within=5)
     assert len(steps) == told
+
+
+def test_a_simulated_robot_publishes_where_it_is(peers: Fleet, arm: Simulation) -> None:
+    poses: list[dict[str, Any]] = []
+    peers.stranger().declare_subscriber("strands/sim-1/pose", lambda sample: poses.append(json.loads(sample.payload)))
+    peers.join(arm, "sim-1", "sim")
+    console = peers.join(None, "console")
+    eventually(lambda: poses, within=3)
+    assert set(poses[0]) == {"peer_id", "t", "x", "y", "z", "theta", "quat", "source", "frame"}
+    eventually(lambda: (console.get_peer("sim-1") or {}).get("topics") == ["health", "pose"], within=3)

@@ -15,6 +15,7 @@ from strands_robots.bus_access import joint_read_source
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
+from strands_robots.hardware.motors import joint_units, tells_temperature, temperatures
 from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks, ended
 from strands_robots.policies.actions import checked_action
 from strands_robots.safety.gate import MotionRefused, Permit, PermitVoidError
@@ -104,6 +105,31 @@ class HardwareRobot(Tasks):
         if problem:
             fields["joints_error"] = problem
         return success(problem or f"{len(joints)} joints.", **fields)
+
+    @property
+    def hardware_name(self) -> str:
+        """The device's type, such as ``so100_follower``."""
+        return kind(self.device)
+
+    @property
+    def joint_units(self) -> dict[str, str]:
+        """``normalized`` (-100 to 100), ``percent`` (0 to 100), ``degrees`` or the device's own word, by action key;
+        a key whose unit nobody states is left out."""
+        return joint_units(self.device)
+
+    def get_health(self) -> Envelope:
+        """``temps``, degrees Celsius by motor, where the motors tell; the read waits for the bus a control period."""
+        if not self._body.is_connected or self._body.lost or not tells_temperature(self.device):
+            return success("Nothing is known of its motors' health.")
+        if not self._body.lock.acquire(timeout=1 / self.control_hz):
+            return error("The bus was busy; the motors' temperatures are not known now.")
+        try:
+            temps = temperatures(self.device)
+        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
+            return error(f"The motors' temperatures could not be read: {type(exc).__name__}: {exc}")
+        finally:
+            self._body.lock.release()
+        return success(f"The warmest motor has {max(temps.values(), default=0.0):g} degrees Celsius.", temps=temps)
 
     def get_observation(self) -> dict[str, Any]:
         """Everything the device sees, images included, in its turn on the bus. Raises what the device raises."""

@@ -107,7 +107,7 @@ class SensorDesk:
                 sensor.busy = False
 
     def _sample(self, sensor: _Sensor) -> None:
-        trouble = ""
+        trouble, level = "", logging.WARNING
         try:
             fields = plain(sensor.provider())
             if sensor.suffix == "pose":
@@ -117,7 +117,7 @@ class SensorDesk:
                 self._context.put(key, stamped(fields, self._context))
                 sensor.spoke = True
         except NoReadingError as exc:
-            trouble = f"{exc}"
+            trouble, level = f"{exc}", logging.INFO  # it has none, which is no fault
         except Exception as exc:  # noqa: BLE001 - whatever a provider raises costs its own turn alone
             trouble = f"{type(exc).__name__}: {exc}"
         finally:
@@ -125,7 +125,7 @@ class SensorDesk:
         # By its words without numbers: an age in them makes no new reason.
         kind = "".join(letter for letter in trouble if not letter.isdigit())
         if kind and kind != sensor.trouble:
-            logger.warning("%s: no %s is published: %s", self._context.peer_id, sensor.suffix, trouble)
+            logger.log(level, "%s: no %s is published: %s", self._context.peer_id, sensor.suffix, trouble)
         sensor.trouble = kind
 
 
@@ -184,7 +184,7 @@ class _Contained:
         except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is told
             found, trouble = None, f"{type(exc).__name__}: {exc}"
         if trouble and trouble != self._trouble:
-            logger.warning("%s: the health of its robot cannot be read: %s", self._peer_id, trouble)
+            logger.info("%s: the health of its robot cannot be read: %s", self._peer_id, trouble)
         self._trouble = trouble
         return found
 

@@ -10,12 +10,14 @@ from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import PermitVoidError
 from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.simulation import whereabouts
 from strands_robots.simulation.arguments import STEPS_MAX, answered
 from strands_robots.simulation.construction import checked_plan
 from strands_robots.simulation.motion import Rollouts
-from strands_robots.simulation.physics import CHUNK
+from strands_robots.simulation.parts import RobotParts
+from strands_robots.simulation.physics import CHUNK, Snapshot
 from strands_robots.simulation.views import camera_names
-from strands_robots.utils import ValidationError, flag, text, whole
+from strands_robots.utils import ValidationError, flag, shown, text, whole
 
 logger = logging.getLogger(__name__)
 
@@ -146,6 +148,39 @@ class Simulation(Rollouts):
             objects=objects,
             timestep=stage.plan.timestep,
         )
+
+    @answered
+    def get_pose(self, robot_name: str | None = None) -> Envelope:
+        """Where a robot's base is: ``x``, ``y``, ``z`` (m), ``theta`` (yaw, rad), ``quat`` (w, x, y, z), ``source``
+        and ``frame``. The name may be left out where there is one robot."""
+        snapshot, robot = self._only(robot_name)
+        pose = whereabouts.base_pose(snapshot, robot)
+        where = f"{robot.name} is at {pose['x']:.3f}, {pose['y']:.3f} m."
+        return success(where, **pose, source="simulation", frame="world")
+
+    @answered
+    def get_odom(self, robot_name: str | None = None) -> Envelope:
+        """The same of a robot that moves about, with ``linear`` (m/s) and ``angular`` (rad/s) along its own axes."""
+        snapshot, robot = self._only(robot_name)
+        if not whereabouts.moves_about(snapshot, robot):
+            return error(f"{robot.name} does not move about.")
+        pose, velocity = whereabouts.base_pose(snapshot, robot), whereabouts.base_velocity(snapshot, robot)
+        return success(f"{robot.name} moves about.", **pose, **velocity, source="simulation", frame="world")
+
+    @property
+    def joint_units(self) -> dict[str, str]:
+        """``radians`` or ``metres`` by action key, of the robot that an action without a name goes to."""
+        snapshot = self._physics.snapshot
+        first = next(iter(snapshot.stage.robots.values()), None)
+        return {} if first is None else whereabouts.joint_units(snapshot, first)
+
+    def _only(self, robot_name: str | None) -> tuple[Snapshot, RobotParts]:
+        snapshot = self._physics.snapshot
+        robots = snapshot.stage.robots
+        name = robot_name or (next(iter(robots)) if len(robots) == 1 else "")
+        if name not in robots:
+            raise ValidationError(f"robot_name must be one of {list(robots)}, not {shown(robot_name)}.")
+        return snapshot, robots[name]
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop everything that moves a robot of this world, and freeze them where they are.
