@@ -28,6 +28,9 @@ from strands_robots.safety.lane import lane
 
 pytestmark = pytest.mark.system
 
+STOPPED_S = 0.25
+"""From the controller's call to an arm's last byte, on a machine that does other things; benchmarks/ measures it."""
+
 MOVE = {"instruction": "wave", "duration": 20.0}
 
 
@@ -87,12 +90,15 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_an_emergency_stop_in_motion_stops_the_bytes_and_locks_the_arms(bench: Bench) -> None:
     bench.move()
+    called = time.monotonic()
     report = bench.controller.stop(["arm-1", "arm-2"], "test")
     at = time.monotonic()
     assert report.ok, report
     time.sleep(0.2)
     for bus in bench.buses:
-        assert [write for write in bus.writes if write.at > at] == []
+        last = bus.writes[-1].at
+        assert called < last <= at, "the report comes after the last byte"
+        assert last - called <= STOPPED_S
         assert [servo.torque for servo in bus.servos.values()] == [bench.stop_level == "hold"] * 6
     refused = bench.fleet.call("arm-1", "execute", MOVE)
     assert refused["status"] == "error"
@@ -105,12 +111,12 @@ def test_an_emergency_stop_in_motion_stops_the_bytes_and_locks_the_arms(bench: B
 def test_a_wedged_bus_is_named_and_the_other_arm_stops(bench: Bench) -> None:
     bench.move()
     bench.buses[0].wedge(30)
+    called = time.monotonic()
     report = bench.controller.stop(["arm-1", "arm-2"], "test")
     assert set(report.not_stopped) | set(report.silent) == {"arm-1"}
     assert set(report.stopped) == {"arm-2"}
-    at = time.monotonic()
     time.sleep(0.2)
-    assert bench.buses[1].written_after(at) == []
+    assert bench.buses[1].writes[-1].at - called <= STOPPED_S, "nobody waits for the arm that is deaf"
     bench.buses[0].release()
 
 
