@@ -40,6 +40,8 @@ SURFACES = frozenset(
         "spin",
         "backup",
         "move_base",
+        "move_base_simple",
+        "commands",
         "goal_pose",
         "initialpose",
         "enable_motors",
@@ -69,17 +71,23 @@ COMMAND_KINDS = {
 }
 """Types that are only ever sent to move something, with the surface that they stand for."""
 
+_SUFFIXES = ("joint_commands", "joint_command", "joint_trajectory")
+"""Surfaces that a prefix tells apart, as the two arms of a robot are: left_joint_command."""
+
 _YES = frozenset({"y", "yes", "a", "approve", "approved", "true"})
 
 
 @lru_cache(maxsize=256)
 def surface_of(name: str, kind: str | None = None) -> str | None:
     """The command surface that a graph name or its type stands for, or None: it moves nothing that we know of."""
-    for word in reversed(name.lower().strip("/").split("/")):
+    for word in reversed(name.lower().strip("/~").split("/")):
         if word in SURFACES:
             return word
         if "cmd_vel" in word:
             return "cmd_vel"
+        for suffix in _SUFFIXES:
+            if word.endswith(suffix):
+                return suffix
     return COMMAND_KINDS.get(bare_kind(kind)) if kind else None
 
 
