@@ -20,6 +20,7 @@ from strands_robots.drivers.ros.tools import suffix_of
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import EarlierRefusedError, Heard, MemoryLink, RosError, Unwatch
+from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.utils import ValidationError
 
 TOPIC = "/cmd_vel"
@@ -437,6 +438,32 @@ def test_a_base_that_rolls_on_did_not_stop_and_one_that_says_nothing_is_unknown(
     finally:
         wheels.close()
     assert made(odom_topic="/odom").halt().stopped is None
+
+
+def test_a_stop_of_a_base_that_never_told_a_speed_says_what_was_done_and_what_nobody_knows(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom")
+    answer = robot.stop()
+    assert (answer["status"], answer["stopped"]) == ("success", None)
+    assert "never told a speed" in answer["content"][0]["text"]
+    assert grade(answer) is Outcome.UNKNOWN
+    assert grade(robot.halt()) is Outcome.UNKNOWN
+    monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 0.01)
+    still = {"linear": {"x": 0.0}, "angular": {"z": 0.0}}
+    link.publish("/odom", "nav_msgs/msg/Odometry", {"twist": {"twist": still}})
+    fallen_silent = robot.stop()
+    assert (fallen_silent["status"], fallen_silent["stopped"]) == ("error", None)
+
+
+def test_a_stop_whose_zero_is_not_taken_is_an_error_also_of_a_base_that_never_told_a_speed(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    answer = made(FaultyLink(tuple(range(1, 10_000))), odom_topic="/odom").stop()
+    assert (answer["status"], answer["stopped"]) == ("error", False)
 
 
 def test_reads_answer_a_sample_or_why_not(made: Made) -> None:
