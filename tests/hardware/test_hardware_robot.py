@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -223,24 +224,61 @@ def test_joints_are_read_while_the_camera_fails() -> None:
         robot.get_observation()
 
 
-def test_a_state_read_waits_at_most_a_control_period_for_the_bus(robot: HardwareRobot) -> None:
-    assert robot.get_state()["joints_age_s"] < 1
+@contextmanager
+def hogged(robot: HardwareRobot) -> Iterator[threading.Event]:
+    """Somebody has the bus until the event is set, or the block is left."""
     held, free = threading.Event(), threading.Event()
 
     def hog() -> None:
         with robot.body().lock:
             held.set()
-            free.wait(5)
+            free.wait(10)
 
     thread = threading.Thread(target=hog)
     thread.start()
     assert held.wait(5)
-    state = robot.get_state()
+    try:
+        yield free
+    finally:
+        free.set()
+        thread.join()
+
+
+def test_a_state_read_waits_at_most_a_control_period_for_the_bus_of_a_robot_that_is_led(robot: HardwareRobot) -> None:
+    assert robot.get_state()["joints_age_s"] < 1
+    robot.start_task("wave")
+    with hogged(robot):
+        eventually(lambda: "joints_error" in robot.get_state())
+        state = robot.get_state()
     assert state["status"] == "success"
-    assert "busy" in state["joints_error"]
+    assert "busy for 0.005 s" in state["joints_error"]
+    assert "pan.pos" in state["joints"]
+
+
+def test_a_state_read_of_a_robot_that_nothing_drives_waits_for_its_turn(robot: HardwareRobot) -> None:
+    with hogged(robot) as free:
+        threading.Timer(0.2, free.set).start()
+        state = robot.get_state()
+    assert "joints_error" not in state
     assert state["joints"]["pan.pos"] == 10.0
-    free.set()
-    thread.join()
+    with hogged(robot):
+        assert "busy for 1 s" in robot.get_state()["joints_error"]
+
+
+def test_a_state_read_that_gets_the_bus_gives_it_to_a_stop_that_waits(robot: HardwareRobot) -> None:
+    robot.get_state()
+    halter = threading.Thread(target=robot.halt)
+    # Re-entrant: the read below gets its turn while the stop waits for this one to end.
+    with robot.body().lock:
+        halter.start()
+        eventually(lambda: robot.body().stop_waits)
+        reads = robot.device.reads
+        state = robot.get_state()
+        assert robot.device.reads == reads
+    halter.join()
+    assert "A stop waits" in state["joints_error"]
+    assert state["joints"]["pan.pos"] == 10.0
+    assert robot.body().stop_waits is False
 
 
 def test_send_action_says_what_was_really_sent_and_clamps(robot: HardwareRobot) -> None:

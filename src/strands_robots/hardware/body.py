@@ -87,6 +87,11 @@ class DeviceBody:
         return bool(getattr(self.device, "is_connected", True))
 
     @property
+    def stop_waits(self) -> bool:
+        """Whether somebody stops the body, or waits for the bus to do it."""
+        return self._stops > 0
+
+    @property
     def latest_joints(self) -> tuple[float, dict[str, float]] | None:
         """Seconds since the last joint read, and its joints; None before the first."""
         latest = self._latest

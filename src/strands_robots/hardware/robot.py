@@ -27,6 +27,10 @@ from strands_robots.utils import ValidationError, choice, number, text
 logger = logging.getLogger(__name__)
 
 
+IDLE_WAIT_S = 1.0
+"""How long a read of the state waits for the bus while nothing drives the robot."""
+
+
 class HardwareRobot(Tasks):
     """Any device with LeRobot's robot interface, driven by tasks, leaders and single actions.
 
@@ -94,11 +98,12 @@ class HardwareRobot(Tasks):
     def get_state(self) -> Envelope:
         """``joints`` by name in the device's unit, ``joints_age_s``, and ``task``.
 
-        While a loop drives the robot the joints are those of its last read, at most two control periods old. Else the
-        read waits its turn on the bus for at most a control period; then the joints are those of the last read, and
-        ``joints_error`` says why. A camera that fails does not touch them.
+        While a loop drives the robot the joints are those of its last read, at most two control periods old, or read
+        in a turn on the bus that is waited for for at most a control period; while nothing does, for at most 1 s.
+        Where no turn comes, or a stop waits for the bus, they are those of the last read, and ``joints_error`` says
+        why. A camera that fails does not touch them.
         """
-        problem = self._refresh(1 / self.control_hz)
+        problem = self._refresh()
         age, joints = self._body.latest_joints or (None, {})
         fields: dict[str, Any] = {"joints": joints, "task": self._task_fields()}
         fields["joints_age_s"] = None if age is None else round(age, 4)
@@ -204,18 +209,22 @@ class HardwareRobot(Tasks):
                 return error(f"Halted, but the device did not disconnect: {type(exc).__name__}: {exc}")
         return success("Halted and disconnected.", stopped=True)
 
-    def _refresh(self, within_s: float) -> str:
+    def _refresh(self) -> str:
         if joint_read_source(self) is None or not self._body.is_connected:
             return "The device is not connected."
         if self._body.lost:
             return "The device's port is gone; these are the joints of the last read."
         age, _ = self._body.latest_joints or (math.inf, {})
+        led = bool(self.teleoperating()) or (self._task is not None and self._task.running)
         # Two, because at one the loop itself is about to read, and would be held up.
-        if age <= 2 * within_s and (self.teleoperating() or (self._task is not None and self._task.running)):
+        if led and age <= 2 / self.control_hz:
             return ""
+        within_s = 1 / self.control_hz if led else IDLE_WAIT_S
         if not self._body.lock.acquire(timeout=within_s):
             return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
         try:
+            if self._body.stop_waits:
+                return "A stop waits for the bus; these are the joints of the last read."
             # Whoever drives it waits meanwhile: for one lost answer, not for three.
             self._body.get_joints(1 if self._body.driven else READ_TRIES)
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
