@@ -3,44 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
-import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fixtures.driver_bench import DriverBench
+from fixtures.driver_bench import DriverBench, drive
 from fixtures.toy_robots import ToyRobot
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from strands_robots.device_connect import base_driver, live_driver
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.envelope import error, success
-from strands_robots.safety.approval import Approval, Grants, state_dir
-from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.approval import Grants, state_dir
 from strands_robots.utils import ValidationError
-
-LISTS: dict[str, tuple[str, ...]] = {"DEVICE_CONNECT_RPC_ALLOW": ("operator",)}
-
-
-@pytest.fixture
-def robot() -> Iterator[ToyRobot]:
-    toy = ToyRobot()
-    yield toy
-    toy.close()
-
-
-def drive(robot: Any, approved: bool = True, **lists: tuple[str, ...]) -> RobotDeviceDriver:
-    allow = {**LISTS, **lists}
-    return RobotDeviceDriver(
-        robot,
-        authorization=Authorization(hardware=True, read_list=lambda name: allow.get(name, ()), robot="bench-1"),
-        approval=Approval(lambda _: ("execute",) if approved else (), lambda: False),
-    )
 
 
 async def test_execute_starts_a_task_and_returns_at_once(robot: ToyRobot) -> None:
@@ -53,31 +30,6 @@ async def test_execute_starts_a_task_and_returns_at_once(robot: ToyRobot) -> Non
         await bench.until(lambda: bench.of("taskComplete"))
         assert bench.of("taskStarted")[0]["instruction"] == "wave"
         assert bench.of("taskComplete")[0]["steps"] == robot.rollouts["toy"].steps
-
-
-async def test_stop_ends_the_task_for_every_caller(robot: ToyRobot) -> None:
-    async with DriverBench(drive(robot)) as bench:
-        for caller in ("operator", "stranger", None, {"no": "name"}):
-            await bench.call("execute", instruction="wave")
-            answer = await bench.call("stop", caller)
-            assert answer["status"] == "success"
-            assert answer["halted"] == ["toy"]
-            assert answer["stopped"] is True
-
-
-async def test_a_stop_that_did_not_happen_is_an_error_that_says_so(robot: ToyRobot) -> None:
-    async with DriverBench(drive(robot)) as bench:
-        await bench.call("execute", instruction="wave", duration=20)
-        robot.stubborn = True
-        answer = await bench.call("stop")
-        assert answer["status"] == "error"
-        assert answer["stopped"] is False
-        assert "toy" in answer["not_stopped"]
-
-
-async def test_nothing_to_stop_is_a_success(robot: ToyRobot) -> None:
-    async with DriverBench(drive(robot)) as bench:
-        assert (await bench.call("stop"))["stopped"] is True
 
 
 @pytest.mark.parametrize("caller", [None, "stranger", "Operator", "", 7, ["operator"], {"a": 1}])
@@ -194,119 +146,6 @@ async def test_an_answer_in_a_shape_nobody_knows_is_an_error(robot: ToyRobot, mo
     monkeypatch.setattr(robot, "start_task", lambda *_, **__: "ok")
     async with DriverBench(drive(robot)) as bench:
         assert (await bench.call("execute", instruction="wave"))["status"] == "error"
-
-
-async def test_a_stop_is_answered_while_motion_and_reads_block(robot: ToyRobot) -> None:
-    let_go = threading.Event()
-    robot.before = {"start_task": let_go.wait, "get_state": let_go.wait}
-    async with DriverBench(drive(robot)) as bench:
-        blocked = [asyncio.create_task(bench.call("execute", instruction="wave")) for _ in range(5)]
-        blocked += [asyncio.create_task(bench.call("getState")) for _ in range(9)]
-        await asyncio.sleep(0.05)
-        began = time.monotonic()
-        assert (await bench.call("stop"))["stopped"] is True
-        assert time.monotonic() - began < 0.5
-        let_go.set()
-        answers = await asyncio.gather(*blocked)
-    refused = [answer for answer in answers if "has not yet answered" in answer.get("reason", "")]
-    assert len(refused) == 14 - base_driver.MOVES_AT_ONCE - live_driver.READS_AT_ONCE + 1 or len(refused) >= 8
-
-
-async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(base_driver, "MOVE_DEADLINE_S", 0.1)
-    let_go = threading.Event()
-    robot.before["start_task"] = let_go.wait
-    async with DriverBench(drive(robot)) as bench:
-        answer = await bench.call("execute", instruction="wave")
-        assert "in time" in answer["reason"]
-        let_go.set()
-        await bench.until(lambda: len(robot.answers) == 1)
-    assert "halted after it was asked for" in robot.answers[0]["reason"]
-    assert robot.writes == []
-
-
-async def test_a_motion_that_is_not_started_in_time_takes_nothing_else_with_it(
-    robot: ToyRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(base_driver, "MOVE_DEADLINE_S", 0.1)
-    let_go, moving = threading.Event(), robot.gate.permit("a local motion")
-    robot.before["start_task"] = let_go.wait
-    async with DriverBench(drive(robot)) as bench:
-        assert "in time" in (await bench.call("execute", instruction="wave"))["reason"]
-        assert moving.valid, "a permit that is revoked without a halt leaves a base with its last velocity"
-        let_go.set()
-        await bench.until(lambda: len(robot.answers) == 1)
-
-
-async def test_a_stop_reaches_the_motion_that_has_not_begun_yet(robot: ToyRobot) -> None:
-    let_go, entered = threading.Event(), threading.Event()
-
-    def wait() -> None:
-        entered.set()
-        let_go.wait(10)
-
-    robot.before["start_task"] = wait
-    async with DriverBench(drive(robot)) as bench:
-        asked = asyncio.create_task(bench.call("execute", instruction="wave"))
-        await bench.until(entered.is_set)
-        assert (await bench.call("stop"))["stopped"] is True
-        let_go.set()
-        answer = await asked
-        assert answer["status"] == "error"
-        assert "halted after it was asked for" in answer["reason"]
-        assert robot.writes == []
-        robot.before.clear()
-        assert (await bench.call("execute", instruction="wave"))["status"] == "success"
-
-
-async def test_a_halt_without_an_answer_is_reported_as_not_stopped(
-    robot: ToyRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
-    let_go = threading.Event()
-    robot.before["halt"] = let_go.wait
-    async with DriverBench(drive(robot)) as bench:
-        answer = await bench.call("stop")
-        assert answer["stopped"] is False
-        assert "no answer in 0.1 s" in answer["reason"]
-        let_go.set()
-
-
-async def test_an_emergency_stop_of_an_allowed_source_halts(robot: ToyRobot) -> None:
-    async with DriverBench(drive(robot, DEVICE_CONNECT_ESTOP_ALLOW=("safety-*",))) as bench:
-        await bench.call("execute", instruction="wave")
-        for source in ("stranger", "Safety-1", "", "bench-1"):
-            await bench.driver.onEmergencyStop(source, "emergencyStop", {"reason": "test"})
-        await asyncio.sleep(0.1)
-        assert robot.rollouts["toy"].running
-        await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {"reason": "test"})
-        await bench.until(lambda: not robot.rollouts["toy"].running)
-
-
-async def test_without_a_list_every_named_source_stops_whatever_the_rpc_list_says(robot: ToyRobot) -> None:
-    async with DriverBench(drive(robot)) as bench:
-        await bench.call("execute", instruction="wave")
-        await bench.driver.onEmergencyStop("anybody", "emergencyStop", {})
-        await bench.until(lambda: not robot.rollouts["toy"].running)
-
-
-def test_a_robot_that_did_not_stop_is_named_at_critical(robot: ToyRobot, caplog: pytest.LogCaptureFixture) -> None:
-    driver = drive(robot)
-    robot.start_task("wave", duration=20)
-    robot.stubborn = True
-    with caplog.at_level(logging.CRITICAL):
-        verdict = driver.handle_estop("safety-1", {"reason": "smoke"})
-    assert verdict is not None
-    assert verdict.stopped is False
-    assert "toy" in caplog.text
-    assert "safety-1" in caplog.text
-
-
-@pytest.mark.parametrize("payload", [None, [], "x", {"reason": object()}])
-def test_an_emergency_stop_counts_whatever_its_payload_is(robot: ToyRobot, payload: object) -> None:
-    verdict = drive(robot).handle_estop("safety-1", payload)
-    assert verdict is not None
-    assert verdict.stopped is True
 
 
 async def test_status_presence_and_heartbeat_tell_what_the_robot_does(robot: ToyRobot) -> None:

@@ -1,0 +1,109 @@
+"""The plane frees robots: by the operator's signature, or at their own machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.recording_robot import RecordingRobot
+from fixtures.waiting import eventually
+
+from strands_robots.audit import read_audit_log
+from strands_robots.envelope import is_error
+from strands_robots.safety import clearance, ed25519
+from strands_robots.safety.orders import StopOrder, new_epoch
+from strands_robots.safety.persistence import LockoutStore
+from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.resume import sign
+
+Add = Callable[..., RecordingRobot]
+
+
+def order(epoch: str = "", source: str = "safety-1", **fields: Any) -> StopOrder:
+    return StopOrder(epoch or new_epoch(), source, fields.pop("reason", "smoke"), **fields)
+
+
+@pytest.fixture
+def operator(monkeypatch: pytest.MonkeyPatch) -> Ed25519PrivateKey:
+    key = Ed25519PrivateKey.generate()
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", ed25519.encode(ed25519.public_half(key)))
+    return key
+
+
+def test_two_stops_need_two_resumes_and_a_resume_starts_nothing(
+    plane: SafetyPlane, add: Add, operator: Ed25519PrivateKey
+) -> None:
+    robot = add()
+    robot.start()
+    epochs = [new_epoch(), new_epoch()]
+    for epoch in epochs:
+        plane.emergency_stop(order(epoch))
+    for left, epoch in ((True, epochs[0]), (False, epochs[1])):
+        answer = plane.resume("arm-1", sign(operator, epoch, ["arm-1"])[0], "test")
+        assert not is_error(answer)
+        assert answer["locked"] is left
+        assert robot.refuses() is left
+    writes = len(robot.device.times)
+    time.sleep(0.03)
+    assert len(robot.device.times) == writes
+    robot.start()
+    assert robot.moving
+
+
+def test_a_rejected_resume_says_nothing_on_the_wire_and_why_in_the_audit(
+    plane: SafetyPlane, add: Add, operator: Ed25519PrivateKey
+) -> None:
+    robot, epoch = add(), new_epoch()
+    plane.emergency_stop(order(epoch))
+    answer = plane.resume("arm-1", sign(operator, epoch, ["arm-2"])[0], "mesh")
+    assert answer["reason"] == "resume rejected"
+    assert robot.refuses()
+    denied = [each for each in read_audit_log() if each["event"] == "resume_denied"]
+    assert "targets" in denied[0]["payload"]["why"]
+    assert is_error(plane.resume("nobody", {}, "mesh"))
+
+
+def test_a_local_clear_frees_names_who_and_survives_a_restart(plane: SafetyPlane, add: Add) -> None:
+    robot = add(key="k")
+    plane.emergency_stop(order())
+    assert list(plane.clear_local("ann")) == ["arm-1"]
+    assert not robot.refuses()
+    assert not LockoutStore().load("k").state.locked
+    assert [each["payload"]["who"] for each in read_audit_log() if each["event"] == "resume_local"] == ["ann"]
+
+
+def test_a_slip_laid_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane, add: Add) -> None:
+    robots = {name: add(name) for name in ("arm-1", "arm-2")}
+    plane.emergency_stop(order())
+    clearance.lay("ann", ["arm-1"])
+    eventually(lambda: not robots["arm-1"].refuses())
+    assert robots["arm-2"].refuses()
+    assert list(clearance.clearances().iterdir()) == []
+
+
+def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_says_of_a_third_that_it_is_free(
+    plane: SafetyPlane, add: Add
+) -> None:
+    running = add("arm-1", key="k1")
+    add("arm-2", key="k2")
+    plane.emergency_stop(order())
+    plane.robots["arm-2"].close()
+    outcome = clearance.clear_here("ann", ["arm-1", "arm-2", "arm-3"], wait_s=1.0)
+    assert outcome == {"arm-1": "cleared", "arm-2": "cleared on disk", "arm-3": "not locked here"}
+    assert not running.refuses()
+    after = add("arm-2", key="k2")
+    assert not after.refuses()
+    cleared = [each for each in read_audit_log() if each["event"] == "resume_local"]
+    assert {each["peer_id"] for each in cleared} == {"arm-1", "arm-2"}
+
+
+def test_a_slip_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:
+    robot = add()
+    plane.emergency_stop(order())
+    clearance.lay("ann", ["arm-1"])
+    clearance.clearances().chmod(0o777)
+    time.sleep(0.6)
+    assert robot.refuses()
