@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import threading
 from typing import Any
 
 import pytest
+from fixtures.waiting import eventually
 from tests.mesh.peers import Clock
 
+from strands_robots.mesh.transport import bridge as bridges
 from strands_robots.mesh.transport.base import TransportError
 from strands_robots.mesh.transport.bridge import BridgeTransport, Near, Seen
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
@@ -106,6 +109,56 @@ def test_it_is_connected_while_either_leg_is(buses: tuple[MemoryBus, MemoryBus])
         half.put("strands/a/presence", {"x": 1})
     with pytest.raises(TransportError, match="neither leg"):
         BridgeTransport(Down(buses[0]), Down(buses[1])).connect()
+
+
+class Late(MemoryTransport):
+    """A leg that connects from the third time on."""
+
+    tries = 0
+
+    def connect(self) -> None:
+        self.tries += 1
+        if self.tries < 3:
+            raise TransportError("not yet")
+        super().connect()
+
+
+def test_a_leg_that_is_down_at_start_is_brought_up_with_what_was_subscribed_and_stopped_meanwhile(
+    buses: tuple[MemoryBus, MemoryBus], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bridges, "RETRY_S", 0.02)
+    late = Late(buses[1], sessionless=True)
+    both = BridgeTransport(MemoryTransport(buses[0]), late)
+    both.connect()
+    far = on(buses[1])
+    heard: list[str] = []
+    stops: list[dict[str, Any]] = []
+    kept = both.declare_subscriber("strands/a/cmd", lambda sample: heard.append(sample.key))
+    dropped = both.declare_subscriber("strands/b/cmd", lambda sample: heard.append(sample.key))
+    dropped.undeclare()
+    far.declare_subscriber("strands/safety/estop", lambda sample: stops.append(json.loads(sample.payload)))
+    for count in (0, 2):
+        stop = {"peer_id": "a", "t": 1.0, "estop_id": "e" * 32, "source_zid": both.session_id, "peers_silent": count}
+        both.put("strands/safety/estop", stop)
+    eventually(lambda: stops, within=5)
+    assert stops == [{"peer_id": "a", "t": 1.0, "estop_id": "e" * 32, "peers_silent": 2}]
+    for name in ("b", "a"):
+        body = {"sender_id": "x", "turn_id": name, "command": {"action": "stop"}}
+        eventually(late.is_alive, within=2)
+        far.put(f"strands/{name}/cmd", body)
+    assert heard == ["strands/a/cmd"]
+    eventually(lambda: not [each for each in threading.enumerate() if each is both._mender], within=2)
+    kept.undeclare()
+    both.close()
+
+
+def test_a_bridge_that_is_closed_while_a_leg_is_down_leaves_no_thread(buses: tuple[MemoryBus, MemoryBus]) -> None:
+    half = BridgeTransport(MemoryTransport(buses[0]), Down(buses[1]))
+    half.connect()
+    mender = half._mender
+    assert mender is not None and mender.is_alive()
+    half.close()
+    assert not mender.is_alive()
 
 
 def test_an_unknown_topic_in_the_setting_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
