@@ -13,10 +13,12 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.mesh.context import registered_providers
+from strands_robots.mesh.dispatch import Dispatcher, fit
 from strands_robots.mesh.security import ValidationError, validate_command
 from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.policies import registry as policy_registry
 from strands_robots.safety.approval import Grants, state_dir
+from strands_robots.safety.stopping import StopVerdict
 
 
 def ask(
@@ -114,6 +116,20 @@ def test_execute_waits_until_the_policy_has_ended(peers: Fleet, monkeypatch: pyt
     console = peers.join(None, "console")
     reply = console.tell("arm-1", "wave", policy_provider="mock", duration=0.5)
     assert reply["result"]["task_status"] == "idle"
+
+
+def test_leaving_the_mesh_ends_an_execute_with_the_reason(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    arm, left = Arm(), threading.Event()
+    execute = {"action": "execute", "policy_provider": "mock", "policy_host": "localhost", "duration": 30.0}
+    answers: list[Any] = []
+    told = Dispatcher(fit(arm), lambda reason: StopVerdict(), left.is_set)
+    asking = threading.Thread(target=lambda: answers.append(told(execute)))
+    asking.start()
+    eventually(lambda: arm.moving, within=2)
+    left.set()
+    asking.join(5)
+    assert answers[0]["status"] == "error"
+    assert "left the mesh" in answers[0]["reason"]
 
 
 def test_a_replayed_motion_is_carried_out_once(peers: Fleet) -> None:

@@ -17,6 +17,7 @@ from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
 from strands_robots.mesh.presence import Herald
 from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.transport.base import TransportError
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity
 
@@ -210,3 +211,36 @@ def test_who_does_not_come_back_with_the_link_is_gone(monkeypatch: pytest.Monkey
     assert not reachable(registry)
     assert registry.conflicts("arm-1", "bb") is None
     herald.stop()
+
+
+def test_a_row_that_is_refreshed_without_a_session_keeps_the_living_peers_binding() -> None:
+    clock = Clock()
+    registry = PeerRegistry(clock=clock)
+    registry.update("arm-1", "robot", "h", {}, session="aa", certificate=("c" * 64, "arm-1"))
+    registry.update("arm-1", "robot", "h", {"task_status": "idle"})
+    assert registry.session_of("arm-1") == "aa"
+    assert registry.certificate_of("arm-1") == ("c" * 64, "arm-1")
+    registry.lost("arm-1", "aa")
+    registry.update("arm-1", "robot", "h", {})
+    assert registry.session_of("arm-1") is None
+
+
+def test_a_peer_that_cannot_begin_gives_the_session_back(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = Mesh(None, "console", parts=peers.parts("console"))
+    transport = peers.transports["console"]
+    declare = transport.declare_subscriber
+
+    def refuse(key: str, callback: Any) -> Any:
+        if key == "strands/broadcast":
+            raise TransportError("no more subscribers")
+        return declare(key, callback)
+
+    monkeypatch.setattr(transport, "declare_subscriber", refuse)
+    with pytest.raises(TransportError):
+        first.start()
+    assert "console" not in get_local_robots()
+    assert transport.session_id is None
+    monkeypatch.undo()
+    first.start()
+    assert first.alive
+    first.close()

@@ -15,8 +15,9 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from fixtures.mesh_robots import Arm, World
 from tests.mesh.peers import Clock, Fleet
 
-from strands_robots.mesh import keys
-from strands_robots.mesh.transport.memory import MemoryTransport
+from strands_robots.mesh import keys, wire_identity
+from strands_robots.mesh.assembly import identity_of
+from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
 
 BODY = {"robot_id": "arm-1", "timestamp": 1.5, "nested": {"b": [1, "é"], "a": None}}
@@ -106,6 +107,30 @@ def test_a_certificate_of_another_authority_does_not_count(folder: Path, tmp_pat
     message = signer(tmp_path, "arm-1", clock).sign(BODY)
     with pytest.raises(IdentityError, match="issued"):
         verifier(folder, clock).verify(message)
+
+
+def test_the_issuer_is_asked_before_the_certificates_dates(folder: Path, tmp_path: Path) -> None:
+    clock = Clock()
+    keys.init(tmp_path)
+    keys.issue(tmp_path, "arm-1")
+    message = signer(tmp_path, "arm-1", clock).sign(BODY)
+    clock.pass_(100 * 365 * 86400.0)
+    with pytest.raises(IdentityError, match="issued"):
+        verifier(folder, clock).verify(message)
+
+
+@pytest.mark.parametrize(("word", "required"), [("1", True), ("yes", True), ("TRUE", True), ("0", False)])
+def test_any_unknown_word_demands_signatures_on_every_road_and_is_warned_of_once(
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    word: str,
+    required: bool,
+) -> None:
+    monkeypatch.setenv("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY", word)
+    wire_identity._taken_as_one.cache_clear()
+    broker = MemoryTransport(MemoryBus(), sessionless=True)
+    assert [identity_of(broker).required for _ in range(3)] == [required] * 3
+    assert len([each for each in caplog.records if "taken as 1" in each.message]) == (word not in "01")
 
 
 @pytest.mark.parametrize("kind", ["rsa", "ed25519", "ecdsa"])

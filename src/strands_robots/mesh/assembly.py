@@ -31,7 +31,7 @@ from strands_robots.mesh.subscriptions import Subscriptions
 from strands_robots.mesh.teleop import TeleopDesk
 from strands_robots.mesh.transport.base import Transport
 from strands_robots.mesh.transport.posture import Posture, credentials_from_settings
-from strands_robots.mesh.wire_identity import Identity, from_settings
+from strands_robots.mesh.wire_identity import Identity, demanded, from_settings
 from strands_robots.safety.halting import halt_of
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
@@ -97,14 +97,15 @@ class Assembled:
         context.transport = transport
         context.identity = self.identity_of(transport)
         hear = transport.declare_subscriber
-        self.held = [
+        for key, heard in (
             # The resumes first: one that the broker kept tells which kept e-stop is over.
-            hear(topics.resume(), self.safety.on_resume),
-            hear(topics.estop(), self.safety.on_estop),
-            hear(topics.command(peer), self.server.on_command),
-            hear(topics.broadcast(), self.server.on_command),
-            hear(topics.responses(peer), self.caller.on_response),
-        ]
+            (topics.resume(), self.safety.on_resume),
+            (topics.estop(), self.safety.on_estop),
+            (topics.command(peer), self.server.on_command),
+            (topics.broadcast(), self.server.on_command),
+            (topics.responses(peer), self.caller.on_response),
+        ):
+            self.held.append(hear(key, heard))
         self.herald.start()
         every, rates = self.scheduler.every, topics.BY_NAME
         if self.mesh.robot is not None:
@@ -241,8 +242,7 @@ def identity_of(transport: Transport) -> Identity:
     posture: Posture | None = getattr(transport, "posture", None)
     if posture is not None:
         return from_settings(posture.credentials)
-    demanded = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY") == "1"
-    return from_settings(credentials_from_settings() if demanded else None)
+    return from_settings(credentials_from_settings() if demanded() == "1" else None)
 
 
 def _body(robot: Any) -> Any:

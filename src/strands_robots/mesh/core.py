@@ -72,8 +72,13 @@ class Mesh(SensorLoopsMixin):
             transport = self._parts.acquire()
             if transport is None:
                 return
-            self._assembled.door.open()
-            self._assembled.begin(transport)
+            try:
+                self._assembled.door.open()
+                self._assembled.begin(transport)
+            except BaseException:
+                # Whoever cannot join holds nothing: neither the session nor half of its subscribers.
+                self._leave()
+                raise
         with _local_lock:
             _local[self.peer_id] = self
 
@@ -82,17 +87,20 @@ class Mesh(SensorLoopsMixin):
         with self._lifecycle_lock:
             if self._context.transport is None:
                 return
-            self._assembled.end(LOOP_JOIN_TIMEOUT_S)
-            self._parts.release()
-            # A locked peer stays with the safety plane: leaving and joining again must not unlock it.
-            if not self._assembled.door.epochs():
-                self._assembled.door.close()
-            self._assembled = assemble(self, self._parts, self._assembled)
-            self._context = self._assembled.context
-            self._sensors = self._assembled.sensors
+            self._leave()
         with _local_lock:
             if _local.get(self.peer_id) is self:
                 del _local[self.peer_id]
+
+    def _leave(self) -> None:
+        self._assembled.end(LOOP_JOIN_TIMEOUT_S)
+        self._parts.release()
+        # A locked peer stays with the safety plane: leaving and joining again must not unlock it.
+        if not self._assembled.door.epochs():
+            self._assembled.door.close()
+        self._assembled = assemble(self, self._parts, self._assembled)
+        self._context = self._assembled.context
+        self._sensors = self._assembled.sensors
 
     def close(self) -> None:
         """Leave the mesh for good, and the safety plane with it."""

@@ -162,7 +162,9 @@ class Dispatcher:
         self, robot: Robot, name: str | None, started: Envelope, ends: list[RolloutEvent], duration: float
     ) -> Envelope:
         deadline = time.monotonic() + duration + EXECUTE_GRACE_S
-        while not self._closing() and time.monotonic() < deadline and not ends:
+        while time.monotonic() < deadline and not ends:
+            if self._closing():
+                return error("execute: this peer left the mesh while the policy ran.", started=started)
             if not _moving(robot, name):
                 break
             time.sleep(POLL_S)

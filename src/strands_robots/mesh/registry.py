@@ -75,11 +75,18 @@ class PeerRegistry:
         session: str | None = None,
         certificate: tuple[str, str] | None = None,
     ) -> bool:
-        """Insert or refresh a row; True when the peer is new."""
-        row = PeerInfo(peer_id, peer_type, hostname, self._clock(), dict(caps), session, certificate)
+        """Insert or refresh a row; True when the peer is new.
+
+        Who says no session of a living peer leaves it bound as it was, and so it is with its certificate.
+        """
+        now = self._clock()
         with self._lock:
             # Taken out and put in again, so that the order of the rows is the order of their last word.
             known = self._rows.pop(peer_id, None)
+            if known is not None and not known.gone and now - known.seen <= PEER_TIMEOUT:
+                session = session if session is not None else known.session
+                certificate = certificate if certificate is not None else known.certificate
+            row = PeerInfo(peer_id, peer_type, hostname, now, dict(caps), session, certificate)
             self._past.pop(peer_id, None)
             self._rows[peer_id] = row
             while len(self._rows) > max(1, self._most()):

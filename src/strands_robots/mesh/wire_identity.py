@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,6 +123,7 @@ class Verifier:
         certificate = _parse(der)
         name = _common_name(certificate)
         self._issued(certificate)
+        self._valid(certificate)
         stamp = wire.finite(sig["t"])
         if stamp is None or not wire.fresh(stamp, self._clock()):
             raise IdentityError("the signature is not fresh")
@@ -140,9 +142,6 @@ class Verifier:
         return Verified(digest, name)
 
     def _issued(self, certificate: x509.Certificate) -> None:
-        now = datetime.datetime.fromtimestamp(self._clock(), datetime.UTC)
-        if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
-            raise IdentityError("the certificate is not valid now")
         for root in self._roots:
             try:
                 certificate.verify_directly_issued_by(root)
@@ -151,6 +150,11 @@ class Verifier:
             else:
                 return
         raise IdentityError("no configured root issued the certificate")
+
+    def _valid(self, certificate: x509.Certificate) -> None:
+        now = datetime.datetime.fromtimestamp(self._clock(), datetime.UTC)
+        if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
+            raise IdentityError("the certificate is not valid now")
 
     def _use(self, digest: str, nonce: str) -> None:
         now = self._monotonic()
@@ -201,15 +205,25 @@ class Identity:
 
 def from_settings(credentials: Credentials | None) -> Identity:
     """The identity the environment asks for: signed when there are certificates, unless it is told otherwise."""
-    word = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY").lower()
+    word = demanded()
     signer, verifier = None, None
     if credentials is not None:
         signer = Signer(credentials.cert, credentials.key)
         verifier = Verifier(credentials.ca.read_bytes())
-    if word not in ("0", "1", "auto"):
-        logger.warning("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY=%r is none of 1, 0 and auto; taken as 1.", word)
-        word = "1"
     return Identity(signer, verifier, required=word == "1" or (word == "auto" and verifier is not None))
+
+
+def demanded() -> str:
+    """What ``STRANDS_MESH_REQUIRE_SIGNED_IDENTITY`` asks for: ``1``, ``0`` or ``auto``; any other word is ``1``."""
+    word = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY").strip().lower()
+    return word if word in ("0", "1", "auto") else _taken_as_one(word)
+
+
+@lru_cache(maxsize=16)
+def _taken_as_one(word: str) -> str:
+    """``1``; each unknown word is warned of once."""
+    logger.warning("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY=%s is none of 1, 0 and auto; taken as 1.", shown(word))
+    return "1"
 
 
 def _cryptography() -> tuple[Any, Any]:
