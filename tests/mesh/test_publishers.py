@@ -52,8 +52,12 @@ def test_a_robot_that_cannot_be_read_says_so_and_stays_seen() -> None:
     reader.read()
     body = reader.read()
     assert body is not None
-    assert body["degraded"]["joints"]["failures"] == 2
-    assert len(body["degraded"]["joints"]["reason"]) < 200
+    told = body["degraded"]["joints"]
+    assert set(told) == {"reason", "detail", "failures", "seconds"}
+    assert (told["reason"], told["failures"]) == ("OSError", 2)
+    assert told["detail"].startswith("bus timeout")
+    assert len(told["detail"]) < 200
+    assert body["task"]["status"] == "idle"
     assert StateReader("console", None).read() is None
 
 

@@ -112,6 +112,11 @@ class HardwareRobot(Tasks):
         return success(problem or f"{len(joints)} joints.", **fields)
 
     @property
+    def is_connected(self) -> bool:
+        """The device is connected, and its port is there."""
+        return self._body.is_connected and not self._body.lost
+
+    @property
     def hardware_name(self) -> str:
         """The device's type, such as ``so100_follower``."""
         return kind(self.device)

@@ -13,6 +13,7 @@ from strands_robots.cameras import Frames, frames_of
 from strands_robots.contract import WorldRobot
 from strands_robots.mesh import camera, session, topics
 from strands_robots.mesh.context import Context
+from strands_robots.mesh.description import Description
 from strands_robots.mesh.dispatch import Dispatcher
 from strands_robots.mesh.door import PlaneDoor, SafetyDoor
 from strands_robots.mesh.executor import Lanes
@@ -25,7 +26,7 @@ from strands_robots.mesh.safety import FleetSafety
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.sensors import SensorDesk
 from strands_robots.mesh.serving import Line, MotionDoor, Server
-from strands_robots.mesh.state import StateReader, describe
+from strands_robots.mesh.state import StateReader
 from strands_robots.mesh.stream import StepFeed
 from strands_robots.mesh.subscriptions import Subscriptions
 from strands_robots.mesh.teleop import TeleopDesk
@@ -203,9 +204,10 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
     scheduler = Scheduler(f"mesh-{peer}")
     sensors = SensorDesk(context, scheduler)
+    description = Description(peer, robot)
 
     def facts() -> dict[str, Any]:
-        told = describe(robot)
+        told = description.read()
         if inputs:
             told["inputs"] = list(inputs.values())
         spoken = sensors.topics()
