@@ -30,7 +30,8 @@ DEPTH = 32
 BURST = 10.0
 LOGGED_ERRORS = 5
 REJECTIONS = ("source", "lockout", "expired", "freshness", "invalid")
-UNITS_FULL_SCALE = {"normalized": 1.0, "radians": 6.283185307179586, "degrees": 360.0, "percent": 100.0}
+UNITS_FULL_SCALE = {"normalized": 100.0, "radians": 6.283185307179586, "degrees": 360.0, "percent": 100.0}
+"""Largest magnitude in each unit: LeRobot's normalised range is -100 to 100, an angle's one turn."""
 
 
 class InputReceiver:
@@ -225,7 +226,7 @@ class InputReceiver:
     def _validated(self, action: object) -> dict[str, float]:
         checked = validate_input_frame(action)
         for joint, value in checked.items():
-            limit = self._limits.get(joint)
+            limit = self._limits.get(joint, self._limits.get(joint.removesuffix(".pos")))
             if limit is not None and abs(value) > limit:
                 raise ValidationError(f"{joint} must be within {limit:g}, not {value:g}.", "TELEOP_VALUE_OUT_OF_RANGE")
         return checked
