@@ -12,12 +12,15 @@ import pytest
 from fixtures.rosbridge_server import RosbridgeServer
 from fixtures.waiting import eventually, free_port
 
+from strands_robots.drivers.ros import wire
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
 from strands_robots.ros import goals
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.goals import run_goal
 from strands_robots.ros.link import RosError
 from strands_robots.ros.rosbridge import RosbridgeLink
+from strands_robots.safety.orders import StopOrder
+from strands_robots.safety.plane import SafetyPlane
 from strands_robots.utils import ValidationError
 
 OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
@@ -254,6 +257,33 @@ def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still
     server.start()
     eventually(lambda: server.published, within=4, what="the hold's zero on the new connection")
     assert server.published[0][1]["linear"]["x"] == 0.0
+
+
+def test_a_server_that_returns_under_the_lockout_brings_zeros_for_their_whole_time_and_nothing_else(
+    server: RosbridgeServer, rover: RosbridgeRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wire, "BLIND_HOLD_S", 0.4)
+    plane = SafetyPlane(deadline_s=1.0)
+    entry = plane.register("rover-1", rover)
+    try:
+        assert rover.start_drive(0.5, 0.0, 20.0)["status"] == "success"
+        eventually(lambda: server.published)
+        server.stop()
+        report = plane.emergency_stop(StopOrder("e" * 32, "console", "test"))["rover-1"]
+        assert report.verdict.stopped is False
+        down = time.monotonic()
+        eventually(lambda: time.monotonic() > down + 3 * wire.BLIND_HOLD_S, what="longer than a blind hold")
+        assert rover.holding
+        server.published.clear()
+        server.start()
+        eventually(lambda: not rover.holding, within=10, what="the end of the hold on the new connection")
+        assert len(server.published) >= 10
+        assert {message["linear"]["x"] for _, message in server.published} == {0.0}
+        assert "e" * 32 in rover.drive(0.5)["reason"]
+        assert "rover-1" in plane.clear_local("test")
+        assert rover.drive(0.5, duration=0.1)["status"] == "success"
+    finally:
+        entry.close()
 
 
 def test_curiosity_is_wired_to_its_simulation() -> None:
