@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from strands_robots.contract import WorldRobot
@@ -18,6 +19,22 @@ Frames = Callable[[], Mapping[str, Any]]
 """Gives height x width x 3 arrays of uint8 by camera name."""
 
 
+class Shots(Mapping[str, Any]):
+    """Pictures by camera name, each taken when it is asked for, so that a camera that fails spoils no other."""
+
+    def __init__(self, takers: Mapping[str, Callable[[], Any]]) -> None:
+        self._takers = dict(takers)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._takers[name]()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._takers)
+
+    def __len__(self) -> int:
+        return len(self._takers)
+
+
 def frames_of(robot: Any) -> Frames | None:
     """How to take a picture with each of a robot's cameras; None for one without.
 
@@ -27,9 +44,12 @@ def frames_of(robot: Any) -> Frames | None:
     body = getattr(robot, "wrapped", robot)
     own, render, observe = (getattr(body, verb, None) for verb in ("camera_frames", "render", "get_observation"))
     if callable(own):
-        return lambda: dict(own())
+        given: Frames = own
+        return given
     if isinstance(robot, WorldRobot) and callable(render):
-        return lambda: {str(name).replace("/", "."): render(name) for name in robot.get_features().get("cameras", ())}
+        return lambda: Shots(
+            {str(name).replace("/", "."): partial(render, name) for name in robot.get_features().get("cameras", ())}
+        )
     if callable(observe):
         return lambda: {str(name): value for name, value in observe().items() if getattr(value, "ndim", 0) == 3}
     return None
@@ -59,7 +79,7 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
     for name in wanted:
         if name not in known:
             raise ValidationError(f"camera must be one of {', '.join(known)}, not {shown(name)}.")
-    return lambda: {name.replace("/", "."): render(name) for name in wanted}
+    return lambda: Shots({name.replace("/", "."): partial(render, name) for name in wanted})
 
 
 def jpeg(name: str, pixels: Any) -> bytes:

@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
+from strands_robots.cameras import Shots
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
@@ -145,13 +146,13 @@ class HardwareRobot(Tasks):
         """Everything the device sees, images included, in its turn on the bus. Raises what the device raises."""
         return self._body.get_observation()
 
-    def camera_frames(self) -> dict[str, Any]:
+    def camera_frames(self) -> Mapping[str, Any]:
         """The newest picture of each of the device's cameras, RGB (height, width, 3), without the bus.
 
-        Raises what a camera raises.
+        A picture is taken when it is asked for by its name; that raises what its camera raises.
         """
         cameras = getattr(self.device, "cameras", None)
-        return {str(name): _picture(camera) for name, camera in (cameras or {}).items()}
+        return Shots({str(name): partial(_picture, camera) for name, camera in (cameras or {}).items()})
 
     def send_action(self, action: Mapping[str, float]) -> Envelope:
         """Set targets once; ``sent`` is what the device really took. Refused while a task or a leader drives it."""

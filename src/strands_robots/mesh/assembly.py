@@ -9,9 +9,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
-from strands_robots.cameras import Frames, frames_of
+from strands_robots.cameras import frames_of
 from strands_robots.contract import WorldRobot
-from strands_robots.mesh import camera, session, topics
+from strands_robots.mesh import session, topics
+from strands_robots.mesh.camera import CameraFeed
+from strands_robots.mesh.children import Children
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.description import Description
 from strands_robots.mesh.dispatch import Dispatcher
@@ -90,6 +92,7 @@ class Assembled:
     sensors: SensorDesk
     identity_of: Callable[[Transport], Identity]
     inputs: dict[str, dict[str, Any]]
+    children: Children | None = None
     held: list[Any] = field(default_factory=list)
 
     def begin(self, transport: Transport) -> None:
@@ -113,11 +116,15 @@ class Assembled:
             self.mesh.add_robot_sensors()
         every("describe", rates["presence"].rate_hz, self.herald.refresh)
         every("state", rates["state"].rate_hz, self._publish_state)
+        if self.children is not None:
+            every("children", rates["presence"].rate_hz, self.children.refresh)
+            every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
         every("tokens", TOKENS_HZ, self.herald.judge_tokens, quick=True)
         every("prune", PRUNE_HZ, self._prune, quick=True)
         frames = frames_of(self.mesh.robot)
         if frames is not None:
-            every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), lambda: self._publish_frames(frames))
+            feed = CameraFeed(context, frames)
+            every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), feed.publish)
         self.scheduler.start()
         self.steps.start()
         # A robot whose bus is wedged is announced all the same, by its name alone.
@@ -138,6 +145,8 @@ class Assembled:
         if dropped:
             logger.info("%s left the mesh and dropped %d subscriptions.", self.context.peer_id, dropped)
         self.herald.stop()
+        if self.children is not None:
+            self.children.close()
         for each in self.held:
             each.undeclare()
         self.held = []
@@ -151,9 +160,6 @@ class Assembled:
         body = self.state.read()
         if body is not None:
             self.context.put(topics.state(self.context.peer_id), body)
-
-    def _publish_frames(self, frames: Frames) -> None:
-        camera.publish_frames(self.context, frames)
 
     def _prune(self) -> None:
         self.context.registry.prune()
@@ -170,8 +176,11 @@ def _safety_key(robot: Any, peer: str, *, keep: bool) -> str | None:
 def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assembled:
     """The parts of ``mesh``; those of a stay before give their door to the safety plane."""
     peer, robot = mesh.peer_id, mesh.robot
-    recorder = Recorder(peer, parts.audit) if parts.audit is not None else Recorder(peer)
-    context = Context(peer, parts.registry, recorder, Identity(), parts.clock, parts.monotonic)
+
+    def recorder(name: str) -> Recorder:
+        return Recorder(name, parts.audit) if parts.audit is not None else Recorder(name)
+
+    context = Context(peer, parts.registry, recorder(peer), Identity(), parts.clock, parts.monotonic)
     simulated = isinstance(robot, WorldRobot) or mesh.peer_type == "sim"
     lanes = Lanes(peer)
     key = _safety_key(robot, peer, keep=parts.keep)
@@ -215,6 +224,10 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
             told["topics"] = spoken
         return told
 
+    children: Children | None = None
+    if isinstance(robot, WorldRobot):
+        admit = safety.on_resume_command
+        children = Children(context, robot, lanes, mesh.peer_type, safety.locked, admit, recorder)
     return Assembled(
         mesh=mesh,
         context=context,
@@ -232,6 +245,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         steps=StepFeed(context, robot, settings.number("STRANDS_MESH_STREAM_HZ")),
         identity_of=parts.identity or identity_of,
         inputs=inputs,
+        children=children,
     )
 
 
