@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
+import sys
 import threading
 import time
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 
 import pytest
 from fixtures.feetech_bus import MOTORS, FeetechBus, arm_calibration, arm_servos
+from fixtures.terminal import on_a_terminal
 from fixtures.waiting import eventually
 from typer.testing import CliRunner
 
@@ -124,6 +127,50 @@ def test_the_command_asks_step_by_step(fresh: FeetechBus) -> None:
     assert ended.exit_code == 2
     assert "standard input has ended" in ended.output
     eventually(lambda: not any(servo.torque for servo in fresh.servos.values()))
+
+
+@pytest.mark.parametrize("machine", [False, True], ids=["shown", "json"])
+def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) -> None:
+    def looked() -> None:
+        """The command has read every joint since now."""
+        before = fresh.answers
+        eventually(lambda: fresh.answers > before + 3 * len(MOTORS), within=10, what="two looks at the joints")
+
+    name = f"by-hand-{machine}"
+    words = ["calibrate", "so101", "--port", fresh.port, "--id", name, *(["--json"] if machine else [])]
+    for servo in fresh.servos.values():
+        servo.put("torque_enable", 1)
+    with on_a_terminal([sys.executable, "-m", "strands_robots.cli", *words], os.environ) as terminal:
+        eventually(lambda: not any(servo.torque for servo in fresh.servos.values()), within=30, what="the torque off")
+        eventually(lambda: machine or "the middle of its motion" in terminal.drawn, what="the first question")
+        for number, servo in fresh.servos.items():
+            servo.shaft = 2000.0 + 10 * number
+        terminal.press("\r")
+        # LeRobot sets each to 0 first.
+        taken = 2 * len(MOTORS)
+        eventually(lambda: len(fresh.written_after(0.0, "homing_offset")) == taken, within=10, what="the middle, taken")
+        for move in (-900, 800):
+            looked()
+            for servo in fresh.servos.values():
+                servo.shaft += move
+            looked()
+            for servo in fresh.servos.values():
+                servo.shaft -= move
+        terminal.press("\r")
+        assert terminal.process.wait(20) == 0, terminal.drawn
+        eventually(lambda: f"{name}.json" in terminal.drawn, what="where it is kept")
+    (path,) = Path(os.environ["HF_LEROBOT_HOME"]).rglob(f"{name}.json")
+    kept = json.loads(path.read_text(encoding="utf-8"))
+    assert {motor: (each["range_min"], each["range_max"]) for motor, each in kept.items()} == {
+        **dict.fromkeys(MOTORS, (2047 - 900, 2047 + 800)),
+        "wrist_roll": (0, 4095),
+    }
+    assert fresh.servos[1].get("min_position") == 2047 - 900, "the servos know it too"
+    if machine:
+        line = next(line for line in terminal.drawn.splitlines() if line.startswith("{"))
+        assert json.loads(line) == {"status": "success", "file": str(path)}
+    else:
+        assert "shoulder_pan" in terminal.drawn, "the joints are shown while they are moved"
 
 
 def test_the_calibration_of_the_fixture_is_lerobots_own_shape() -> None:
