@@ -32,6 +32,7 @@ class VelocityWire:
         self._lock = threading.Lock()
         self._urgent = link if isinstance(link, UrgentLink) else None
         self._behind = Behind(self.zero)
+        self._clogged = False
 
     def send(self, fields: Mapping[str, Any], permit: Permit) -> None:
         """One command. Raises :class:`PermitVoidError` when a stop came first, else what the link raises."""
@@ -61,9 +62,12 @@ class VelocityWire:
         if self._urgent is None:
             self.zero()
             return
-        if self._behind.offer() > CLOGGED_S:
-            logger.warning("%s does not take zeros behind its commands; its connection is cut.", self.topic)
+        clogged = self._behind.offer() > CLOGGED_S
+        if clogged:
+            if not self._clogged:
+                logger.warning("%s does not take zeros behind its commands; its connection is cut.", self.topic)
             self._urgent.cut()
+        self._clogged = clogged
         try:
             self._urgent.publish_urgent(self.topic, self.kind, self._zero)
         except RosError:
