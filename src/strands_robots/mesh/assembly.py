@@ -227,7 +227,9 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     children: Children | None = None
     if isinstance(robot, WorldRobot):
         admit = safety.on_resume_command
-        children = Children(context, robot, lanes, mesh.peer_type, safety.locked, admit, recorder)
+        children = Children(
+            context, robot, lanes, kind=mesh.peer_type, locked=safety.locked, resume=admit, audit=recorder
+        )
     return Assembled(
         mesh=mesh,
         context=context,

@@ -108,7 +108,7 @@ class Lanes:
     """The lanes of one peer: commands (4 workers, 32 waiting), stops, relayed resumes, and delivery to its user."""
 
     def __init__(self, peer_id: str) -> None:
-        self.stop_lane = Lane(f"{peer_id}-stop", 1, 2)
+        self.stop_lane = Lane(f"{peer_id}-stop", 1, 128)
         self.resumes = Lane(f"{peer_id}-resume", 1, 64)
         self.commands = Lane(f"{peer_id}-command", 4, 32)
         self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)

@@ -30,7 +30,7 @@ class Stops:
     """Stops that wait, by the robot that they name.
 
     Args:
-        lane: whose worker halts. One job of it at a time is ours.
+        lane: whose worker halts. One job of it at a time is ours, one halt each, so that others come between.
     """
 
     def __init__(self, lane: Lane, halt: Halt) -> None:
@@ -64,19 +64,20 @@ class Stops:
         return self._held.total()
 
     def _run(self) -> None:
-        while True:
-            with self._lock:
-                if not self._waiting:
-                    self._halting = False
-                    return
-                robot = next(iter(self._waiting))
-                askers = list(self._waiting.pop(robot))
-                self._held.subtract(sender for sender, _ in askers)
-                self._held = +self._held
-            try:
-                self._halt(robot, askers)
-            except Exception:
-                logger.exception("A stop failed.")  # and the next one is carried out
+        with self._lock:
+            robot = next(iter(self._waiting))
+            askers = list(self._waiting.pop(robot))
+            self._held.subtract(sender for sender, _ in askers)
+            self._held = +self._held
+        try:
+            self._halt(robot, askers)
+        except Exception:
+            logger.exception("A stop failed.")  # and the next one is carried out
+        with self._lock:
+            self._halting = bool(self._waiting)
+            more = self._halting
+        if more:
+            self._lane.submit(self._run)
 
     def _shed(self, sender: str) -> None:
         for robot, askers in self._waiting.items():

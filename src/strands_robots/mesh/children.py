@@ -1,0 +1,217 @@
+"""The robots of a world of several, each as a peer of its own beside the world: ``<parent>__<robot>``.
+
+A child is announced from its parent's session, answers commands for its one robot, and stops with it when the fleet is
+told to stop. Locking and resuming are its parent's. What concerns the whole world, its parent is asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from strands_robots.contract import Observer, Unsubscribe, WorldRobot
+from strands_robots.envelope import Envelope, error
+from strands_robots.mesh import topics
+from strands_robots.mesh.context import Context
+from strands_robots.mesh.dispatch import Dispatcher
+from strands_robots.mesh.executor import Lanes
+from strands_robots.mesh.presence import Herald
+from strands_robots.mesh.recorder import Recorder
+from strands_robots.mesh.serving import Line, MotionDoor, Server
+from strands_robots.mesh.transport.base import LiveTransport, Subscription, TransportError
+from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
+from strands_robots.utils import ValidationError, identifier
+
+logger = logging.getLogger(__name__)
+
+MOST = 64
+
+Resume = Callable[[object], dict[str, Any]]
+
+
+class OneRobot:
+    """One robot of a world, seen as a world that holds nothing else."""
+
+    def __init__(self, world: WorldRobot, name: str) -> None:
+        self._world = world
+        self.tool_name_str = name
+        self.gate = world.gate
+
+    def list_robots(self) -> list[str]:
+        return [name for name in self._world.list_robots() if name == self.tool_name_str]
+
+    def start_policy(
+        self, robot_name: str, instruction: str, policy_provider: str = "mock", duration: float = 30.0, **policy: Any
+    ) -> Envelope:
+        return self._world.start_policy(
+            robot_name, instruction, policy_provider=policy_provider, duration=duration, **policy
+        )
+
+    def stop_policy(self, robot_name: str) -> Envelope:
+        return self._world.stop_policy(robot_name)
+
+    def list_policies_running(self) -> list[dict[str, Any]]:
+        return [row for row in self._world.list_policies_running() if row.get("robot") == self.tool_name_str]
+
+    def get_state(self) -> Envelope:
+        return self._own(self._world.get_state())
+
+    def get_features(self) -> Envelope:
+        return self._own(self._world.get_features())
+
+    def step(self, n: int = 1) -> Envelope:
+        return error(f"step: {self.tool_name_str} is one robot of a world; ask the world.")
+
+    def reset(self) -> Envelope:
+        return error(f"reset: {self.tool_name_str} is one robot of a world; ask the world.")
+
+    def subscribe(self, observer: Observer) -> Unsubscribe:
+        return self._world.subscribe(observer)
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop this robot alone."""
+        name = self.tool_name_str
+        if not self.list_robots():
+            return StopVerdict()
+        ran = bool(self.list_policies_running())
+        answer: object
+        try:
+            answer = self._world.stop_policy(name)
+        except Exception as exc:  # noqa: BLE001 - whatever a stop raises is graded
+            answer = exc
+        outcome = grade(answer)
+        if outcome is Outcome.STOPPED:
+            return StopVerdict(halted=(name,) if ran else ())
+        if outcome.stopped is None:
+            return StopVerdict(unknown={name: explain(answer)})
+        return StopVerdict(not_stopped={name: explain(answer)})
+
+    def facts(self) -> dict[str, Any]:
+        """What presence says of it."""
+        running = self.list_policies_running()
+        told: dict[str, Any] = {
+            "tool_name": self.tool_name_str,
+            "task_status": "running" if running else "idle",
+            "world": True,
+            "sim_robots": [self.tool_name_str],
+        }
+        return told | ({"instruction": str(running[0].get("instruction", ""))} if running else {})
+
+    def _own(self, told: Envelope) -> Envelope:
+        robots = told.get("robots")
+        if not isinstance(robots, Mapping):
+            return told
+        return {**told, "robots": {name: robots[name] for name in robots if name == self.tool_name_str}}
+
+
+@dataclass(slots=True)
+class _Child:
+    context: Context
+    herald: Herald
+    held: list[Subscription]
+
+
+class Children:
+    """The children of one peer, as its world has them now; none while it holds fewer than two robots.
+
+    Args:
+        context: the parent's.
+        locked: whether the parent's lockout holds.
+        resume: admits an assertion at the parent.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        world: WorldRobot,
+        lanes: Lanes,
+        *,
+        kind: str,
+        locked: Callable[[], bool],
+        resume: Resume,
+        audit: Callable[[str], Recorder],
+    ) -> None:
+        self._context = context
+        self._world = world
+        self._lanes = lanes
+        self._kind = kind
+        self._locked = locked
+        self._resume = resume
+        self._audit = audit
+        self._children: dict[str, _Child] = {}
+        self._told: set[str] = set()
+        self._open = True
+
+    def refresh(self) -> None:
+        """Announce the robots that came and take away those that went."""
+        transport = self._context.transport
+        if transport is None or transport.session_id is None:
+            return  # a broker's policy pins a peer to its own topics
+        names = self._world.list_robots()
+        wanted = {each: name for name in names[:MOST] if (each := self._id(name))} if len(names) > 1 else {}
+        for peer in [peer for peer in self._children if peer not in wanted]:
+            self._end(self._children.pop(peer))
+        for peer, name in wanted.items():
+            if peer not in self._children and self._open:
+                self._children[peer] = self._begin(peer, name)
+        for child in list(self._children.values()):
+            child.herald.refresh()
+
+    def announce(self) -> None:
+        for child in list(self._children.values()):
+            child.herald.announce()
+
+    def close(self) -> None:
+        self._open = False
+        children, self._children = self._children, {}
+        for child in children.values():
+            self._end(child)
+
+    def _id(self, robot: str) -> str | None:
+        peer = f"{self._context.peer_id}__{robot}"
+        try:
+            return identifier("peer_id", peer)
+        except ValidationError as exc:
+            if robot not in self._told:
+                self._told.add(robot)
+                logger.warning("A robot of this world is not announced by itself: %s", exc)
+            return None
+
+    def _begin(self, peer: str, name: str) -> _Child:
+        parent, robot = self._context, OneRobot(self._world, name)
+        transport = parent.transport
+        if transport is None:
+            raise TransportError("the mesh is not running.")
+        context = replace(parent, peer_id=peer, audit=self._audit(peer))
+        dispatcher = Dispatcher(robot, robot.halt, closing=lambda: not parent.running())
+
+        def dispatch(command: dict[str, Any]) -> Any:
+            action = command["action"]
+            if action == "resume":
+                return self._resume(command["assertion"])
+            if action == "ping":
+                return {}
+            if action.startswith("teleop_"):
+                return error(f"{action}: {name} is one robot of a world; ask {parent.peer_id}.")
+            return dispatcher(command)
+
+        door = MotionDoor(context, hardware=False)
+        server = Server(context, self._lanes, door, self._locked, dispatch, line=Line(robot.gate))
+        held: list[Subscription] = []
+        child = _Child(context, Herald(context, self._kind, robot.facts), held)
+        held.append(transport.declare_subscriber(topics.command(peer), server.on_command))
+        held.append(transport.declare_subscriber(topics.broadcast(), server.on_command))
+        session = transport.session_id
+        if isinstance(transport, LiveTransport) and session is not None:
+            held.append(transport.declare_token(topics.token(peer, session)))
+        return child
+
+    @staticmethod
+    def _end(child: _Child) -> None:
+        for each in child.held:
+            with contextlib.suppress(TransportError):  # the session may be gone already, and the subscriber with it
+                each.undeclare()
+        child.context.audit.close()

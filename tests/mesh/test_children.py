@@ -1,0 +1,81 @@
+"""Each robot of a world of several as a peer of its own."""
+
+from __future__ import annotations
+
+import pytest
+from fixtures.mesh_robots import World
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet
+
+from strands_robots.mesh.core import Mesh
+
+START = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
+
+
+def joined(peers: Fleet) -> tuple[World, Mesh, Mesh]:
+    world = World("left", "right")
+    mesh = peers.join(world, "sim-1", "sim")
+    console = peers.join(None, "console")
+    eventually(lambda: {"sim-1", "sim-1__left", "sim-1__right"} <= set(console.peers_by_id), within=3)
+    return world, mesh, console
+
+
+def test_each_robot_of_a_world_is_announced_and_answers_for_itself(peers: Fleet) -> None:
+    world, _, console = joined(peers)
+    row = console.peers_by_id["sim-1__left"]
+    assert (row["type"], row["tool_name"], row["sim_robots"]) == ("sim", "left", ["left"])
+    assert console.peer_wire_zid("sim-1__left") == console.peer_wire_zid("sim-1")
+    assert console.ping("sim-1__right")["status"] == "ok"
+    assert console.send("sim-1__left", START, timeout=5)["result"]["status"] == "success"
+    assert world.running == {"left": "wave"}
+    status = console.send("sim-1__right", {"action": "status"}, timeout=5)["result"]
+    assert (status["task_status"], status["robots"]) == ("idle", ["right"])
+    assert list(console.send("sim-1__left", {"action": "state"}, timeout=5)["result"]["robots"]) == ["left"]
+
+
+def test_the_stop_of_a_child_stops_its_robot_alone(peers: Fleet) -> None:
+    world, _, console = joined(peers)
+    for name in ("left", "right"):
+        console.send(f"sim-1__{name}", START, timeout=5)
+    stopped = console.send("sim-1__left", {"action": "stop"}, timeout=5)["result"]
+    assert (stopped["ok"], stopped["stopped"]) == (True, ["left"])
+    assert world.running == {"right": "wave"}
+
+
+@pytest.mark.parametrize("action", ["step", "reset", "teleop_status"])
+def test_what_concerns_the_world_is_refused_by_its_robots(peers: Fleet, action: str) -> None:
+    world, _, console = joined(peers)
+    assert console.send("sim-1__left", {"action": action}, timeout=5)["result"]["status"] == "error"
+    assert world.steps == 0
+
+
+def test_an_emergency_stop_finds_no_child_silent_and_locks_them(peers: Fleet) -> None:
+    world, mesh, console = joined(peers)
+    console.send("sim-1__left", START, timeout=5)
+    answers = console.emergency_stop()
+    assert {answer["responder_id"] for answer in answers} == {"sim-1", "sim-1__left", "sim-1__right"}
+    recorded = peers.events("emergency_stop")[0]
+    assert (recorded["not_stopped"], recorded["silent"]) == ([], [])
+    assert world.running == {}
+    eventually(lambda: mesh.lockout_epoch is not None, within=2)
+    assert console.send("sim-1__left", START, timeout=5)["error"] == "command rejected"
+
+
+def test_robots_come_and_go_with_their_world(peers: Fleet) -> None:
+    world, mesh, console = joined(peers)
+    world.names.remove("right")
+    children = mesh._assembled.children
+    assert children is not None
+    eventually(lambda: not children._children, within=3)
+    eventually(lambda: not console.peers_by_id["sim-1__left"]["reachable"], within=3)
+    world.names.append("middle")
+    eventually(lambda: "sim-1__middle" in console.peers_by_id, within=3)
+    mesh.stop()
+    assert console.send("sim-1__middle", {"action": "ping"}, timeout=0.1)["status"] == "timeout"
+
+
+def test_a_world_of_one_robot_is_one_peer(peers: Fleet) -> None:
+    mesh, console = peers.join(World("left"), "sim-1", "sim"), peers.join(None, "console")
+    assert mesh._assembled.children is not None
+    mesh._assembled.children.refresh()
+    assert set(console.peers_by_id) == {"sim-1"}
