@@ -82,7 +82,7 @@ def test_a_suspended_robot_is_told_as_silent_and_stops_when_it_goes_on(join: Joi
     arm.ask("start", "wave")
     arm.signal(signal.SIGSTOP)
     answers = console.ask("estop")[1]
-    assert [answer["responder_id"] for answer in answers] == ["console"]
+    assert answers == []
     arm.signal(signal.SIGCONT)
     eventually(lambda: arm.ask("epoch") == console.ask("epoch"), within=6)
     eventually(lambda: arm.ask("moving") is False, within=2, what="it stands still")
@@ -99,7 +99,7 @@ def test_a_suspended_hub_holds_the_mesh_up_and_a_stop_arrives_when_it_goes_on(jo
     # Beyond the link's lease of 4 s, so that nothing waits in the hub's buffers.
     time.sleep(max(0.0, 5.0 - (time.monotonic() - stopped)))
     answers = console.ask("estop")[1]
-    assert [answer["responder_id"] for answer in answers] == ["console"]
+    assert answers == []
     assert arm.ask("epoch") is None
     hub.signal(signal.SIGCONT)
     eventually(lambda: arm.ask("epoch") == console.ask("epoch"), within=20)
