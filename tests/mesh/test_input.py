@@ -14,6 +14,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
+from strands_robots.envelope import success
 from strands_robots.mesh import input as input_module
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputPublisher, InputReceiver
@@ -202,6 +203,25 @@ def test_a_joint_commanded_too_fast_is_refused(stream: Stream) -> None:
     eventually(lambda: stream.stat("slew_rejected")() == 1, within=2)
     stream.send(action={"shoulder.pos": 5.0})
     eventually(lambda: stream.stat("frames_received")() == 2, within=2)
+
+
+def test_the_first_frame_is_bounded_from_where_the_follower_stands(stream: Stream) -> None:
+    where = success("state", joints={"shoulder.pos": 10.0}, task={})
+    stream.arm.get_state = lambda: where  # type: ignore[method-assign]
+    stream.send(action={"shoulder.pos": 700.0})
+    eventually(lambda: stream.stat("slew_rejected")() == 1, within=2)
+    stream.send(action={"shoulder.pos": 11.0})
+    eventually(lambda: stream.stat("frames_received")() == 1, within=2)
+    assert stream.arm.actions == [{"shoulder.pos": 11.0}]
+
+
+def test_a_follower_that_cannot_tell_its_joints_is_led_all_the_same(stream: Stream) -> None:
+    def unread() -> Any:
+        raise ConnectionError("no status packet")
+
+    stream.arm.get_state = unread  # type: ignore[method-assign]
+    stream.send(action={"shoulder.pos": 90.0})
+    eventually(lambda: stream.arm.actions, within=2)
 
 
 def test_a_stream_ends_with_its_lifetime(stream: Stream, monkeypatch: pytest.MonkeyPatch) -> None:

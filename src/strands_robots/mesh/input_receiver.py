@@ -10,11 +10,13 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
+from strands_robots.bus_access import read_joints
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, validate_mesh_identifier
 from strands_robots.mesh.transport.base import Sample
+from strands_robots.policies.actions import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.utils import ValidationError
 
@@ -65,6 +67,7 @@ class InputReceiver:
         self._opened = self._ended = 0.0
         self._sequence = -1
         self._last: dict[str, tuple[float, float]] = {}
+        self._seeded = False
         self._tokens, self._refilled = BURST, 0.0
         self._counts: Counter[str] = Counter()
         self.start_refusal: str | None = None
@@ -141,7 +144,7 @@ class InputReceiver:
             return str(refused)
         if self._mesh.lockout_epoch is not None:
             return f"locked by the emergency stop {self._mesh.lockout_epoch}"
-        self._session, self._sequence, self._last = session, -1, {}
+        self._session, self._sequence, self._last, self._seeded = session, -1, {}, False
         self._tokens, self._refilled = BURST, time.monotonic()
         self._counts = Counter()
         self._lane = Lane(f"mesh-follow-{self._device}", 1, DEPTH, drop_oldest=True)
@@ -236,6 +239,10 @@ class InputReceiver:
         floor = 1.0 / cap if cap > 0 else 1.0 / 100.0
         if fastest <= 0:
             return False
+        if not self._seeded:
+            # A leader that stands apart is let in when the slew bound would have brought the follower to it.
+            self._seeded = True
+            self._last = {joint: (value, now) for joint, value in present_joints(self._robot).items()}
         for joint, value in action.items():
             known = self._last.get(joint)
             if known is not None and abs(value - known[0]) > fastest * max(now - known[1], floor):
@@ -272,3 +279,15 @@ def joint_limits(robot: Any) -> dict[str, float]:
         return {}
     known = {str(joint): UNITS_FULL_SCALE.get(str(unit)) for joint, unit in units.items()}
     return {joint: min(2 * scale, INPUT_VALUE_ABS) for joint, scale in known.items() if scale is not None}
+
+
+def present_joints(robot: Any) -> dict[str, float]:
+    """Where the joints of a follower are, by name; empty where it does not tell them now."""
+    reader = getattr(robot, "get_state", None)
+    try:
+        state = reader() if callable(reader) else {"joints": read_joints(robot)}
+    except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the first frame is then bounded by its range
+        logger.warning("A follower's joints could not be read: %s: %s", type(exc).__name__, exc)
+        return {}
+    joints = state.get("joints") if isinstance(state, Mapping) and "joints_error" not in state else None
+    return numbers(joints) if isinstance(joints, Mapping) else {}
