@@ -8,6 +8,7 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.mesh.core import Mesh
+from strands_robots.mesh.transport.memory import MemoryTransport
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
 
@@ -72,6 +73,17 @@ def test_robots_come_and_go_with_their_world(peers: Fleet) -> None:
     eventually(lambda: "sim-1__middle" in console.peers_by_id, within=3)
     mesh.stop()
     assert console.send("sim-1__middle", {"action": "ping"}, timeout=0.1)["status"] == "timeout"
+
+
+def test_a_broker_that_pins_a_peer_to_its_topics_is_shown_no_children(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MemoryTransport, "pins_topics", True, raising=False)
+    mesh, console = peers.join(World("left", "right"), "sim-1", "sim"), peers.join(None, "console")
+    assert mesh._assembled.children is not None
+    mesh._assembled.children.refresh()
+    mesh._assembled.children.announce()
+    assert set(console.peers_by_id) == {"sim-1"}
 
 
 def test_a_world_of_one_robot_is_one_peer(peers: Fleet) -> None:

@@ -148,8 +148,8 @@ class Children:
     def refresh(self) -> None:
         """Announce the robots that came and take away those that went."""
         transport = self._context.transport
-        if transport is None or transport.session_id is None:
-            return  # a broker's policy pins a peer to its own topics
+        if transport is None or transport.session_id is None or getattr(transport, "pins_topics", False):
+            return
         names = self._world.list_robots()
         wanted = {each: name for name in names[:MOST] if (each := self._id(name))} if len(names) > 1 else {}
         for peer in [peer for peer in self._children if peer not in wanted]:

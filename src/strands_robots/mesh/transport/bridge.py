@@ -137,6 +137,9 @@ class BridgeTransport:
         cloud: the leg that carries the bridged topics; MQTT by default.
     """
 
+    pins_topics = True
+    """The broker's policy keeps a peer to topics of its own name."""
+
     def __init__(self, local: Transport | None = None, cloud: Transport | None = None) -> None:
         self._local = local or _zenoh()
         self._cloud = cloud or _iot()
