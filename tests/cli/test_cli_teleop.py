@@ -36,3 +36,12 @@ def test_without_a_terminal_the_keyboard_is_refused(run: Run) -> None:
 def test_a_real_follower_without_lerobot_names_the_extra(run: Run) -> None:
     result = run("teleop", "keyboard", "no-such-arm@/dev/ttyACM0", "--json")
     assert result.exit_code in (1, 2)
+
+
+def test_a_recording_is_replayed_to_no_device_of_device_connect(run: Run, tmp_path: Path) -> None:
+    write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
+    result = run("replay", str(tmp_path / "run.csv"), "--to", "arm-1", "--json")
+    assert result.exit_code == 2
+    reason = json.loads(result.stdout)["reason"]
+    assert "'arm-1' is not known" in reason
+    assert "mesh:PEER" in reason

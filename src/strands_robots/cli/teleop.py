@@ -179,7 +179,13 @@ def _made(follower: str, options: dict[str, Any], **more: Any) -> Any:
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
-    return Robot(kind, mode="real" if at else "sim", **more, **({**options, "port": port} if at else {}))
+    try:
+        return Robot(kind, mode="real" if at else "sim", **more, **({**options, "port": port} if at else {}))
+    except ValidationError as exc:
+        if at or "/" in kind or "." in kind:
+            raise
+        far = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
+        raise ValidationError(f"{exc} {far}") from exc
 
 
 def _stopped(screen: Screen, robot: Any) -> StopVerdict:
