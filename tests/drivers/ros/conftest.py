@@ -1,0 +1,27 @@
+"""Bases over links in memory, disconnected when a test has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.ros_bases import OPEN, TOPIC, Made
+
+from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.drivers.ros.posed_base import PosedBaseRobot
+from strands_robots.ros.link import MemoryLink
+
+
+@pytest.fixture
+def made() -> Iterator[Made]:
+    robots: list[MobileBaseRobot] = []
+
+    def make(link: MemoryLink | None = None, **options: Any) -> MobileBaseRobot:
+        options = {"publish_rate": 1000.0, "command_gate": OPEN, **options}
+        robots.append(PosedBaseRobot("rover", link or MemoryLink(), TOPIC, **options))
+        return robots[-1]
+
+    yield make
+    for robot in robots:
+        robot.disconnect()

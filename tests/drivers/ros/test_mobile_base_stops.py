@@ -1,0 +1,291 @@
+"""Stops of a base: zeros until it is still, and an honest word of what is known."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+from fixtures.ros_bases import TOPIC, FaultyLink, Lock, Made, memory, none_left, velocities
+from fixtures.waiting import eventually
+
+from strands_robots.ros.link import Heard, MemoryLink, Unwatch
+from strands_robots.safety.stopping import Outcome, grade
+
+
+def test_a_stop_ends_a_running_drive_and_nothing_but_zeros_follows(made: Made) -> None:
+    robot = made(publish_rate=100.0)
+    events: list[tuple[str, str]] = []
+    robot.subscribe(lambda event: events.append((event.kind, event.state)))
+    assert robot.start_drive(0.5, 0.1, 30.0)["status"] == "success"
+    eventually(lambda: velocities(memory(robot)))
+    assert robot.get_task_status()["task_status"] == "running"
+    assert "being driven" in robot.drive(0.1)["reason"]
+    answer = robot.stop()
+    after = len(memory(robot).sent)
+    assert (answer["stopped"], answer["halted"]) == (True, ["drive"])
+    eventually(lambda: len(memory(robot).sent) > after + 3, what="the hold's zeros")
+    assert set(velocities(memory(robot))[after:]) == {(0.0, 0.0)}
+    eventually(lambda: events == [("started", "running"), ("finished", "stopped")])
+    assert robot.get_task_status()["task_status"] == "stopped"
+
+
+def test_a_new_drive_ends_the_zeros_of_the_stop_before_it(made: Made) -> None:
+    robot = made(publish_rate=200.0)
+    robot.stop()
+    assert robot.drive(0.3, duration=0.05)["status"] == "success"
+    sent = velocities(memory(robot))
+    first = sent.index((0.3, 0.0))
+    assert sent[first : first + 10] == [(0.3, 0.0)] * 10
+    assert sent[first + 10 :] == [(0.0, 0.0)]
+
+
+def test_a_locked_base_refuses_to_drive_and_still_sends_zeros(made: Made) -> None:
+    robot = made(publish_rate=100.0)
+    robot.gate.attach(Lock())
+    assert robot.drive(0.1)["reason"] == "drive is locked"
+    assert memory(robot).sent == []
+    assert robot.halt("lockout").stopped is True
+    eventually(lambda: len(memory(robot).sent) > 3)
+    assert set(velocities(memory(robot))) == {(0.0, 0.0)}
+
+
+def test_a_blind_base_is_told_zeros_for_its_time_and_no_longer(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.2)
+    robot = made(publish_rate=50.0)
+    robot.halt()
+    eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()), within=2)
+    assert 8 <= len(memory(robot).sent) <= 12
+
+
+def test_a_link_that_returns_after_the_blind_hold_still_gets_zeros_for_its_whole_time(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.2)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    link = FaultyLink(tuple(range(1, 10_000)))
+    robot = made(link, publish_rate=50.0)
+    assert robot.halt().stopped is False
+    eventually(lambda: link.tries > 25, what="tries beyond the time of a blind hold")
+    link.faults = ()
+    eventually(lambda: not robot.holding, within=2)
+    assert 6 <= len(link.sent) <= 12, "as many as a link that was never down gets"
+
+
+def test_a_link_that_drops_out_within_the_hold_gets_zeros_for_its_whole_time_again(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.2)
+    link = FaultyLink(tuple(range(4, 30)))
+    robot = made(link, publish_rate=50.0)
+    assert robot.halt().stopped
+    eventually(lambda: not robot.holding, within=3)
+    assert 9 <= len(link.sent) <= 15, "three before the drop-out and the whole time after it"
+
+
+def test_a_hold_on_a_link_that_never_returns_ends_with_the_base(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.05)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    robot = made(FaultyLink(tuple(range(1, 10_000))), publish_rate=50.0)
+    robot.halt()
+    time.sleep(0.2)
+    assert robot.holding
+    robot.disconnect()
+    assert not robot.holding
+
+
+def test_a_moving_base_whose_odometry_falls_silent_is_held_for_the_blind_time_from_its_last_word(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.3)
+    monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 0.05)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom", publish_rate=100.0)
+    wheels = Wheels(link, 1.0, 0.0)
+    try:
+        robot.halt()
+        time.sleep(0.5)
+    finally:
+        wheels.close()
+    silent_from = len(velocities(link))
+    eventually(lambda: not robot.holding, within=2)
+    assert len(velocities(link)) - silent_from >= 15
+
+
+def test_a_graph_that_is_asked_for_a_type_for_seconds_does_not_delay_the_zeros(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+
+    class Slow(MemoryLink):
+        free = threading.Event()
+        watchers = 0
+
+        def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+            self.free.wait(10)
+            unwatch = super().watch(topic, kind, heard)
+            self.watchers += 1
+
+            def done() -> None:
+                unwatch()
+                self.watchers -= 1
+
+            return done
+
+    link = Slow()
+    robot = made(link, odom_topic="/odom", publish_rate=100.0)
+    assert robot.halt().stopped is None
+    try:
+        eventually(lambda: len(link.sent) > 10, within=2, what="zeros while the watch still blocks")
+    finally:
+        link.free.set()
+    robot.disconnect()
+    assert link.watchers == 0, "a watch that came late does not outlive the base"
+
+
+def test_a_halt_on_a_link_that_blocks_answers_in_time_that_it_did_not_stop(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    link = FaultyLink()
+    robot = made(link)
+    link.free.clear()
+    began = time.monotonic()
+    verdict = robot.halt()
+    took = time.monotonic() - began
+    link.free.set()
+    assert verdict.stopped is False
+    assert "in time" in verdict.not_stopped["velocity"]
+    assert took < 0.5
+
+
+def test_a_halt_that_the_link_refuses_names_why_and_tries_again(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.3")
+    robot = made(FaultyLink(tuple(range(1, 10_000))))
+    verdict = robot.halt()
+    assert verdict.stopped is False
+    assert "was lost" in verdict.not_stopped["velocity"]
+    retried = made(FaultyLink((1, 2)))
+    assert retried.halt().stopped is True
+
+
+class Wheels:
+    """Tells odometry at 100 Hz: slows down by ``brake`` m/s a sample once it gets a zero."""
+
+    def __init__(self, link: MemoryLink, speed: float, brake: float) -> None:
+        self.speed, self._brake, self._link = speed, brake, link
+        self._zeroed = threading.Event()
+        self._done = threading.Event()
+        link.watch(TOPIC, None, lambda m: None if m["linear"]["x"] else self._zeroed.set())
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._done.wait(0.01):
+            if self._zeroed.is_set():
+                self.speed = max(0.0, self.speed - self._brake)
+            still = {"x": 0.0, "y": 0.0, "z": 0.0}
+            twist = {"linear": {**still, "x": self.speed}, "angular": still}
+            self._link.publish("/odom", "nav_msgs/msg/Odometry", {"twist": {"twist": twist}})
+
+
+def test_with_odometry_a_stop_waits_until_the_base_is_still(made: Made) -> None:
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom", publish_rate=50.0)
+    wheels = Wheels(link, 1.0, 0.05)
+    try:
+        verdict = robot.halt()
+        assert verdict.stopped is True
+        assert wheels.speed <= 0.01
+        assert verdict.elapsed_ms > 150
+        eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()), within=2)
+        sent = len(velocities(link))
+        time.sleep(0.1)
+        assert len(velocities(link)) == sent, "a base that is still gets no more zeros"
+    finally:
+        wheels.close()
+
+
+def test_a_base_that_rolls_on_did_not_stop_and_one_that_says_nothing_is_unknown(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.3")
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom", publish_rate=50.0)
+    wheels = Wheels(link, 1.0, 0.0)
+    try:
+        verdict = robot.halt()
+        assert verdict.stopped is False
+        assert "1.00 m/s" in verdict.not_stopped["velocity"]
+    finally:
+        wheels.close()
+    assert made(odom_topic="/odom").halt().stopped is None
+
+
+def test_a_stop_of_a_base_that_never_told_a_speed_says_what_was_done_and_what_nobody_knows(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    link = MemoryLink()
+    robot = made(link, odom_topic="/odom")
+    answer = robot.stop()
+    assert (answer["status"], answer["stopped"]) == ("success", None)
+    assert "never told a speed" in answer["content"][0]["text"]
+    assert grade(answer) is Outcome.UNKNOWN
+    assert grade(robot.halt()) is Outcome.UNKNOWN
+    monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 0.01)
+    still = {"linear": {"x": 0.0}, "angular": {"z": 0.0}}
+    link.publish("/odom", "nav_msgs/msg/Odometry", {"twist": {"twist": still}})
+    fallen_silent = robot.stop()
+    assert (fallen_silent["status"], fallen_silent["stopped"]) == ("error", None)
+
+
+def test_a_stop_whose_zero_is_not_taken_is_an_error_also_of_a_base_that_never_told_a_speed(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    answer = made(FaultyLink(tuple(range(1, 10_000))), odom_topic="/odom").stop()
+    assert (answer["status"], answer["stopped"]) == ("error", False)
+
+
+def test_a_drive_that_gets_no_thread_leaves_the_base_held_that_was_held(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = made(publish_rate=100.0)
+    robot.stop()
+    start = threading.Thread.start
+
+    def no_drive(thread: threading.Thread) -> None:
+        if thread.name.startswith("drive-"):
+            none_left(thread)
+        start(thread)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", no_drive)
+        assert "could not begin" in robot.start_drive(0.1, 0.0, 0.01)["reason"]
+    assert robot.holding
+    before = len(memory(robot).sent)
+    eventually(lambda: len(memory(robot).sent) > before + 3, what="zeros of the hold that goes on")
+    assert set(velocities(memory(robot))) == {(0.0, 0.0)}
+
+
+def test_a_halt_that_gets_no_thread_sends_its_one_zero_all_the_same(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = made()
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", none_left)
+        assert robot.halt().stopped
+    assert velocities(memory(robot)) == [(0.0, 0.0)]
+
+
+def test_zeros_come_once_a_second_at_least_however_slow_the_rate(made: Made) -> None:
+    link = MemoryLink()
+    robot = made(link, publish_rate=1e-300)
+    assert robot.halt().stopped
+    eventually(lambda: len(link.sent) >= 2, within=4)
