@@ -185,7 +185,5 @@ class LeaderPolicy:
             self.event_errors += 1
             self.last_error = f"get_teleop_events: {type(exc).__name__}: {exc}"
             if self.event_errors == 1:
-                logger.warning(
-                    "The events of %s cannot be read; frames go on without.", self._device, exc_info=True
-                )
+                logger.warning("The events of %s cannot be read; frames go on without.", self._device, exc_info=True)
             return None

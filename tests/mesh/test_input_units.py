@@ -61,7 +61,7 @@ def test_a_value_beyond_its_joints_scale_moves_nothing(arm: HardwareRobot, peers
     try:
         leader.put("strands/lead/input/leader", {**frame, "t": peers.clock(), "seq": 1, "action": {"pan.pos": 250.0}})
         eventually(lambda: receiver.stats["rejected_invalid"] == 1, within=3)
-        leader.put("strands/lead/input/leader", {**frame, "t": peers.clock(), "seq": 2, "action": {"pan.pos": 90.0}})
+        leader.put("strands/lead/input/leader", {**frame, "t": peers.clock(), "seq": 2, "action": {"pan.pos": 15.0}})
         eventually(lambda: receiver.stats["frames_received"] == 1, within=3)
     finally:
         receiver.stop()
