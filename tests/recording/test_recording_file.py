@@ -6,8 +6,18 @@ import random
 from pathlib import Path
 
 import pytest
+from fixtures.waiting import eventually
 
-from strands_robots.recording import CHUNK_BYTES, Joints, Picture, Recorder, read_entries, read_items, recorded_actions
+from strands_robots.recording import (
+    CHUNK_BYTES,
+    Joints,
+    Picture,
+    Recorder,
+    file,
+    read_entries,
+    read_items,
+    recorded_actions,
+)
 from strands_robots.utils import ValidationError
 
 pytest.importorskip("mcap")
@@ -122,3 +132,26 @@ def test_a_recording_is_never_overwritten_and_other_files_are_refused(tmp_path: 
         pass
     with pytest.raises(ValidationError, match="cannot be read"):
         list(read_entries(tmp_path / "none.mcap"))
+
+
+def there(path: Path, event: str) -> bool:
+    return any(entry.event == event for entry in read_entries(path))
+
+
+def test_what_happened_is_in_the_file_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(file, "CHUNK_S", 60.0)
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        recorder.take("arm-1", "taskStarted", {})
+        eventually(lambda: there(path, "taskStarted"), what="the event, long before its chunk is full or old")
+
+
+def test_what_comes_at_a_steady_rate_is_in_the_file_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(file, "CHUNK_S", 0.2)
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        recorder.take("arm-1", "stateUpdate", {"task_status": "running"})
+        eventually(lambda: there(path, "stateUpdate"), what="the state, though nothing comes after it")
+        recorder.take_joints("arm-1", {"pan.pos": 1.0})
+    assert [entry.event for entry in read_entries(path)] == ["stateUpdate"]
+    assert [item.joints for item in read_items(path) if isinstance(item, Joints)] == [{"pan.pos": 1.0}]

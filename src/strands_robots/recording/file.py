@@ -15,11 +15,15 @@ from typing import Any, Self
 
 from strands_robots.policies.actions import numbers
 from strands_robots.recording import schemas
+from strands_robots.recording._compat import close_chunk
 from strands_robots.recording.schemas import Schema
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 CHUNK_BYTES = 16_384
 """At most so much is lost of a file that was cut off."""
+
+CHUNK_S = 1.0
+"""And at most what came in so many seconds; an event at no steady rate is in the file at once."""
 
 WAITING_MAX = 50_000
 """What may wait to be written; what comes on top is counted as lost."""
@@ -137,7 +141,7 @@ class Recorder:
         try:
             with self._file as file:
                 channels = _Channels(file, self.counts)
-                while (item := self._waiting.get()) is not None:
+                while (item := self._next(channels)) is not None:
                     if isinstance(item, Entry):
                         self._event(channels, item)
                     elif isinstance(item, Joints):
@@ -151,6 +155,13 @@ class Recorder:
         except Exception as exc:  # noqa: BLE001 - told to whoever ends the recording
             self._failure = exc
 
+    def _next(self, channels: _Channels) -> Item | None:
+        while True:
+            try:
+                return self._waiting.get(timeout=channels.due_s)
+            except queue.Empty:
+                channels.close_chunk()
+
     def _event(self, channels: _Channels, entry: Entry) -> None:
         at = _ns(entry.at)
         data = json.dumps(entry.payload, default=str)
@@ -159,6 +170,7 @@ class Recorder:
             words = f"{entry.event} {data}" if entry.payload else entry.event
             line = schemas.log_line(at, _level(entry), entry.device, words)
             channels.write(f"/{entry.device}/{LOG}", schemas.LOG, at, line)
+            channels.close_chunk()
         elif self._joints_of_events:
             joints = entry.payload.get("joints") or entry.payload.get("observation")
             if isinstance(joints, Mapping):
@@ -169,6 +181,8 @@ class _Channels:
     """The channels of a file that is being written, each made with its first message."""
 
     def __init__(self, file: Any, counts: Counter[str]) -> None:
+        self._file = file
+        self._open_since: float | None = None
         self._writer = _mcap().Writer(file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="", library="strands-robots")
         self._schemas: dict[str, int] = {}
@@ -186,6 +200,22 @@ class _Channels:
             self._channels[topic] = channel
         self._writer.add_message(channel, log_time=at, data=data, publish_time=at)
         self._counts[topic] += 1
+        if self._open_since is None:
+            self._open_since = time.monotonic()
+        elif self.due_s == 0:
+            self.close_chunk()
+
+    @property
+    def due_s(self) -> float | None:
+        """Seconds until the chunk that is being filled is closed; None where none is."""
+        since = self._open_since
+        return None if since is None else max(0.0, since + CHUNK_S - time.monotonic())
+
+    def close_chunk(self) -> None:
+        """Put what was written so far into the file."""
+        close_chunk(self._writer)
+        self._file.flush()
+        self._open_since = None
 
     def finish(self) -> None:
         """Write the index; the file is whole then."""

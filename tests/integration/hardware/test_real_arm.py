@@ -123,6 +123,7 @@ def test_it_takes_one_action_and_goes_there(arm: Arm) -> None:
 
 def test_a_rollout_keeps_its_rate_while_the_state_is_read(arm: Arm, bus: FeetechBus) -> None:
     robot = arm()
+    robot.get_state()  # a busy machine may give the first read of the rollout no turn in time
     before = time.monotonic()
     assert robot.start_task("wave", duration=3.0)["status"] == "success"
     while robot.get_task_status()["task_status"] == "running":

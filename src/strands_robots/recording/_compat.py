@@ -1,0 +1,10 @@
+"""The one private member of the mcap library that is used, as its 1.x releases have it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def close_chunk(writer: Any) -> None:
+    """Write the chunk that is being filled; the library itself closes one only when it is full, or at the end."""
+    writer._Writer__finalize_chunk()
