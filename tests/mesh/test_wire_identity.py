@@ -109,6 +109,16 @@ def test_a_certificate_of_another_authority_does_not_count(folder: Path, tmp_pat
         verifier(folder, clock).verify(message)
 
 
+def test_a_certificate_whose_name_is_no_text_does_not_count(folder: Path) -> None:
+    clock = Clock()
+    signed = json.loads(json.dumps(signer(folder, "arm-1", clock).sign(BODY)))
+    der = base64.b64decode(signed["sig"]["cert"] + "==")
+    assert b"arm-1" in der
+    signed["sig"]["cert"] = base64.b64encode(der.replace(b"arm-1", b"arm-\xff")).decode()
+    with pytest.raises(IdentityError, match="cannot be read"):
+        verifier(folder, clock).verify(signed)
+
+
 def test_the_issuer_is_asked_before_the_certificates_dates(folder: Path, tmp_path: Path) -> None:
     clock = Clock()
     keys.init(tmp_path)

@@ -263,7 +263,9 @@ def _parse(der: bytes) -> Any:
     x509, _ = _cryptography()
     try:
         certificate = x509.load_der_x509_certificate(der)
+        # The parser reads some parts when they are asked for, and finds them broken only then.
         certificate.public_key()
+        certificate.subject, certificate.issuer, certificate.extensions  # noqa: B018 - asked for, not used
     except Exception as exc:  # noqa: BLE001 - hostile bytes make the parser raise several kinds
         raise IdentityError(f"the certificate cannot be read: {type(exc).__name__}") from None
     return certificate
