@@ -87,7 +87,8 @@ def test_a_partition_is_told_and_the_stop_arrives_when_it_heals(far: Stage, lab:
     assert lab.dropped > 0
     assert facts(robots)["moving"]
     lab.weather.parted = False
-    assert hand.ask("result")["ok"]
+    report = hand.ask("result")
+    assert report["ok"], str(report)
     assert facts(robots)["epochs"] == [epoch]
     eventually(lambda: not facts(robots)["moving"])
     assert eventually(lambda: engaged(robots, epoch))
