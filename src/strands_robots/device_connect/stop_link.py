@@ -84,6 +84,7 @@ class ZenohStopLink:
         self._state = _State(lambda up: None)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
+        self._heard: tuple[Collection[str], Hear] | None = None
         self._put_options: dict[str, Any] = {}
 
     @property
@@ -94,7 +95,20 @@ class ZenohStopLink:
         self._state = _State(on_state)
         self._thread = threading.Thread(target=self._open, args=(events, hear), name="stop-link", daemon=True)
         self._thread.start()
+        self._heard = (events, hear)
         _OPEN.add(self)
+
+    def renew(self) -> None:
+        """Close the session and open another, on a thread; not while the last one is still being opened."""
+        if self._heard is None or (self._thread is not None and self._thread.is_alive()):
+            return
+        self._thread = threading.Thread(target=self._again, args=self._heard, name="stop-link", daemon=True)
+        self._thread.start()
+
+    def _again(self, events: Collection[str], hear: Hear) -> None:
+        self._drop()
+        if not self._closing.is_set():
+            self._open(events, hear)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
         session = self._session
@@ -111,6 +125,11 @@ class ZenohStopLink:
         self._closing.set()
         if self._thread is not None:
             self._thread.join(10.0)
+        self._drop()
+        _OPEN.discard(self)
+
+    def _drop(self) -> None:
+        """Close the session there is."""
         # Whoever comes second waits too: a thread that is inside Zenoh while the interpreter ends aborts the process.
         with self._closing_session:
             session, self._session = self._session, None
@@ -123,8 +142,8 @@ class ZenohStopLink:
                     logger.debug("a declaration of the stop lane was gone already: %s", exc)
             if session is not None:
                 session.close()
+            self._far_sides.clear()
         self._state.set(False)
-        _OPEN.discard(self)
 
     def _open(self, events: Collection[str], hear: Hear) -> None:
         import zenoh  # noqa: PLC0415 - an optional package, loaded with the first link

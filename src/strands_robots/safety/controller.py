@@ -17,7 +17,7 @@ from typing import Any
 
 from strands_robots.safety import ed25519
 from strands_robots.safety.decision import signed_fields
-from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, StopLink, notification
+from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, RenewableLink, StopLink, notification
 from strands_robots.safety.orders import new_epoch
 from strands_robots.utils import ValidationError, device_id, number
 
@@ -27,6 +27,9 @@ REPEAT_S = (0.005, 0.005, 0.01, 0.01, 0.02, 0.05, 0.1, 0.2)
 """Pauses between repetitions; the last one goes on. Quick at first: among forged ones each try may be the one heard."""
 
 UNCONFIRMED_S = 0.1
+RENEW_S = 6.0
+"""After so long without any answer the connection is made anew: it may have come back to nobody."""
+
 DEADLINE_S = 3.0
 REFUSED = "resumed before"
 
@@ -185,7 +188,7 @@ class SafetyController:
 
     def _repeat(self, run: _Running, payload: bytes, deadline_s: float, on_progress: OnProgress) -> None:
         pauses, told = iter(REPEAT_S), -1
-        pause, next_send, again = 0.0, run.started, 0
+        pause, next_send, again, renew_at = 0.0, run.started, 0, run.started + RENEW_S
         while True:
             now = time.monotonic()
             late = now - run.started >= UNCONFIRMED_S
@@ -197,6 +200,10 @@ class SafetyController:
                 on_progress(run.progress(self._link.up, now))
             if finished:
                 return
+            if now >= renew_at and not run.answers:
+                renew_at = now + RENEW_S
+                if isinstance(self._link, RenewableLink):
+                    self._link.renew()
             if now >= next_send:
                 if again or not run.sent:
                     run.sent = self._link.publish(self.controller_id, ESTOP, payload) or run.sent

@@ -6,7 +6,7 @@ import json
 import time
 import uuid
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 ESTOP = "emergencyStop"
 VERDICT = "emergencyStopVerdict"
@@ -34,6 +34,14 @@ class StopLink(Protocol):
 
     def close(self) -> None:
         """Close the connection and end the link's thread. Safe to call twice."""
+
+
+@runtime_checkable
+class RenewableLink(Protocol):
+    """A link that can be made anew while it is used."""
+
+    def renew(self) -> None:
+        """Give the connection up and open another; returns at once. For one that is up and brings no answer."""
 
 
 def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:
