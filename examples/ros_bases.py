@@ -9,9 +9,8 @@ The far ends are this project's stand-ins; with a real robot, only the addresses
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
+from fixtures.base_process import base_process
 from fixtures.rosbridge_server import RosbridgeServer
 
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
@@ -48,12 +47,8 @@ def over_rosbridge() -> None:
 
 def over_dds() -> None:
     """The base on loopback DDS."""
-    line = [sys.executable, "-m", "fixtures.dds_base", str(DOMAIN)]
-    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as base:
-        assert base.stdout is not None
-        base.stdout.readline()
+    with base_process(DOMAIN):
         show(RtpsRobot("base", "/cmd_vel", odom_topic="/odom", domain_id=DOMAIN), 0.3, 0.0)
-        base.communicate(timeout=10)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What every test gets: a state directory of its own, so that none reads or writes the user's, and a working Ctrl-C."""
+"""What every test gets: settings and state that are not the user's, a working Ctrl-C, and an end to its threads."""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -10,11 +11,25 @@ from pathlib import Path
 import pytest
 from fixtures.waiting import eventually
 
+from strands_robots import settings
 from strands_robots.audit import flush_audit
+
+# What is set in the shell that starts the tests would change what they say; how pictures are made stays as it is.
+for setting in settings.declared():
+    if setting.name not in {"DISPLAY", "MUJOCO_GL"}:
+        os.environ.pop(setting.name, None)
 
 # A shell starts background jobs with Ctrl-C ignored, and every process that a test starts would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def state_directory_of_the_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The state directory of what a whole file shares: its robots start before a test's own directory is set."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STRANDS_STATE_DIR", str(tmp_path_factory.mktemp("state")))
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +38,6 @@ def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     directory = tmp_path_factory.mktemp("state")
     directory.chmod(0o700)
     monkeypatch.setenv("STRANDS_STATE_DIR", str(directory))
-    monkeypatch.delenv("STRANDS_MESH_AUDIT_DIR", raising=False)
     yield directory
     flush_audit(0.5)
 

@@ -47,10 +47,10 @@ def test_records_are_shown_by_stop_robot_and_event(run: Run) -> None:
     assert run("audit", "show", "arm-9").exit_code == 1
 
 
-def test_a_record_that_was_changed_fails_its_check(run: Run, tmp_path: Path) -> None:
+def test_a_record_that_was_changed_fails_its_check(run: Run, state_directory: Path) -> None:
     record()
     assert run("audit", "verify").exit_code == 0
-    log = next(path for path in (tmp_path / "state").iterdir() if path.suffix == ".jsonl")
+    log = next(path for path in state_directory.iterdir() if path.suffix == ".jsonl")
     log.write_bytes(log.read_bytes().replace(b'"number":1', b'"number":7'))
     result = run("audit", "verify", "--json")
     assert result.exit_code == 1

@@ -12,11 +12,11 @@ from strands_robots.safety.approval import Grants
 Run = Callable[..., Result]
 
 
-def test_a_grant_can_be_claimed_once(run: Run, tmp_path: Path) -> None:
+def test_a_grant_can_be_claimed_once(run: Run, state_directory: Path) -> None:
     result = run("grant", "execute@arm-1", "--json")
     assert result.exit_code == 0
     assert json.loads(result.stdout)["peer"] == "arm-1"
-    grants = Grants(tmp_path / "state" / "grants")
+    grants = Grants(state_directory / "grants")
     assert grants.claim("execute", "arm-1") is not None
     assert grants.claim("execute", "arm-1") is None
 

@@ -143,7 +143,7 @@ def test_a_live_robot_answers_for_itself(run: Run, fleet: FakeFleet) -> None:
 
 
 def test_without_a_network_what_is_kept_here_is_still_told(
-    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    run: Run, monkeypatch: pytest.MonkeyPatch, state_directory: Path
 ) -> None:
     def nobody(network: object, source: str = "") -> Any:
         raise Failure("The network is not there.", Exit.SILENT)
@@ -153,5 +153,5 @@ def test_without_a_network_what_is_kept_here_is_still_told(
     result = run("lockout")
     assert result.exit_code == 0
     assert "The network is not there." in result.stdout and "arm-1" in result.stdout
-    (tmp_path / "state" / "lockouts.json").write_text("{", encoding="utf-8")
+    (state_directory / "lockouts.json").write_text("{", encoding="utf-8")
     assert run("lockout").exit_code == 1

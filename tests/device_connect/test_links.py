@@ -14,16 +14,6 @@ from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.utils import ValidationError
 
 
-@pytest.fixture(autouse=True)
-def bare_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in (
-        *("DEVICE_CONNECT_ALLOW_INSECURE", "MESSAGING_BACKEND", "MESSAGING_URLS", "NATS_URL", "NATS_URLS"),
-        *("ZENOH_CONNECT", "ZENOH_LISTEN", "MESSAGING_CREDENTIALS_FILE", "NATS_CREDENTIALS_FILE"),
-        *("MESSAGING_TLS_CA_FILE", "MESSAGING_TLS_CERT_FILE", "MESSAGING_TLS_KEY_FILE"),
-    ):
-        monkeypatch.delenv(name, raising=False)
-
-
 def test_zenoh_without_a_url_finds_peers_by_multicast() -> None:
     link = link_for(None, "zenoh", "default", None)
     assert link.is_peer

@@ -18,12 +18,6 @@ from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError
 
 
-@pytest.fixture(autouse=True)
-def open_lists(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DEVICE_CONNECT_RPC_ALLOW", "DEVICE_CONNECT_ESTOP_ALLOW", "STRANDS_MESH_POLICY_TYPE_ALLOW"):
-        monkeypatch.delenv(name, raising=False)
-
-
 @pytest.fixture
 def world() -> Iterator[ToyWorld]:
     toy = ToyWorld()

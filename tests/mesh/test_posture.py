@@ -11,12 +11,6 @@ from strands_robots.mesh import keys, topics
 from strands_robots.mesh.transport import TransportError, posture, zenoh_config
 
 
-@pytest.fixture(autouse=True)
-def bare(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("ZENOH_CONNECT", "ZENOH_LISTEN", "STRANDS_MESH_PORT"):
-        monkeypatch.delenv(name, raising=False)
-
-
 def test_without_any_setting_the_mesh_stays_on_loopback_without_certificates() -> None:
     found = posture.from_settings()
     assert found.hub == "tcp/127.0.0.1:7447"

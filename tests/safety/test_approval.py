@@ -149,8 +149,6 @@ def test_the_refusal_names_the_ways_to_approve() -> None:
 
 def test_the_environment_is_the_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
-    monkeypatch.delenv("BYPASS_TOOL_CONSENT", raising=False)
-    monkeypatch.delenv("STRANDS_ROBOT_COMMAND_ALLOW", raising=False)
     assert Approval().claim("execute", "arm-1") is None
     Grants(tmp_path / "grants").grant("execute", "arm-1")
     assert Approval().claim("execute", "arm-1") is not None

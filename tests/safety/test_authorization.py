@@ -91,7 +91,6 @@ def test_a_list_of_providers_closes_the_others() -> None:
 
 def test_the_lists_are_read_when_they_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Authorization(hardware=True)
-    monkeypatch.delenv("DEVICE_CONNECT_RPC_ALLOW", raising=False)
     assert robot.motion("operator", "execute") is not None
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", " operator ,")
     assert robot.motion("operator", "execute") is None

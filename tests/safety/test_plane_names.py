@@ -19,14 +19,6 @@ KEY = hardware_key("so101", "usb-1")
 
 
 @pytest.fixture
-def plane() -> Iterator[SafetyPlane]:
-    here = SafetyPlane(deadline_s=0.5)
-    yield here
-    for entry in list(here.robots.values()):
-        entry.close()
-
-
-@pytest.fixture
 def robot() -> Iterator[RecordingRobot]:
     made = RecordingRobot()
     yield made

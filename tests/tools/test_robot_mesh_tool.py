@@ -173,7 +173,6 @@ def test_device_connect_is_the_usual_network(monkeypatch: pytest.MonkeyPatch, wo
 
 def test_a_network_that_leaves_this_machine_needs_an_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NATS_URL", "nats://192.0.2.1:4222")
-    monkeypatch.delenv("DEVICE_CONNECT_ALLOW_INSECURE", raising=False)
     answer = robot_mesh(action="stop", target="arm-1")
     assert answer["status"] == "error"
     assert "allow_insecure" in answer["reason"]

@@ -14,7 +14,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.ros.dds_fields import filled, plain
 from strands_robots.ros.dds_security import checked_credentials, policies, presenting
-from strands_robots.ros.link import Heard, Message, RosError, Unwatch
+from strands_robots.ros.link import Heard, Message, RosError, Unwatch, next_message
 from strands_robots.ros.names import bare_kind
 from strands_robots.utils import missing_extra, number, whole
 
@@ -94,19 +94,7 @@ class DdsLink:
         _write(self._writer(topic, kind), message, topic, kind)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
-        arrived, got = threading.Event(), list[Message]()
-
-        def keep(message: Message) -> None:
-            got.append(message)
-            arrived.set()
-
-        unwatch = self.watch(topic, kind, keep)
-        try:
-            if not arrived.wait(within_s):
-                raise RosError(f"Nothing arrived on {topic} within {within_s:g} s.")
-        finally:
-            unwatch()
-        return dict(got[0])
+        return next_message(self.watch, topic, kind, within_s)
 
     def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
         """Refused: bare DDS carries topics alone here."""

@@ -61,9 +61,8 @@ class Credentials:
         found = {_PROPERTIES[name]: uri for name, uri in self.uris.items()}
         folder = _plugin_folder()
         for role, file, called in _PLUGINS:
-            found[f"dds.sec.{role}.library.path"] = str(folder / file)
-            found[f"dds.sec.{role}.library.init"] = f"init_{called}"
-            found[f"dds.sec.{role}.library.finalize"] = f"finalize_{called}"
+            loaded = {"path": str(folder / file), "init": f"init_{called}", "finalize": f"finalize_{called}"}
+            found |= {".".join(("dds.sec", role, "library", part)): value for part, value in loaded.items()}
         return found
 
 

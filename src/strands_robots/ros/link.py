@@ -119,6 +119,25 @@ class UrgentLink(Protocol):
         """Give up what the first way has not sent yet, so that nothing of it arrives later."""
 
 
+def next_message(
+    watch: Callable[[str, str | None, Heard], Unwatch], topic: str, kind: str | None, within_s: float
+) -> dict[str, Any]:
+    """The first message that a link's ``watch`` tells of a topic. Raises :class:`RosError` where none comes in time."""
+    arrived, got = threading.Event(), list[Message]()
+
+    def keep(message: Message) -> None:
+        got.append(message)
+        arrived.set()
+
+    unwatch = watch(topic, kind, keep)
+    try:
+        if not arrived.wait(within_s):
+            raise RosError(f"Nothing arrived on {topic} within {within_s:g} s.")
+    finally:
+        unwatch()
+    return dict(got[0])
+
+
 MemoryAction = Callable[[Message, Heard, Goal], None]
 
 
@@ -177,20 +196,7 @@ class MemoryLink:
                 logger.exception("A watcher of %s failed.", topic)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
-        arrived = threading.Event()
-        got: list[Message] = []
-
-        def keep(message: Message) -> None:
-            got.append(message)
-            arrived.set()
-
-        unwatch = self.watch(topic, kind, keep)
-        try:
-            if not arrived.wait(within_s):
-                raise RosError(f"Nothing arrived on {topic} within {within_s:g} s.")
-        finally:
-            unwatch()
-        return dict(got[0])
+        return next_message(self.watch, topic, kind, within_s)
 
     def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
         del kind, within_s

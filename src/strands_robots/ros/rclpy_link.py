@@ -11,7 +11,7 @@ from weakref import WeakSet
 
 from strands_robots import settings
 from strands_robots.ros.dds import DOMAIN_MAX
-from strands_robots.ros.link import GivenUp, Goal, Heard, Message, RosError, Unwatch, never
+from strands_robots.ros.link import GivenUp, Goal, Heard, Message, RosError, Unwatch, never, next_message
 from strands_robots.ros.names import bare_kind, node_name
 from strands_robots.ros.rclpy_fields import filled, interface_class, plain
 from strands_robots.ros.rclpy_session import Session, ros2
@@ -77,19 +77,7 @@ class RclpyLink:
         _send(self._publisher(topic, kind), message, topic, kind)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
-        arrived, got = threading.Event(), list[Message]()
-
-        def keep(message: Message) -> None:
-            got.append(message)
-            arrived.set()
-
-        unwatch = self.watch(topic, kind, keep)
-        try:
-            if not arrived.wait(within_s):
-                raise RosError(f"Nothing arrived on {topic} within {within_s:g} s.")
-        finally:
-            unwatch()
-        return dict(got[0])
+        return next_message(self.watch, topic, kind, within_s)
 
     def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
         session = self._open()

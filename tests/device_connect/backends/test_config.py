@@ -8,28 +8,6 @@ from strands_robots.device_connect.backends import LinkConfig, link_from_environ
 from strands_robots.device_connect.backends.config import endpoints
 from strands_robots.utils import ValidationError
 
-VARIABLES = (
-    "MESSAGING_BACKEND",
-    "MESSAGING_URLS",
-    "MESSAGING_CREDENTIALS_FILE",
-    "MESSAGING_TLS_CA_FILE",
-    "MESSAGING_TLS_CERT_FILE",
-    "MESSAGING_TLS_KEY_FILE",
-    "NATS_URL",
-    "NATS_URLS",
-    "NATS_CREDENTIALS_FILE",
-    "ZENOH_CONNECT",
-    "ZENOH_LISTEN",
-    "STRANDS_DC_PORT",
-)
-
-
-@pytest.fixture(autouse=True)
-def environment(monkeypatch):
-    for name in VARIABLES:
-        monkeypatch.delenv(name, raising=False)
-    return monkeypatch
-
 
 def test_with_nothing_set_a_link_is_a_multicast_peer():
     link = link_from_environment()
@@ -39,8 +17,8 @@ def test_with_nothing_set_a_link_is_a_multicast_peer():
     assert not link.loopback_only
 
 
-def test_a_zenoh_endpoint_makes_a_client(environment):
-    environment.setenv("ZENOH_CONNECT", "tcp/10.0.0.1:7447, tls/10.0.0.2:7447")
+def test_a_zenoh_endpoint_makes_a_client(monkeypatch):
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/10.0.0.1:7447, tls/10.0.0.2:7447")
     link = link_from_environment()
     assert not link.is_peer
     assert link.connect == ("tcp/10.0.0.1:7447", "tls/10.0.0.2:7447")
@@ -48,57 +26,57 @@ def test_a_zenoh_endpoint_makes_a_client(environment):
     assert link.zenoh()["listen"]["endpoints"] == []
 
 
-def test_a_nats_url_makes_a_nats_link_without_naming_the_backend(environment):
-    environment.setenv("NATS_URL", "nats://10.0.0.1:4222")
+def test_a_nats_url_makes_a_nats_link_without_naming_the_backend(monkeypatch):
+    monkeypatch.setenv("NATS_URL", "nats://10.0.0.1:4222")
     assert link_from_environment().transport == "nats"
 
 
-def test_a_listen_endpoint_makes_a_peer_that_listens_there(environment):
-    environment.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7000")
+def test_a_listen_endpoint_makes_a_peer_that_listens_there(monkeypatch):
+    monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7000")
     link = link_from_environment()
     assert link.is_peer
     assert link.listeners == ("tcp/127.0.0.1:7000",)
 
 
-def test_an_unknown_backend_is_refused_by_name(environment):
-    environment.setenv("MESSAGING_BACKEND", "mqtt")
+def test_an_unknown_backend_is_refused_by_name(monkeypatch):
+    monkeypatch.setenv("MESSAGING_BACKEND", "mqtt")
     with pytest.raises(ValidationError, match="mqtt"):
         link_from_environment()
 
 
-def test_a_credentials_file_says_everything(environment, tmp_path):
+def test_a_credentials_file_says_everything(monkeypatch, tmp_path):
     file = tmp_path / "a.creds.json"
     section = {"urls": ["tls/10.0.0.1:7447"], "tls": {"ca_pem": "-----BEGIN X", "cert_pem": "c", "key_pem": "k"}}
     file.write_text(json.dumps({"device_id": "a", "tenant": "lab", "zenoh": section}))
-    environment.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
+    monkeypatch.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
     link = link_from_environment()
     assert (link.tenant, link.connect, link.cert) == ("lab", ("tls/10.0.0.1:7447",), "c")
     assert link.authenticated
 
 
-def test_a_nats_creds_file_is_read(environment, tmp_path):
+def test_a_nats_creds_file_is_read(monkeypatch, tmp_path):
     file = tmp_path / "a.creds"
     file.write_text(
         "-----BEGIN NATS USER JWT-----\neyJ0\n------END NATS USER JWT------\n\n*** keep it secret ***\n"
         "-----BEGIN USER NKEY SEED-----\nSUAC\n------END USER NKEY SEED------\n"
     )
-    environment.setenv("NATS_CREDENTIALS_FILE", str(file))
-    environment.setenv("NATS_URL", "nats://10.0.0.1:4222")
+    monkeypatch.setenv("NATS_CREDENTIALS_FILE", str(file))
+    monkeypatch.setenv("NATS_URL", "nats://10.0.0.1:4222")
     link = link_from_environment()
     assert (link.jwt, link.nkey_seed) == ("eyJ0", "SUAC")
 
 
-def test_a_missing_credentials_file_is_named(environment, tmp_path):
-    environment.setenv("MESSAGING_CREDENTIALS_FILE", str(tmp_path / "none.json"))
+def test_a_missing_credentials_file_is_named(monkeypatch, tmp_path):
+    monkeypatch.setenv("MESSAGING_CREDENTIALS_FILE", str(tmp_path / "none.json"))
     with pytest.raises(ValidationError, match=r"none\.json"):
         link_from_environment()
 
 
 @pytest.mark.parametrize("content", [b"# a page of prose", b"\xff\xfe\x00", b"[]", b'{"nats": 3}'])
-def test_a_file_that_holds_no_credentials_is_named(environment, tmp_path, content):
+def test_a_file_that_holds_no_credentials_is_named(monkeypatch, tmp_path, content):
     file = tmp_path / "page.md"
     file.write_bytes(content)
-    environment.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
+    monkeypatch.setenv("MESSAGING_CREDENTIALS_FILE", str(file))
     with pytest.raises(ValidationError, match=r"page\.md"):
         link_from_environment()
 
@@ -109,8 +87,8 @@ def test_a_tenant_that_would_reach_others_is_refused(tenant):
         LinkConfig(tenant=tenant)
 
 
-def test_a_loopback_link_stays_on_this_machine(environment):
-    environment.setenv("STRANDS_DC_PORT", "7555")
+def test_a_loopback_link_stays_on_this_machine(monkeypatch):
+    monkeypatch.setenv("STRANDS_DC_PORT", "7555")
     link = loopback_config()
     assert link.loopback_only
     assert link.meeting_point == "tcp/127.0.0.1:7555"

@@ -62,8 +62,6 @@ def lab(request: pytest.FixtureRequest) -> Iterator[Lab]:
 
 @pytest.fixture
 def connected(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
-    for name in ("ZENOH_CONNECT", "NATS_URL", "MESSAGING_BACKEND", "DEVICE_CONNECT_RPC_ALLOW"):
-        monkeypatch.delenv(name, raising=False)
     for name, value in lab.environment.items():
         monkeypatch.setenv(name, value)
     agent_tools.connect()

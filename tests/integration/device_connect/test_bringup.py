@@ -37,12 +37,6 @@ from strands_robots.device_connect.simulation_driver import SimulationDeviceDriv
 from strands_robots.utils import ValidationError
 
 
-@pytest.fixture(autouse=True)
-def quiet_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DEVICE_CONNECT_ALLOW_INSECURE", "DEVICE_CONNECT_RPC_ALLOW", "ZENOH_CONNECT", "NATS_URL"):
-        monkeypatch.delenv(name, raising=False)
-
-
 @pytest.fixture
 def link() -> LinkConfig:
     return loopback_config(free_port())

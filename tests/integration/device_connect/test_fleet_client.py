@@ -25,8 +25,7 @@ from strands_robots.utils import ValidationError
 
 
 @pytest.fixture
-def link(monkeypatch: pytest.MonkeyPatch) -> LinkConfig:
-    monkeypatch.delenv("DEVICE_CONNECT_RPC_ALLOW", raising=False)
+def link() -> LinkConfig:
     return loopback_config(free_port())
 
 
@@ -177,8 +176,7 @@ def test_no_network_is_an_error_within_its_deadline() -> None:
     eventually(lambda: not any(t.name == "fleet-client" for t in threading.enumerate()))
 
 
-def test_the_same_over_nats(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DEVICE_CONNECT_RPC_ALLOW", raising=False)
+def test_the_same_over_nats() -> None:
     with NatsServer() as server:
         link = LinkConfig(transport="nats", connect=(server.url,))
         world = ToyWorld()

@@ -24,9 +24,7 @@ def authority(tmp_path: Path) -> Authority:
 
 
 @pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[ToyWorld]:
-    for name in ("DEVICE_CONNECT_ALLOW_INSECURE", "DEVICE_CONNECT_RPC_ALLOW"):
-        monkeypatch.delenv(name, raising=False)
+def world() -> Iterator[ToyWorld]:
     toy = ToyWorld()
     yield toy
     toy.close()

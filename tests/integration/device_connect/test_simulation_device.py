@@ -40,8 +40,7 @@ def sim(link: LinkConfig) -> Iterator[Simulation]:
 
 
 @pytest.fixture
-def fleet(link: LinkConfig, sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[FleetClient]:
-    monkeypatch.delenv("DEVICE_CONNECT_RPC_ALLOW", raising=False)
+def fleet(link: LinkConfig, sim: Simulation) -> Iterator[FleetClient]:
     with FleetClient(link, "tester") as client:
         yield client
         client.stop("sim-1")

@@ -5,8 +5,6 @@ The base is a process on loopback DDS, and a listener of its own there says what
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -15,6 +13,7 @@ from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.base_process import base_process
 from fixtures.mesh_peer import MeshPeer
 from fixtures.nats_server import NatsServer
 from fixtures.waiting import eventually, free_port
@@ -57,21 +56,15 @@ class Sent:
 
 @pytest.fixture(autouse=True)
 def surroundings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
     monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "drive")
     monkeypatch.setenv("STRANDS_ROS2_COMMAND_ALLOW", "cmd_vel")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
 
 
 @pytest.fixture
 def wheels() -> Iterator[None]:
-    line = [sys.executable, "-m", "fixtures.dds_base", str(DOMAIN)]
-    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
+    with base_process(DOMAIN):
         yield
-        process.communicate(timeout=10)
 
 
 @pytest.fixture

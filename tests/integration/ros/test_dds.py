@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.base_process import base_process
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
@@ -22,25 +23,10 @@ ROOT = Path(__file__).resolve().parents[3]
 TWIST = "geometry_msgs/msg/Twist"
 
 
-@pytest.fixture(autouse=True)
-def loopback(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-
-
 @pytest.fixture
 def base() -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "fixtures.dds_base", str(DOMAIN)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    yield process
-    process.communicate(timeout=10)
+    with base_process(DOMAIN) as process:
+        yield process
 
 
 @pytest.fixture
@@ -55,7 +41,7 @@ def x_of(robot: RtpsRobot) -> float:
     return float(message["pose"]["pose"]["position"]["x"])
 
 
-def test_a_base_in_another_process_is_driven_and_stopped(base: subprocess.Popen[str], rover: RtpsRobot) -> None:
+def test_a_base_in_another_process_is_driven_and_stopped(base: None, rover: RtpsRobot) -> None:
     began = x_of(rover)
     answer = rover.drive(0.3, 0.0, duration=1.0)
     assert (answer["status"], answer["messages"], answer["trailing_zero"]) == ("success", 20, True)
@@ -63,7 +49,7 @@ def test_a_base_in_another_process_is_driven_and_stopped(base: subprocess.Popen[
     assert x_of(rover) - began == pytest.approx(0.3, abs=0.06)
 
 
-def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: subprocess.Popen[str], rover: RtpsRobot) -> None:
+def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: None, rover: RtpsRobot) -> None:
     assert rover.advertise()["status"] == "success"
     assert rover.start_drive(1.0, 0.0, 30.0)["status"] == "success"
     eventually(lambda: x_of(rover) > 0.1)
@@ -86,7 +72,7 @@ def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(
     assert "Nobody subscribes to /cmd_vel" in verdict.not_stopped["velocity"]
 
 
-def test_a_type_that_is_not_given_is_asked_of_the_graph(base: subprocess.Popen[str]) -> None:
+def test_a_type_that_is_not_given_is_asked_of_the_graph(base: None) -> None:
     link = DdsLink(DOMAIN, match_s=5.0)
     try:
         assert "twist" in link.read("/odom", None, 3.0)
@@ -124,7 +110,7 @@ def test_a_message_goes_from_one_link_to_another_and_a_closed_link_opens_again()
         receiver.close()
 
 
-def test_a_read_leaves_no_thread_behind(base: subprocess.Popen[str]) -> None:
+def test_a_read_leaves_no_thread_behind(base: None) -> None:
     link = DdsLink(DOMAIN)
     try:
         for _ in range(3):

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fixtures.base_process import base_process
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
@@ -25,25 +26,10 @@ RtpsRobot("lost", "/cmd_vel", domain_id={DOMAIN}, publish_rate=20, command_gate=
 """
 
 
-@pytest.fixture(autouse=True)
-def loopback(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-
-
 @pytest.fixture
-def world() -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "fixtures.mujoco_base", str(DOMAIN)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    yield process
-    process.communicate(timeout=10)
+def world() -> Iterator[None]:
+    with base_process(DOMAIN, "fixtures.mujoco_base"):
+        yield
 
 
 @pytest.fixture
@@ -61,7 +47,7 @@ def speed_of(robot: RtpsRobot) -> float:
     return float(robot.get_pose(5.0)["message"]["twist"]["twist"]["linear"]["x"])
 
 
-def test_two_seconds_at_three_tenths_are_six_tenths_of_a_metre(world: subprocess.Popen[str], driver: RtpsRobot) -> None:
+def test_two_seconds_at_three_tenths_are_six_tenths_of_a_metre(world: None, driver: RtpsRobot) -> None:
     # A subscriber learns of a new publisher some milliseconds later, and what was sent before that is lost on it.
     assert driver.advertise()["status"] == "success"
     began = x_of(driver)
@@ -74,7 +60,7 @@ def test_two_seconds_at_three_tenths_are_six_tenths_of_a_metre(world: subprocess
     assert x_of(driver) - began == pytest.approx(0.3 * max(2.0, took_s), rel=0.05)
 
 
-def test_a_lost_link_leaves_it_standing(world: subprocess.Popen[str], driver: RtpsRobot) -> None:
+def test_a_lost_link_leaves_it_standing(world: None, driver: RtpsRobot) -> None:
     # A driver that is gone without a word: no zero and no stop, as when a cable is pulled.
     with subprocess.Popen([sys.executable, "-c", DRIVER], cwd=ROOT) as lost:
         try:

@@ -14,15 +14,14 @@ import pytest
 from fixtures.certificates import Authority
 from fixtures.child import Child
 from fixtures.dds_pki import DdsPki, governance
+from fixtures.taking_arm import TakingArm
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
-from strands_robots.envelope import success
 from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError
-from strands_robots.ros_telemetry import INSECURE
 from strands_robots.utils import ValidationError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,19 +41,6 @@ OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 Peer = Callable[[dict[str, str] | None], Child]
 
 
-class Arm:
-    """Takes actions and keeps them."""
-
-    tool_name_str = "my arm"
-
-    def __init__(self) -> None:
-        self.taken: list[dict[str, float]] = []
-
-    def send_action(self, action: dict[str, float]) -> dict[str, Any]:
-        self.taken.append(action)
-        return success("taken")
-
-
 def until_heard(speaker: Child, listener: Child, fields: dict[str, Any]) -> None:
     """A first message may go out before the far end has the keys to read it."""
     began = len(listener.ask("heard"))
@@ -64,13 +50,6 @@ def until_heard(speaker: Child, listener: Child, fields: dict[str, Any]) -> None
         return len(listener.ask("heard")) > began
 
     eventually(heard)
-
-
-@pytest.fixture(autouse=True)
-def confined(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    monkeypatch.delenv(INSECURE, raising=False)
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +231,7 @@ def test_a_base_on_a_secured_graph_is_driven_and_stopped(peer: Peer, us: dict[st
 def test_an_arm_on_a_secured_graph_takes_commands_of_members_only(
     peer: Peer, us: dict[str, str], alice: dict[str, str]
 ) -> None:
-    arm = Arm()
+    arm = TakingArm()
     command = {"name": ["a.pos"], "position": [0.5]}
     bridge = HardwareRtpsBridge(arm, domain_id=DOMAIN, poll_period=0.005, dds_security_config=us)
     try:
@@ -268,7 +247,7 @@ def test_an_arm_on_a_secured_graph_takes_commands_of_members_only(
 def test_an_arm_whose_permissions_do_not_grant_the_command_topic_is_not_put_on_the_graph(us: dict[str, str]) -> None:
     before = threading.active_count()
     with pytest.raises(RosError, match="/another/joint_command cannot be read"):
-        HardwareRtpsBridge(Arm(), domain_id=DOMAIN, command_robot_name="another", dds_security_config=us)
+        HardwareRtpsBridge(TakingArm(), domain_id=DOMAIN, command_robot_name="another", dds_security_config=us)
     assert threading.active_count() == before
 
 
@@ -284,7 +263,7 @@ def test_an_arm_whose_permissions_do_not_grant_the_command_topic_is_not_put_on_t
 def test_commands_are_refused_where_the_governance_leaves_them_open(pki: DdsPki, laws: str, open_because: str) -> None:
     config = pki.member("lax", subscribe=("rt/my_arm/joint_command",), laws=laws)
     with pytest.raises(ValidationError, match=open_because):
-        HardwareRtpsBridge(Arm(), domain_id=DOMAIN, dds_security_config=config)
+        HardwareRtpsBridge(TakingArm(), domain_id=DOMAIN, dds_security_config=config)
 
 
 def test_the_keys_of_the_documentation_secure_an_arm(tmp_path: Path) -> None:
@@ -297,7 +276,7 @@ def test_the_keys_of_the_documentation_secure_an_arm(tmp_path: Path) -> None:
         files = {**own, **shared, "governance": "governance.p7s"}
         return {key: str(tmp_path / file) for key, file in files.items()}
 
-    arm = Arm()
+    arm = TakingArm()
     bridge = HardwareRtpsBridge(arm, command_robot_name="arm", poll_period=0.005, dds_security_config=config("arm"))
     command = {"name": ["a.pos"], "position": [0.5]}
     try:

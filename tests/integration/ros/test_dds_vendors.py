@@ -26,10 +26,8 @@ PICTURE = bytes(at % 251 for at in range(320 * 240 * 3))
 
 
 @pytest.fixture(autouse=True)
-def loopback(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+def open_to_peers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE", "1")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
 
 
 Built = Callable[[Vendor], Path]

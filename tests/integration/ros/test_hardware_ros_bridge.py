@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from fixtures import rclpy_stand_in
 from fixtures.devices import RecordingDevice
+from fixtures.taking_arm import TakingArm
 from fixtures.waiting import eventually
 
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware_ros_bridge import HardwareRosBridge
 from strands_robots.ros.dds import DdsLink
@@ -30,34 +31,11 @@ IMAGE = "sensor_msgs/msg/Image"
 SECURITY = ("ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY", "ROS_SECURITY_KEYSTORE")
 
 
-@pytest.fixture(autouse=True)
-def confined(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    for name in ("CYCLONEDDS_URI", "ROS_DOMAIN_ID", INSECURE, *SECURITY):
-        monkeypatch.delenv(name, raising=False)
-
-
 @pytest.fixture
 def sourced() -> Iterator[None]:
     """A ROS 2 that is sourced, as far as our code can tell."""
     with rclpy_stand_in.installed():
         yield
-
-
-class Arm:
-    """Takes actions and keeps them; refuses while locked."""
-
-    tool_name_str = "my arm"
-
-    def __init__(self) -> None:
-        self.taken: list[dict[str, float]] = []
-        self.locked = False
-
-    def send_action(self, action: dict[str, float]) -> dict[str, Any]:
-        if self.locked:
-            return error("locked")
-        self.taken.append(action)
-        return success("taken")
 
 
 @pytest.fixture
@@ -71,7 +49,7 @@ def test_a_joint_command_of_a_dds_peer_drives_the_arm_whole_or_not_at_all(
     sourced: None, peer: DdsLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(INSECURE, "1")
-    arm = Arm()
+    arm = TakingArm()
     bridge = HardwareRosBridge(arm, domain_id=DOMAIN, joint_limits={"a.pos": (-1.0, 1.0)}, spin_period=0.005)
     try:
         for bad in (
@@ -143,7 +121,7 @@ def test_a_bridge_that_cannot_be_is_refused_before_ros_2_is_looked_for(
     monkeypatch.setenv(INSECURE, "1")
     before, threads = dict(os.environ), threading.active_count()
     with pytest.raises(ValidationError, match=named):
-        HardwareRosBridge(Arm(), **{"domain_id": DOMAIN, **options})
+        HardwareRosBridge(TakingArm(), **{"domain_id": DOMAIN, **options})
     assert (dict(os.environ), threading.active_count()) == (before, threads)
 
 
@@ -156,13 +134,13 @@ def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists_or_se
             for name, value in {**secured, **weak}.items() if weak else []:
                 patched.setenv(name, value)
             with pytest.raises(ValidationError, match=INSECURE):
-                HardwareRosBridge(Arm(), domain_id=DOMAIN)
-    HardwareRosBridge(Arm(), domain_id=DOMAIN, enable_commands=False).shutdown()
+                HardwareRosBridge(TakingArm(), domain_id=DOMAIN)
+    HardwareRosBridge(TakingArm(), domain_id=DOMAIN, enable_commands=False).shutdown()
     for name, value in secured.items():
         monkeypatch.setenv(name, value)
     # The graph counts as secured; joining it is the middleware's, and the stand-in joins open ones only.
     with pytest.raises(RosError, match="open graphs only"):
-        HardwareRosBridge(Arm(), domain_id=DOMAIN)
+        HardwareRosBridge(TakingArm(), domain_id=DOMAIN)
 
 
 def test_without_a_ros_2_each_bridge_says_so_in_one_sentence() -> None:

@@ -22,12 +22,6 @@ NAV, NAV_KIND = "/navigate_to_pose", "nav2_msgs/action/NavigateToPose"
 ARM_KIND = "std_srvs/srv/SetBool"
 
 
-@pytest.fixture(autouse=True)
-def confined(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-
-
 @pytest.fixture(params=["memory", "rclpy", "dds"])
 def ends(request: pytest.FixtureRequest) -> Iterator[tuple[RosLink, RosLink]]:
     """Two links on one graph."""

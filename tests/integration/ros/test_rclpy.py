@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +13,7 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from fixtures import rclpy_stand_in
+from fixtures.base_process import base_process
 from fixtures.dds_nav2 import RELIABLE, Service
 from fixtures.nav2_process import nav2
 from fixtures.rclpy_stand_in.idl import SERVICES, ServoCtrlMsg
@@ -27,7 +26,6 @@ from strands_robots.ros import goals, ros_action
 from strands_robots.ros.actions import close_links
 from strands_robots.ros.dds import confine
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros_telemetry import INSECURE
 
 DOMAIN = 86
 ROOT = Path(__file__).resolve().parents[3]
@@ -35,13 +33,6 @@ OPEN = CommandGate(lambda _: ("cmd_vel", "navigate_to_pose"), lambda: False)
 JOINTS = "sensor_msgs/msg/JointState"
 IMAGE = "sensor_msgs/msg/Image"
 SECURITY = ("ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY", "ROS_SECURITY_KEYSTORE")
-
-
-@pytest.fixture(autouse=True)
-def confined(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    for name in ("CYCLONEDDS_URI", "ROS_DOMAIN_ID", "STRANDS_ROS2_COMMAND_ALLOW", INSECURE, *SECURITY):
-        monkeypatch.delenv(name, raising=False)
 
 
 @pytest.fixture
@@ -54,12 +45,8 @@ def sourced() -> Iterator[None]:
 
 @pytest.fixture
 def base() -> Iterator[None]:
-    line = [sys.executable, "-m", "fixtures.dds_base", str(DOMAIN)]
-    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
+    with base_process(DOMAIN):
         yield
-        process.communicate(timeout=10)
 
 
 Rover = Callable[..., RosBridgedRobot]

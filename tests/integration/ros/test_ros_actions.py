@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.base_process import base_process
 from fixtures.rosbridge_server import RosbridgeServer
 from fixtures.waiting import eventually
 
@@ -32,10 +31,7 @@ class Operator:
 
 
 @pytest.fixture(autouse=True)
-def clean(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    for name in ("CYCLONEDDS_URI", "STRANDS_ROS2_COMMAND_ALLOW", "BYPASS_TOOL_CONSENT"):
-        monkeypatch.delenv(name, raising=False)
+def closed_links() -> Iterator[None]:
     yield
     close_links()
 
@@ -137,10 +133,7 @@ def test_an_argument_outside_its_domain_is_refused_by_name(action: str, options:
 
 
 def test_a_graph_over_dds_is_looked_at_and_read(tmp_path: Path) -> None:
-    line = [sys.executable, "-m", "fixtures.dds_base", str(DOMAIN)]
-    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as base:
-        assert base.stdout is not None
-        assert base.stdout.readline() == "ready\n"
+    with base_process(DOMAIN):
         found = eventually(lambda: ros_action("list_topics", domain_id=DOMAIN)["topics"])
         odom = next(each for each in found if each["topic"] == "/odom")
         assert odom == {"topic": "/odom", "type": "nav_msgs/msg/Odometry", "publishers": 1, "subscriptions": 0}
@@ -148,7 +141,6 @@ def test_a_graph_over_dds_is_looked_at_and_read(tmp_path: Path) -> None:
         assert sample["twist"]["twist"]["linear"] == {"x": 0.0, "y": 0.0, "z": 0.0}
         told = {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "fields": {"linear": {"x": 0.1}}}
         assert ros_action("publish", domain_id=DOMAIN, tool_context=Operator(True), **told)["status"] == "success"
-        base.communicate(timeout=10)
     for action, options in (
         ("service_call", {"name": "/add", "type": "p/Add"}),
         ("action_goal", {"name": "/go", "type": "p/Go"}),

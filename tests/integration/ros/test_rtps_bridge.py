@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.taking_arm import TakingArm
 from fixtures.waiting import eventually
 
-from strands_robots.envelope import error, success
 from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros_telemetry import INSECURE
@@ -20,36 +20,13 @@ JOINTS = "sensor_msgs/msg/JointState"
 LIMITS = {"a.pos": (-1.0, 1.0)}
 
 
-class Arm:
-    """Takes actions and keeps them; refuses while locked."""
-
-    tool_name_str = "my arm"
-
-    def __init__(self) -> None:
-        self.taken: list[dict[str, float]] = []
-        self.locked = False
-
-    def send_action(self, action: dict[str, float]) -> dict[str, Any]:
-        if self.locked:
-            return error("locked")
-        self.taken.append(action)
-        return success("taken")
-
-
-@pytest.fixture(autouse=True)
-def confined(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
-    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    monkeypatch.delenv(INSECURE, raising=False)
+@pytest.fixture
+def arm() -> TakingArm:
+    return TakingArm()
 
 
 @pytest.fixture
-def arm() -> Arm:
-    return Arm()
-
-
-@pytest.fixture
-def bridge(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> Iterator[HardwareRtpsBridge]:
+def bridge(arm: TakingArm, monkeypatch: pytest.MonkeyPatch) -> Iterator[HardwareRtpsBridge]:
     monkeypatch.setenv(INSECURE, "1")
     made = HardwareRtpsBridge(arm, domain_id=DOMAIN, joint_limits=LIMITS, poll_period=0.005)
     yield made
@@ -65,7 +42,7 @@ def controller() -> Iterator[DdsLink]:
     link.close()
 
 
-def test_a_joint_command_drives_the_arm(arm: Arm, bridge: HardwareRtpsBridge, controller: DdsLink) -> None:
+def test_a_joint_command_drives_the_arm(arm: TakingArm, bridge: HardwareRtpsBridge, controller: DdsLink) -> None:
     controller.publish(COMMAND, JOINTS, {"name": ["a.pos", "b.pos"], "position": [0.5, 7.0]})
     eventually(lambda: arm.taken == [{"a.pos": 0.5, "b.pos": 7.0}])
 
@@ -81,13 +58,13 @@ def test_a_joint_command_drives_the_arm(arm: Arm, bridge: HardwareRtpsBridge, co
     ],
 )
 def test_a_command_that_is_wrong_in_one_place_is_dropped_whole(
-    arm: Arm, bridge: HardwareRtpsBridge, bad: dict[str, Any]
+    arm: TakingArm, bridge: HardwareRtpsBridge, bad: dict[str, Any]
 ) -> None:
     assert bridge.apply(bad) is False
     assert arm.taken == []
 
 
-def test_a_locked_arm_refuses_commands_from_the_graph(arm: Arm, bridge: HardwareRtpsBridge) -> None:
+def test_a_locked_arm_refuses_commands_from_the_graph(arm: TakingArm, bridge: HardwareRtpsBridge) -> None:
     arm.locked = True
     assert bridge.apply({"name": ["a.pos"], "position": [0.1]}) is False
     assert arm.taken == []
@@ -117,7 +94,7 @@ def test_joints_and_images_are_told_to_whoever_listens(controller: DdsLink) -> N
         bridge.shutdown()
 
 
-def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists(arm: Arm) -> None:
+def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists(arm: TakingArm) -> None:
     with pytest.raises(ValidationError, match=INSECURE):
         HardwareRtpsBridge(arm, domain_id=DOMAIN)
     HardwareRtpsBridge(arm, domain_id=DOMAIN, enable_commands=False).shutdown()
@@ -142,7 +119,7 @@ CREDENTIALS = dict.fromkeys(("identity_ca", "certificate", "private_key", "gover
     ],
 )
 def test_a_bridge_that_cannot_be_is_refused_before_anything_happens(
-    arm: Arm, options: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
+    arm: TakingArm, options: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(INSECURE, "1")
     before = threading.active_count()

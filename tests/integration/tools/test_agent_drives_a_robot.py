@@ -13,7 +13,6 @@ from fixtures.toy_robots import ToyWorld
 from fixtures.waiting import eventually, free_port
 from strands import Agent
 
-from strands_robots import settings
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.tools import robot_mesh
 
@@ -21,8 +20,6 @@ from strands_robots.tools import robot_mesh
 @pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ToyWorld]:
     """One toy world, served on a loopback port that the tool uses too."""
-    for setting in settings.declared():
-        monkeypatch.delenv(setting.name, raising=False)
     monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
     toy = ToyWorld("toys", robots=("left",))
