@@ -8,11 +8,12 @@ import subprocess
 import sys
 
 import pytest
+import zenoh
 from device_connect_edge.messaging.exceptions import MessagingError
 from fixtures.bare_caller import Caller
 from fixtures.certificates import Authority
 from fixtures.echo_device import EchoDevice
-from fixtures.waiting import eventually_async, free_port, until
+from fixtures.waiting import eventually, eventually_async, free_port, until
 from fixtures.zenoh_router import ZenohRouter, only_own_subjects
 
 from strands_robots.device_connect.backends import LinkConfig, backend_for, loopback_config, open_client
@@ -41,6 +42,22 @@ async def test_peers_with_endpoints_and_no_multicast_find_and_call_each_other():
             await caller.sees("arm-1", "arm-2")
             for name in ("arm-1", "arm-2"):
                 assert (await caller.call(name, "getStatus", {"value": name}))["result"]["value"] == name
+
+
+def test_of_two_peers_that_learn_of_each_other_one_dials_and_it_is_the_one_nobody_may_reach():
+    meeting, listening = f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
+    links = (
+        LinkConfig(mode="peer", listen=(meeting,), multicast=False),
+        LinkConfig(mode="peer", listen=(listening,), connect=(meeting,), multicast=False),
+        LinkConfig(mode="peer", connect=(meeting,), multicast=False),
+    )
+    with contextlib.ExitStack() as stack:
+        _, reached, dialling = [
+            stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(link.zenoh())))) for link in links
+        ]
+        eventually(lambda: len(dialling.info.peers_zid()) == len(reached.info.peers_zid()) == 2)
+        (one,) = [link for link in dialling.info.links() if str(link.zid) == str(reached.zid())]
+        assert str(one.dst) == listening
 
 
 async def test_a_bare_device_is_found_and_called_by_our_client(router):

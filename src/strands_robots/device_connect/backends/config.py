@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -164,6 +165,7 @@ class LinkConfig:
         connect = list(self.connect) + ([self.meeting_point] if self.meeting_point and not meet else [])
         patience = -1 if peer else max(1, round(self.connect_timeout_s * 1000))
         config: dict[str, Any] = {
+            "id": self._session_id(),
             "mode": "peer" if peer else "client",
             "listen": {"endpoints": listen if peer else [], "timeout_ms": 0, "exit_on_failure": True},
             "connect": {
@@ -176,7 +178,11 @@ class LinkConfig:
             "open": {"return_conditions": {"connect_scouted": self.uses_multicast, "declares": True}},
             "scouting": {
                 "multicast": {"enabled": self.uses_multicast, "autoconnect": {"peer": ["router", "peer"]}},
-                "gossip": {"enabled": peer, "autoconnect": {"peer": ["router", "peer"]}},
+                "gossip": {
+                    "enabled": peer,
+                    "autoconnect": {"peer": ["router", "peer"]},
+                    "autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": self._dials_peers()}},
+                },
             },
             "transport": {
                 "unicast": {"open_timeout": HANDSHAKE_MS},
@@ -202,6 +208,22 @@ class LinkConfig:
             config["transport"]["link"]["protocols"] = ["tls"]
             config["transport"]["link"]["tls"] = self._zenoh_tls()
         return config
+
+    def _session_id(self) -> str:
+        """A fresh Zenoh id: who states no endpoint to listen on may be behind a firewall, and is the greater one.
+
+        The last byte counts most.
+        """
+        return f"51{secrets.token_hex(14)}{'01' if self.listen else 'ff'}"
+
+    def _dials_peers(self) -> str:
+        """Of two peers that gossip tells of each other, the greater one dials, and it alone.
+
+        Were both to dial, one transport would hold two links, and one that expires on one side before the other is
+        joined again without its subscriptions, for good (eclipse-zenoh/zenoh issue 2806, found open in 1.10). With
+        certificates both dial all the same: gossip tells addresses, of which a certificate may name those of one side.
+        """
+        return "always" if self.ca else "greater-zid"
 
     def meeting_host(self) -> dict[str, Any]:
         """The configuration of a session that does nothing but hold the meeting port."""
