@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
+from strands_robots.cli.mesh import stopped_on_mesh
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Exit, Failure, Screen, label, plain, table
 from strands_robots.cli.passphrase import PASSPHRASE_FILE, signing_key
 from strands_robots.cli.quiet import kept_log
 from strands_robots.safety.controller import DEADLINE_S, Answer, Progress, SafetyController, StopReport
 from strands_robots.safety.orders import new_epoch
+from strands_robots.tools.networks import NativeMesh
 from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 SLOW_MS = 100.0
 """An answer that took longer is shown in red."""
 
+LOCKED = "They are locked until they are resumed: strands-robots resume."
 LINK_WAIT_S = 2.0
 DRAW_S = 0.05
 COLUMNS = ("robot", "answer", "ms", "what it said")
@@ -49,10 +52,17 @@ def estop(
     deadline: Annotated[float, typer.Option("--deadline", help="Seconds until silence is silence.")] = DEADLINE_S,
     key: Annotated[Path | None, typer.Option("--key", help="Sign it, where robots ask for signed stops.")] = None,
     passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
+    on_mesh: Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")] = False,
 ) -> None:
     """Stop every robot of the tenant and lock it. Exits with 1 when one did not stop, with 3 when one is silent."""
     if devices and everything:
         raise Failure("estop takes DEVICE... or --all.", Exit.USAGE)
+    if on_mesh:
+        if devices or key is not None:
+            raise Failure("estop --mesh stops everybody, and takes neither DEVICE nor --key.", Exit.USAGE)
+        network.on_mesh()
+        stopped_on_mesh(screen, NativeMesh().emergency_stop(reason), f" {LOCKED}")
+        return
     expected = [device_id("DEVICE", each) for each in devices or []]
     seconds = number("--deadline", deadline, above=0, high=600)
     source = device_id("--as", source)
@@ -79,7 +89,7 @@ def estop(
         where = "" if report.link else f" {describe(link)}"
         raise Failure(plain(f"{told['reason']}{where}", 2000), code, **facts)
     screen.data({"status": "success", **facts})
-    screen.say("They are locked until they are resumed: strands-robots resume.")
+    screen.say(LOCKED)
 
 
 class Running:

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.mesh import peers_on_mesh
+from strands_robots.cli.mesh import peers_on_mesh, stopped_on_mesh
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Exit, Failure, Screen, label, plain, table
 from strands_robots.cli.words import assignments
 from strands_robots.envelope import Envelope, is_error, text_of
 from strands_robots.safety.stopping import explain, grade
+from strands_robots.tools.networks import NativeMesh
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def peers(
 ) -> None:
     """List the robots on the network, or what one of them can do."""
     if on_mesh:
+        network.on_mesh()
         peers_on_mesh(screen, number("--timeout", timeout, above=0, high=60))
         return
     with reached(network) as fleet:
@@ -92,10 +94,15 @@ def stop(
     device: Annotated[str | None, typer.Argument(help="The device's id.")] = None,
     everything: Annotated[bool, typer.Option("--all", help="Stop every device that answers.")] = False,
     timeout: Annotated[float, _WAIT] = 5.0,
+    on_mesh: Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")] = False,
 ) -> None:
     """Stop one robot, or all. Exits with 1 when one did not stop, with 3 when one is silent."""
     if (device is None) != everything:
         raise Failure("stop takes a DEVICE or --all.", Exit.USAGE)
+    if on_mesh:
+        network.on_mesh()
+        stopped_on_mesh(screen, NativeMesh().stop(device or ""))
+        return
     seconds = number("--timeout", timeout, above=0, high=60)
     with reached(network) as fleet:
         answers = fleet.stop_all(seconds) if device is None else {device: fleet.stop(device, seconds)}

@@ -1,9 +1,8 @@
-"""The native mesh at the command line: ``serve --mesh``, ``peers --mesh``, and ``mesh keys init|issue|acl``."""
+"""The native mesh at the command line: ``--mesh`` of ``serve``, ``peers``, ``stop``, ``estop``; and ``mesh keys``."""
 
 from __future__ import annotations
 
 import os
-import secrets
 import shlex
 import signal
 import time
@@ -15,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.output import Exit, Failure, Screen, table
-from strands_robots.envelope import text_of
+from strands_robots.cli.output import Exit, Failure, Screen, label, plain, table
+from strands_robots.envelope import Envelope, text_of
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
@@ -113,16 +112,31 @@ def peers_on_mesh(screen: Screen, timeout: float) -> None:
     screen.show(table("", ("peer", "type", "host", "status", "heard"), cells))
 
 
+def stopped_on_mesh(screen: Screen, told: Envelope, end: str = "") -> None:
+    """Show what became of a stop on the mesh: exits with 1 when one did not stop, with 3 when one or all are silent."""
+    moving, silent = told.get("not_stopped", []), told.get("silent", [])
+
+    def row(name: str, said: str) -> tuple[Any, ...]:
+        if name in moving:
+            return name, label("DID NOT STOP", "bold red"), said
+        return name, label("NO ANSWER", "bold red") if name in silent else label("stopped", "green"), said
+
+    screen.show(table("", ("robot", "answer", "what it said"), (row(*each) for each in told.get("robots", {}).items())))
+    facts = {name: value for name, value in told.items() if name not in ("status", "content", "reason")}
+    if told["status"] != "success":
+        raise Failure(plain(text_of(told), 2000), Exit.REFUSED if moving else Exit.SILENT, **facts)
+    screen.data({"status": "success", **facts})
+    screen.say(f"{text_of(told)}{end}", "green")
+
+
 def own_id(word: str) -> str:
     """An id for a command's stay on the mesh, which the certificate speaks for where there is one."""
     from strands_robots.mesh.transport.base import TransportError  # noqa: PLC0415 - loaded when it is used
-    from strands_robots.mesh.transport.posture import credentials_from_settings  # noqa: PLC0415 - as above
-    from strands_robots.mesh.wire_identity import IdentityError, Signer  # noqa: PLC0415
+    from strands_robots.mesh.transport.posture import visitor_id  # noqa: PLC0415 - as above
+    from strands_robots.mesh.wire_identity import IdentityError  # noqa: PLC0415
 
-    own = f"{word}-{secrets.token_hex(4)}"
     try:
-        files = credentials_from_settings()
-        return own if files is None else f"{Signer(files.cert, files.key).common_name}__{own}"
+        return visitor_id(word)
     except (TransportError, IdentityError) as exc:
         raise Failure(str(exc), Exit.USAGE) from exc
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from inspect import Parameter
 from pathlib import Path
@@ -12,7 +12,7 @@ import typer
 
 from strands_robots import settings
 from strands_robots.cli.output import Exit, Failure
-from strands_robots.utils import missing_extra
+from strands_robots.utils import missing_extra, port
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
@@ -57,6 +57,20 @@ class Network:
         if not link.authenticated and not link.loopback_only and not self.opted_in:
             raise Failure(_NEEDS, Exit.USAGE)
         return link
+
+    def on_mesh(self) -> None:
+        """Take the port, which is all that the native mesh has a use for.
+
+        Raises:
+            Failure: another flag was given.
+            ValidationError: the port is none.
+        """
+        if any(getattr(self, each.name) for each in fields(self) if each.name != "port"):
+            raise Failure(
+                "--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE
+            )
+        if self.port is not None:
+            settings.put("STRANDS_MESH_PORT", str(port("--port", self.port)))
 
     def _reached(self) -> LinkConfig:
         backends = _backends()

@@ -95,6 +95,8 @@ def serve(
     wanted = None if peer_id is None else device_id("--peer-id", peer_id)
     meeting, serial = told_apart(port or [])
     network = replace(network, port=meeting)
+    if on_mesh:
+        network.on_mesh()
     link = None if on_mesh else network.link()
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
 

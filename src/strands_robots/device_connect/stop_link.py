@@ -30,6 +30,9 @@ TRY_MS = 1000
 LEASE_MS = 4000
 """A silent far side is given up after this long; shorter, and a lossy link would flap under a stop."""
 
+OVERLAP_S = 2.0
+"""How long a session that is replaced still carries stops: peers learn of the new one and of one another meanwhile."""
+
 
 def stop_link(link: LinkConfig) -> StopLink:
     """A connection of the lane's own to where ``link`` leads."""
@@ -71,79 +74,104 @@ class _State:
             self._on_state(up)
 
 
+class _Session:
+    """A Zenoh session, what is declared on it, and who is at its far side."""
+
+    def __init__(self, session: Any) -> None:
+        self.session = session
+        self.declared: list[Any] = []
+        self.far_sides: set[str] = set()
+
+
 class ZenohStopLink:
-    """A Zenoh session of its own; callbacks run on Zenoh's receiving thread and only hand over."""
+    """A Zenoh session of its own; callbacks run on Zenoh's receiving threads and only hand over."""
 
     def __init__(self, link: LinkConfig) -> None:
         self._link = _apart(link)
         self._root = f"device-connect/{link.tenant}"
-        self._session: Any = None
-        self._keep: list[Any] = []
+        self._sessions: tuple[_Session, ...] = ()
         self._closing_session = threading.Lock()
-        self._far_sides: set[str] = set()
+        self._telling, self._starting = threading.Lock(), threading.Lock()
         self._state = _State(lambda up: None)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._heard: tuple[Collection[str], Hear] | None = None
+        self._heard: tuple[Collection[str], Hear] = ((), lambda event, source, payload: None)
         self._put_options: dict[str, Any] = {}
 
     @property
     def up(self) -> bool:
         return self._state.up
 
+    @property
+    def far_sides(self) -> set[str]:
+        """The Zenoh ids of whoever it reaches."""
+        return {zid for each in self._sessions for zid in tuple(each.far_sides)}
+
     def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
         self._state = _State(on_state)
-        self._thread = threading.Thread(target=self._open, args=(events, hear), name="stop-link", daemon=True)
-        self._thread.start()
         self._heard = (events, hear)
+        with self._starting:
+            self._start(self._open)
         _OPEN.add(self)
 
     def renew(self) -> None:
-        """Close the session and open another, on a thread; not while the last one is still being opened."""
-        if self._heard is None or (self._thread is not None and self._thread.is_alive()):
-            return
-        self._thread = threading.Thread(target=self._again, args=self._heard, name="stop-link", daemon=True)
-        self._thread.start()
+        """Open another session, and close the one before it once both have carried what was sent for a while.
 
-    def _again(self, events: Collection[str], hear: Hear) -> None:
-        self._drop()
-        if not self._closing.is_set():
-            self._open(events, hear)
+        On a thread; nothing while the last one is still at it.
+        """
+        with self._starting:
+            if self._thread is not None and not self._thread.is_alive() and not self._closing.is_set():
+                self._start(self._again)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
-        session = self._session
-        if session is None or not self._state.up:
-            return False
-        try:
-            session.put(f"{self._root}/{source}/event/{event}", payload, **self._put_options)
-        except Exception as exc:  # noqa: BLE001 - the binding has one error for a closed session and a bad key
-            logger.warning("%s was not sent: %s", event, exc)
-            return False
-        return True
+        sent = False
+        for each in self._sessions:
+            if not each.far_sides:
+                continue
+            try:
+                each.session.put(f"{self._root}/{source}/event/{event}", payload, **self._put_options)
+            except Exception as exc:  # noqa: BLE001 - the binding has one error for a closed session and a bad key
+                logger.warning("%s was not sent: %s", event, exc)
+            else:
+                sent = True
+        return sent
 
     def close(self) -> None:
         self._closing.set()
-        if self._thread is not None:
-            self._thread.join(10.0)
-        self._drop()
+        with self._starting:
+            thread = self._thread
+        if thread is not None:
+            thread.join(10.0)
+        for each in self._sessions:
+            self._drop(each)
         _OPEN.discard(self)
 
-    def _drop(self) -> None:
-        """Close the session there is."""
+    def _start(self, work: Callable[..., None]) -> None:
+        self._thread = threading.Thread(target=work, args=self._heard, name="stop-link", daemon=True)
+        self._thread.start()
+
+    def _again(self, events: Collection[str], hear: Hear) -> None:
+        before = self._sessions
+        self._open(events, hear)
+        self._closing.wait(OVERLAP_S)
+        for each in before:
+            self._drop(each)
+
+    def _drop(self, each: _Session) -> None:
+        """Close a session."""
         # Whoever comes second waits too: a thread that is inside Zenoh while the interpreter ends aborts the process.
         with self._closing_session:
-            session, self._session = self._session, None
-            keep, self._keep = self._keep, []
-            for declared in keep:
+            if each not in self._sessions:
+                return
+            self._sessions = tuple(other for other in self._sessions if other is not each)
+            for declared in each.declared:
                 # Closing ends links, which Zenoh would tell on its own threads after this has returned.
                 try:
                     declared.undeclare()
                 except Exception as exc:  # noqa: BLE001 - the binding has one error for all; the close goes on
                     logger.debug("a declaration of the stop lane was gone already: %s", exc)
-            if session is not None:
-                session.close()
-            self._far_sides.clear()
-        self._state.set(False)
+            each.session.close()
+        self._tell()
 
     def _open(self, events: Collection[str], hear: Hear) -> None:
         import zenoh  # noqa: PLC0415 - an optional package, loaded with the first link
@@ -156,6 +184,35 @@ class ZenohStopLink:
             "congestion_control": zenoh.CongestionControl.DROP,
             "express": True,
         }
+        session = None
+        while session is None and not self._closing.is_set():
+            try:
+                session = zenoh.open(zenoh.Config.from_json5(json.dumps(self._config())))
+            except zenoh.ZError as exc:
+                logger.debug("the stop lane's session does not open yet: %s", exc)
+                self._closing.wait(RETRY_S)
+        if session is None:
+            return
+        opened = _Session(session)
+
+        def on_sample(sample: Any) -> None:
+            parts = str(sample.key_expr).split("/")
+            if len(parts) == 5:
+                hear(parts[4], parts[2], sample.payload.to_bytes())
+
+        def on_far_side(event: Any) -> None:
+            # One thread of the session's tells these, in order.
+            change = opened.far_sides.add if str(event.kind).endswith("PUT") else opened.far_sides.discard
+            change(str(event.transport.zid))
+            self._tell()
+
+        opened.declared = [
+            session.declare_subscriber(f"{self._root}/*/event/{event}", direct(on_sample)) for event in events
+        ]
+        self._sessions = (*self._sessions, opened)
+        opened.declared.append(session.info.declare_transport_events_listener(direct(on_far_side), history=True))
+
+    def _config(self) -> dict[str, Any]:
         config = self._link.zenoh()
         config["connect"]["retry"] = {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2}
         config["transport"]["link"]["tx"]["lease"] = LEASE_MS
@@ -163,36 +220,11 @@ class ZenohStopLink:
         config["transport"]["shared_memory"] = {"enabled": False}
         if not self._link.is_peer:
             config["connect"]["timeout_ms"] = TRY_MS
-        text = json.dumps(config)
-        session = None
-        while session is None and not self._closing.is_set():
-            try:
-                session = zenoh.open(zenoh.Config.from_json5(text))
-            except zenoh.ZError as exc:
-                logger.debug("the stop lane's session does not open yet: %s", exc)
-                self._closing.wait(RETRY_S)
-        if session is None:
-            return
+        return config
 
-        def on_sample(sample: Any) -> None:
-            parts = str(sample.key_expr).split("/")
-            if len(parts) == 5:
-                hear(parts[4], parts[2], sample.payload.to_bytes())
-
-        self._keep = [
-            session.declare_subscriber(f"{self._root}/*/event/{event}", direct(on_sample)) for event in events
-        ]
-        self._session = session
-        self._keep.append(session.info.declare_transport_events_listener(direct(self._on_far_side), history=True))
-
-    def _on_far_side(self, event: Any) -> None:
-        zid = str(event.transport.zid)
-        # One thread of Zenoh's tells these, in order.
-        if str(event.kind).endswith("PUT"):
-            self._far_sides.add(zid)
-        else:
-            self._far_sides.discard(zid)
-        self._state.set(bool(self._far_sides) and not self._closing.is_set())
+    def _tell(self) -> None:
+        with self._telling:
+            self._state.set(any(each.far_sides for each in self._sessions) and not self._closing.is_set())
 
 
 class NatsStopLink:

@@ -28,7 +28,10 @@ REPEAT_S = (0.005, 0.005, 0.01, 0.01, 0.02, 0.05, 0.1, 0.2)
 
 UNCONFIRMED_S = 0.1
 RENEW_S = 6.0
-"""After so long without any answer the connection is made anew: it may have come back to nobody."""
+"""A stop, or one after another, that someone expected left unanswered for so long makes the connection anew."""
+
+SETTLE_S = 1.0
+"""A stop goes on for at least so long before it has the connection made anew."""
 
 DEADLINE_S = 3.0
 REFUSED = "resumed before"
@@ -107,6 +110,7 @@ class SafetyController:
         self._stops: dict[str, _Running] = {}
         self._closing = threading.Event()
         self._check_in: threading.Thread | None = None
+        self._unanswered_s = 0.0
         self._link = make_link()
         self._link.open((VERDICT,), self._hear, self._link_changed)
 
@@ -188,7 +192,8 @@ class SafetyController:
 
     def _repeat(self, run: _Running, payload: bytes, deadline_s: float, on_progress: OnProgress) -> None:
         pauses, told = iter(REPEAT_S), -1
-        pause, next_send, again, renew_at = 0.0, run.started, 0, run.started + RENEW_S
+        pause, next_send, again = 0.0, run.started, 0
+        renew_at = run.started + max(SETTLE_S, RENEW_S - self._unanswered_s)
         while True:
             now = time.monotonic()
             late = now - run.started >= UNCONFIRMED_S
@@ -199,9 +204,10 @@ class SafetyController:
                 told = state
                 on_progress(run.progress(self._link.up, now))
             if finished:
+                self._unanswered_s = self._unanswered_s + now - run.started if run.unanswered else 0.0
                 return
-            if now >= renew_at and not run.answers:
-                renew_at = now + RENEW_S
+            if now >= renew_at and run.unanswered and self._link.up:
+                renew_at, self._unanswered_s = now + RENEW_S, run.started - now
                 if isinstance(self._link, RenewableLink):
                     self._link.renew()
             if now >= next_send:
@@ -294,6 +300,11 @@ class _Running:
     @property
     def complete(self) -> bool:
         return bool(self.expected) and self.expected <= self.answers.keys()
+
+    @property
+    def unanswered(self) -> bool:
+        """Somebody who is expected, or anybody at all, gave no answer yet."""
+        return not self.answers or not self.expected <= self.answers.keys()
 
     def progress(self, link_up: bool, now: float) -> Progress:
         late = now - self.started >= UNCONFIRMED_S

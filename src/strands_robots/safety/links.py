@@ -41,7 +41,7 @@ class RenewableLink(Protocol):
     """A link that can be made anew while it is used."""
 
     def renew(self) -> None:
-        """Give the connection up and open another; returns at once. For one that is up and brings no answer."""
+        """Open another connection in place of the one there is, which carries stops until then; returns at once."""
 
 
 def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:

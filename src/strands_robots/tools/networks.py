@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -101,14 +100,19 @@ class NativeMesh:
         return _with_console(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
-        """The mesh's emergency stop; who can be seen and gave no answer is named."""
+        """The mesh's emergency stop, sent at once; and again when it is known who is there, for their answers by name.
+
+        Who can be seen and gave no answer is named. Both hold the robots; a resume of the operator's frees both.
+        """
 
         def stopped(console: Mesh) -> Envelope:
+            console.emergency_stop()
+            time.sleep(HEAR_S)
             expected = [row["peer_id"] for row in console.peers if row["reachable"]]
             replies = [each for each in console.emergency_stop() if each["responder_id"] != console.peer_id]
             return {**verdict_of(_by_name(replies, expected)), "estop_id": console.lockout_epoch}
 
-        return _with_console(stopped, stopped=None)
+        return _with_console(stopped, hear_s=0.0, stopped=None)
 
 
 def _by_name(replies: list[dict[str, Any]], expected: list[str]) -> dict[str, Envelope]:
@@ -134,15 +138,20 @@ def _answer_of(target: str, reply: dict[str, Any]) -> Envelope:
     return result if isinstance(result, dict) else error(f"{target} answered nothing known.")
 
 
-def _with_console(work: Callable[[Mesh], Envelope], **fields: Any) -> Envelope:
+def _with_console(work: Callable[[Mesh], Envelope], hear_s: float = HEAR_S, **fields: Any) -> Envelope:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.mesh.transport.base import TransportError  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport.posture import visitor_id  # noqa: PLC0415
 
-    console = init_mesh(None, f"{SOURCE}-{secrets.token_hex(4)}", "tool")
+    try:
+        console = init_mesh(None, visitor_id(SOURCE), "tool")
+    except (TransportError, ValueError) as exc:
+        return error(str(exc), **fields)
     if console is None or not console.alive:
         return error("The native mesh is off or has no session; see the log.", **fields)
     try:
         # Two heartbeats: who is there has been heard by then.
-        time.sleep(HEAR_S)
+        time.sleep(hear_s)
         return work(console)
     finally:
         console.close()

@@ -7,7 +7,10 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -17,7 +20,9 @@ from strands_robots.cli.app import build
 COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
 
-def test_a_served_arm_is_seen_from_another_terminal_and_ctrl_c_stops_it(tmp_path: Path, port: int) -> None:
+@contextmanager
+def served(tmp_path: Path, port: int) -> Iterator[tuple[subprocess.Popen[str], dict[str, str]]]:
+    """``arm-1`` on the mesh of this port, and the environment of a second terminal."""
     state = tmp_path / "state"
     state.mkdir(mode=0o700)
     settings = {**os.environ, "STRANDS_MESH_PORT": str(port), "STRANDS_STATE_DIR": str(state)}
@@ -30,22 +35,55 @@ def test_a_served_arm_is_seen_from_another_terminal_and_ctrl_c_stops_it(tmp_path
     try:
         assert serving.stdout is not None
         assert json.loads(serving.stdout.readline())["peer_id"] == "arm-1"
-        seen = subprocess.run(
-            [*COMMAND, "peers", "--mesh", "--json"],
-            capture_output=True,
-            text=True,
-            env=settings,
-            check=True,
-            timeout=30,
-        )
-        [row] = json.loads(seen.stdout)["peers"]
-        assert (row["peer_id"], row["type"], row["sim_robots"]) == ("arm-1", "sim", ["so100"])
-        serving.send_signal(signal.SIGINT)
-        rest = serving.communicate(timeout=15)[0]
-        assert json.loads(rest.splitlines()[0])["stopped"] is True
+        yield serving, settings
     finally:
         serving.kill()
         serving.wait()
+
+
+def asked(settings: dict[str, str], *words: str) -> tuple[int, dict[str, Any]]:
+    """The exit code and the answer of a command in the second terminal."""
+    ended = subprocess.run(
+        [*COMMAND, *words, "--json"], capture_output=True, text=True, env=settings, check=False, timeout=30
+    )
+    assert ended.stdout, ended.stderr
+    return ended.returncode, json.loads(ended.stdout)
+
+
+def test_a_served_arm_is_seen_from_another_terminal_and_ctrl_c_stops_it(tmp_path: Path, port: int) -> None:
+    with served(tmp_path, port) as (serving, settings):
+        code, seen = asked(settings, "peers", "--mesh")
+        [row] = seen["peers"]
+        assert (code, row["peer_id"], row["type"], row["sim_robots"]) == (0, "arm-1", "sim", ["so100"])
+        serving.send_signal(signal.SIGINT)
+        rest = serving.communicate(timeout=15)[0]
+        assert json.loads(rest.splitlines()[0])["stopped"] is True
+
+
+def test_a_served_arm_is_stopped_locked_and_freed_from_another_terminal(tmp_path: Path, port: int) -> None:
+    with served(tmp_path, port) as (_, settings):
+        assert asked(settings, "stop", "arm-1", "--mesh")[1]["stopped"] is True
+        code, told = asked(settings, "estop", "--mesh")
+        assert (code, told["stopped"], list(told["robots"])) == (0, True, ["arm-1"])
+        kept = json.loads((tmp_path / "state" / "lockouts.json").read_text())["robots"]
+        assert [each["name"] for each in kept.values()] == ["arm-1"]
+        assert asked(settings, "resume", "--local", "arm-1")[0] == 0
+        assert (
+            json.loads((tmp_path / "state" / "lockouts.json").read_text())["robots"]["simulation:arm-1"]["holds"] == []
+        )
+
+
+def test_a_stop_that_nobody_answers_is_no_success(tmp_path: Path, port: int) -> None:
+    settings = {**os.environ, "STRANDS_MESH_PORT": str(port), "STRANDS_STATE_DIR": str(tmp_path)}
+    code, told = asked(settings, "estop", "--mesh")
+    assert (code, told["stopped"]) == (3, None)
+
+
+@pytest.mark.parametrize("command", [["serve", "so100"], ["peers"], ["stop", "--all"], ["estop"]])
+def test_a_network_flag_that_the_mesh_has_no_use_for_is_refused(command: list[str]) -> None:
+    ended = CliRunner().invoke(build(), [*command, "--mesh", "--nats", "nats://127.0.0.1:4222"])
+    assert ended.exit_code == 2
+    assert "--mesh takes no network flag but --port" in ended.output
 
 
 def test_keys_are_made_issued_and_named_for_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ that says in its name what it is.
 from __future__ import annotations
 
 import logging
+import secrets
 import stat
 from dataclasses import dataclass
 from ipaddress import ip_address
@@ -159,3 +160,16 @@ def _access_control() -> str | None:
     if path.stat().st_size > ACL_MAX_BYTES:
         raise TransportError(f"STRANDS_MESH_ACL_FILE: {path} is above {ACL_MAX_BYTES // 1024} KiB.")
     return path.read_text(encoding="utf-8")
+
+
+def visitor_id(word: str) -> str:
+    """A fresh id for a short stay on the mesh, which the certificate speaks for where there is one.
+
+    Raises:
+        TransportError: the certificate's settings name files that cannot be used.
+        IdentityError: the certificate cannot be read.
+    """
+    from strands_robots.mesh.wire_identity import Signer  # noqa: PLC0415 - needs cryptography, and only with a certificate
+
+    own, files = f"{word}-{secrets.token_hex(4)}", credentials_from_settings()
+    return own if files is None else f"{Signer(files.cert, files.key).common_name}__{own}"
