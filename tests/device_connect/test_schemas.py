@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
+from strands_robots.device_connect.declare import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 
@@ -70,3 +71,19 @@ def test_reads_and_writes_are_labelled() -> None:
         for function in driver.functions:
             reads = function.name.startswith("get")
             assert function.labels["direction"] == ("read" if reads else "write"), function.name
+
+
+def test_a_fleet_of_one_class_says_the_same_and_a_subclass_says_its_own() -> None:
+    class Wider(RobotDeviceDriver):
+        """A robot of two more words."""
+
+        @rpc()
+        async def greet(self) -> dict[str, Any]:
+            """Say hello."""
+            return {"status": "success"}
+
+    first, second, wider = RobotDeviceDriver(ToyRobot()), RobotDeviceDriver(ToyRobot()), Wider(ToyRobot())
+    first.functions.clear()
+    assert second.functions == DRIVERS[0].functions
+    assert second.events == DRIVERS[0].events
+    assert {f.name for f in wider.functions} - {f.name for f in second.functions} == {"greet"}

@@ -66,9 +66,7 @@ class Network:
             ValidationError: the port is none.
         """
         if any(getattr(self, each.name) for each in fields(self) if each.name != "port"):
-            raise Failure(
-                "--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE
-            )
+            raise Failure("--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE)
         if self.port is not None:
             settings.put("STRANDS_MESH_PORT", str(port("--port", self.port)))
 

@@ -10,9 +10,10 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from device_connect_edge.drivers import DeviceDriver
-from device_connect_edge.types import DeviceStatus
+from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
 from strands_robots.contract import RolloutEvent, TaskRobot, Unsubscribe, WorldRobot
@@ -26,6 +27,9 @@ READ_DEADLINE_S = 5.0
 """Seconds in which a robot has to have answered a read."""
 
 READS_AT_ONCE = 4
+
+_FUNCTIONS: WeakKeyDictionary[type, tuple[FunctionDef, ...]] = WeakKeyDictionary()
+_EVENTS: WeakKeyDictionary[type, tuple[EventDef, ...]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +70,20 @@ class LiveDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no ty
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit what belongs to ``event``."""
         raise NotImplementedError
+
+    @property
+    def functions(self) -> list[FunctionDef]:
+        """What can be called; read off a class once, not for each robot of a fleet."""
+        if type(self) not in _FUNCTIONS:
+            _FUNCTIONS[type(self)] = tuple(super().functions)
+        return list(_FUNCTIONS[type(self)])
+
+    @property
+    def events(self) -> list[EventDef]:
+        """What can be heard; read off a class once, too."""
+        if type(self) not in _EVENTS:
+            _EVENTS[type(self)] = tuple(super().events)
+        return list(_EVENTS[type(self)])
 
     @property
     def status(self) -> DeviceStatus:
