@@ -49,7 +49,7 @@ MOTION = frozenset({"execute", "start", "step", "reset", "teleop_receive"})
 """Actions that move metal: the motion gate asks for attribution and the operator's approval."""
 
 CHANGING = MOTION | {"stop", "teleop_stop", "resume"}
-"""Actions that change something: each turn of them is carried out once."""
+"""Actions that change something, each on record. A turn of them is carried out once; one of STOP_FIELDS each time."""
 
 ANSWERED_WHILE_LOCKED = frozenset(
     {"status", "ping", "resume", "stop", "state", "features", "teleop_status", "teleop_stop"}
