@@ -12,13 +12,15 @@ from strands_robots.bus_access import read_joints
 from strands_robots.contract import RolloutEvent, TaskRobot, WorldRobot, adapt
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mesh.security import policy_host_refusal
-from strands_robots.safety.stopping import StopVerdict, explain, grade
+from strands_robots.safety.halting import verdict_of
+from strands_robots.safety.stopping import StopVerdict
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.05
 EXECUTE_GRACE_S = 10.0
 TOLD_S = 0.5
+HALT = "stop over the mesh"
 POLICY_FIELDS = (
     "policy_port",
     "policy_host",
@@ -75,26 +77,21 @@ class Dispatcher:
         robot = self._robot
         if robot is None:
             return {"ok": True, "stopped": [], "not_stopped": [], "results": {}}
-        if robot_name and isinstance(robot, WorldRobot):
-            return self._stop_one(robot, robot_name)
-        return told(self._halt("stop over the mesh"))
+        name = self.meant(robot_name or "")
+        if isinstance(name, dict):
+            return name
+        return told(stop_one(robot, name) if name and isinstance(robot, WorldRobot) else self._halt(HALT))
 
-    @staticmethod
-    def _stop_one(world: WorldRobot, name: str) -> dict[str, Any]:
-        if name not in world.list_robots():
-            known = ", ".join(world.list_robots()) or "none"
-            return told(StopVerdict(not_stopped={name: f"there is no robot of this name; there are {known}"}))
-        answer: object
-        try:
-            answer = world.stop_policy(name)
-        except Exception as exc:  # noqa: BLE001 - whatever a stop raises is graded
-            answer = exc
-        outcome = grade(answer)
-        if outcome.stopped:
-            return told(StopVerdict(halted=(name,)))
-        if outcome.stopped is None:
-            return told(StopVerdict(unknown={name: explain(answer)}))
-        return told(StopVerdict(not_stopped={name: explain(answer)}))
+    def meant(self, robot_name: str) -> str | dict[str, Any]:
+        """The robot that a stop means, empty for all there is; or the answer, where this world has none of the name."""
+        world = self._robot
+        if not robot_name or not isinstance(world, WorldRobot):
+            return ""
+        robots = world.list_robots()
+        if robot_name in robots:
+            return robot_name
+        known = ", ".join(robots) or "none"
+        return told(StopVerdict(not_stopped={robot_name: f"there is no robot of this name; there are {known}"}))
 
     def _status(self, robot: Robot, command: dict[str, Any]) -> Any:
         if not isinstance(robot, WorldRobot):
@@ -187,6 +184,11 @@ def _moving(robot: Robot, name: str | None) -> bool:
     if isinstance(robot, WorldRobot):
         return any(row.get("robot") == name for row in robot.list_policies_running())
     return str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
+
+
+def stop_one(world: WorldRobot, name: str) -> StopVerdict:
+    """Stop one robot of a world."""
+    return verdict_of(lambda: world.stop_policy(name), name)
 
 
 def told(verdict: StopVerdict) -> dict[str, Any]:

@@ -14,18 +14,23 @@ Answered = Callable[[StopVerdict], None]
 
 def halt_of(robot: Haltable, robot_id: str, reason: str) -> StopVerdict:
     """The robot's verdict on its own halt; whatever else it answers or raises is graded."""
+    return verdict_of(lambda: robot.halt(reason), robot_id)
+
+
+def verdict_of(stop: Callable[[], object], name: str) -> StopVerdict:
+    """What ``stop`` answers as a verdict on the one that is called ``name``; what it raises is graded too."""
     try:
-        answer: object = robot.halt(reason)
-    except Exception as exc:  # noqa: BLE001 - a halt that raises is a robot that may be moving, and is named so
+        answer = stop()
+    except Exception as exc:  # noqa: BLE001 - a stop that raises is a robot that may be moving, and is named so
         answer = exc
     if isinstance(answer, StopVerdict):
         return answer
     outcome = grade(answer)
     if outcome.stopped:
-        return StopVerdict((robot_id,))
+        return StopVerdict((name,))
     if outcome.stopped is None:
-        return StopVerdict(unknown={robot_id: explain(answer)})
-    return StopVerdict(not_stopped={robot_id: explain(answer)})
+        return StopVerdict(unknown={name: explain(answer)})
+    return StopVerdict(not_stopped={name: explain(answer)})
 
 
 class HaltWorker:
