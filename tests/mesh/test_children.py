@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+from typing import Any
+
 import pytest
 from fixtures.mesh_robots import World
+from fixtures.toy_robots import ToyWorld
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
+from strands_robots.envelope import Envelope, success
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.transport.memory import MemoryTransport
 
@@ -41,6 +46,100 @@ def test_the_stop_of_a_child_stops_its_robot_alone(peers: Fleet) -> None:
     stopped = console.send("sim-1__left", {"action": "stop"}, timeout=5)["result"]
     assert (stopped["ok"], stopped["stopped"]) == (True, ["left"])
     assert world.running == {"right": "wave"}
+
+
+class Led(World):
+    """A world that takes actions; while its bus is held, an action waits for it."""
+
+    def __init__(self, *names: str) -> None:
+        super().__init__(*names)
+        self.asked, self.free = threading.Semaphore(0), threading.Event()
+        self.free.set()
+        self.sent: list[bool] = []
+
+    def send_action(self, action: dict[str, float]) -> Envelope:
+        self.asked.release()
+        self.free.wait(10)
+        refusal = self.gate.refusal("send_action")
+        self.sent.append(refusal is None)
+        return refusal or success("sent")
+
+    def step(self, n: int = 1) -> Envelope:
+        self.asked.release()
+        self.free.wait(10)
+        return super().step(n)
+
+
+def test_the_stop_of_a_child_ends_the_streams_that_drive_its_world(peers: Fleet) -> None:
+    world = Led("left", "right")
+    _, console, lead = peers.join(world, "sim-1", "sim"), peers.join(None, "console"), peers.join(None, "lead")
+    eventually(lambda: "sim-1__left" in console.peers_by_id, within=3)
+    receive = {"action": "teleop_receive", "source_peer_id": "lead"}
+    assert console.send("sim-1", receive, timeout=5)["result"]["status"] == "success"
+
+    def lead_on(sequence: int) -> None:
+        frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": sequence}
+        lead.publish("strands/lead/input/leader", {**frame, "action": {"pan": 1.0}, "events": None})
+
+    lead_on(1)
+    eventually(lambda: world.sent == [True], within=2)
+    world.free.clear()
+    lead_on(2)
+    assert world.asked.acquire(timeout=2)
+    assert world.asked.acquire(timeout=2)
+    assert console.send("sim-1__left", {"action": "stop"}, timeout=5)["result"]["ok"] is True
+    assert console.send("sim-1", {"action": "teleop_status"}, timeout=5)["result"]["streams"] == []
+    lead_on(3)
+    world.free.set()
+    eventually(lambda: world.sent == [True, False], within=2, what="the frame that waited for the bus to be refused")
+
+
+@pytest.mark.parametrize("stopped", ["sim-1__left", "sim-1"])
+def test_the_stop_of_one_robot_reaches_its_starts_in_line_wherever_they_were_asked_for(
+    peers: Fleet, stopped: str
+) -> None:
+    world = Led("left", "right")
+    mesh, console = peers.join(world, "sim-1", "sim"), peers.join(None, "console")
+    eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id), within=3)
+    world.free.clear()
+    answers: dict[str, Any] = {}
+
+    def ask(name: str, peer: str, command: dict[str, Any]) -> threading.Thread:
+        thread = threading.Thread(target=lambda: answers.update({name: console.send(peer, command, timeout=9)}))
+        thread.start()
+        return thread
+
+    threads = [ask(f"step-{n}", "sim-1", {"action": "step", "steps": 1}) for n in range(4)]
+    assert all(world.asked.acquire(timeout=5) for _ in threads)
+    threads += [ask(name, f"sim-1__{name}", START) for name in ("left", "right")]
+    threads.append(ask("by name", "sim-1", {**START, "robot_name": "left"}))
+    eventually(lambda: mesh._assembled.lanes.commands._queue.qsize() == 3)
+    stop = {"action": "stop", **({"robot_name": "left"} if stopped == "sim-1" else {})}
+    assert console.send(stopped, stop, timeout=5)["result"]["ok"] is True
+    world.free.set()
+    for thread in threads:
+        thread.join(9)
+    assert [answers[name]["result"]["status"] for name in ("left", "by name", "right")] == ["error", "error", "success"]
+    assert list(world.running) == ["right"]
+
+
+def test_a_fleets_stop_of_one_name_leaves_the_robots_of_others_alone(peers: Fleet) -> None:
+    world = ToyWorld()
+    peers.join(world, "sim-1", "sim")
+    console = peers.join(None, "console")
+    eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id), within=3)
+    for name in ("left", "right"):
+        console.send(f"sim-1__{name}", START, timeout=5)
+    answers = console.broadcast({"action": "stop", "robot_name": "right"}, 0.5)
+    assert {each["responder_id"]: each["result"]["ok"] for each in answers} == {
+        "sim-1": True,
+        "sim-1__left": False,
+        "sim-1__right": True,
+    }
+    eventually(lambda: [row["robot"] for row in world.list_policies_running()] == ["left"], within=2)
+    steps = world.rollouts["left"].steps
+    eventually(lambda: world.rollouts["left"].steps > steps + 5, within=2)
+    world.close()
 
 
 @pytest.mark.parametrize("action", ["step", "reset", "teleop_status"])

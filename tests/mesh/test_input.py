@@ -131,9 +131,18 @@ def test_a_locked_follower_opens_no_stream_and_an_open_one_ends(stream: Stream) 
 
 def test_a_halt_ends_a_stream_without_locking(stream: Stream) -> None:
     stream.arm.halt("by hand")
+    assert stream.receiver.stats["running"] is False
     stream.send()
-    eventually(lambda: stream.receiver.stats["running"] is False, within=2)
+    eventually(lambda: stream.stat("rejected_lockout")() == 1, within=2)
     assert stream.arm.actions == []
+
+
+def test_a_stream_that_a_halt_ended_opens_again_when_asked(stream: Stream) -> None:
+    stream.arm.halt("by hand")
+    stream.receiver.start()
+    assert stream.receiver.running
+    stream.send()
+    eventually(lambda: stream.arm.actions, within=2)
 
 
 def test_another_session_on_the_leaders_topic_moves_nothing(stream: Stream) -> None:

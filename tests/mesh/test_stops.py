@@ -14,8 +14,9 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope, success
+from strands_robots.mesh import teleop
 from strands_robots.mesh.executor import Lane
-from strands_robots.mesh.stops import EACH, MOST, Stops
+from strands_robots.mesh.stops import EACH, MOST, Stops, Tell
 from strands_robots.safety.stopping import StopVerdict
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 30.0}
@@ -53,6 +54,29 @@ def test_a_stop_does_not_wait_for_a_stream_whose_frame_hangs(peers: Fleet, monke
     arm.let_go.set()
     asking.join(8)
     assert answers[0]["result"]["ok"] is True
+
+
+def test_a_stop_is_answered_while_the_frames_of_every_stream_hang(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
+    monkeypatch.setattr(teleop, "JOIN_S", 0.1)
+    arm = Hanging()
+    peers.join(arm, "arm-1")
+    console, leader = peers.join(None, "console"), peers.join(None, "lead")
+    for device in ("leader", "pedal"):
+        receive = {"action": "teleop_receive", "source_peer_id": "lead", "device_name": device}
+        assert console.send("arm-1", receive, timeout=5)["result"]["status"] == "success"
+        frame = {"peer_id": "lead", "device": device, "method": "arm", "t": peers.clock(), "seq": 1}
+        leader.publish(f"strands/lead/input/{device}", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+        assert arm.inside.wait(5)
+        arm.inside.clear()
+    # Waiting for a frame of one stream takes 2 s where it is done before the answer.
+    assert console.send("arm-1", {"action": "stop"}, timeout=1.5)["result"]["ok"] is True
+    assert console.send("arm-1", {"action": "teleop_status"}, timeout=5)["result"]["streams"] == []
+    assert console.send("arm-1", {"action": "stop"}, timeout=1.5)["result"]["ok"] is True
+    eventually(lambda: sum("still being applied" in each.getMessage() for each in caplog.records) == 2, within=5)
+    arm.let_go.set()
 
 
 class Slow(World):
@@ -114,12 +138,13 @@ def test_no_stop_of_a_flood_is_refused_and_an_honest_one_gets_its_verdict(peers:
 def test_a_flood_under_many_names_keeps_its_bound_and_the_fleet_stop() -> None:
     lane, halted, begun, let_go = Lane("stops", 1, 2), Counter[str](), threading.Event(), threading.Event()
 
-    def halt(robot: str, askers: list[tuple[str, str]]) -> None:
+    def halt(robot: str) -> Tell:
         begun.set()
         let_go.wait(10)
-        halted[robot] += len(askers)
+        return lambda askers: halted.update({robot: len(askers)})
 
-    stops = Stops(lane, halt)
+    answers = Lane("answers", 1, MOST * 2)
+    stops = Stops(lane, answers, halt)
     stops.add("", "first", "t")
     assert begun.wait(5)
     stops.add("", "console", "t")
@@ -132,6 +157,91 @@ def test_a_flood_under_many_names_keeps_its_bound_and_the_fleet_stop() -> None:
     assert stops.unanswered >= 500
     lane.stop(2)
     assert stops.add("", "late", "t") is False
+    answers.stop(2)
+
+
+def test_a_stop_that_lost_its_answer_to_a_flood_is_carried_out_all_the_same() -> None:
+    lane, answers, begun, let_go = Lane("stops", 1, 2), Lane("answers", 1, 8), threading.Event(), threading.Event()
+    halted: list[str] = []
+
+    def halt(robot: str) -> Tell:
+        begun.set()
+        let_go.wait(10)
+        halted.append(robot)
+        return lambda askers: None
+
+    stops = Stops(lane, answers, halt)
+    stops.add("", "first", "t")
+    assert begun.wait(5)
+    stops.add("left", "one", "t0")
+    for turn in range(EACH):
+        stops.add("right", "one", f"t{turn + 1}")
+    let_go.set()
+    eventually(lambda: halted == ["", "left", "right"], within=5)
+    eventually(lambda: len(stops) == 0, within=5)
+    assert stops.unanswered == 1
+    assert (lane.stop(2), answers.stop(2)) == ([], [])
+
+
+def test_the_next_halt_waits_for_no_answer_to_the_one_before() -> None:
+    lane, answers, let_go = Lane("stops", 1, 2), Lane("answers", 1, 8), threading.Event()
+    halted: list[str] = []
+    told: list[tuple[str, str]] = []
+
+    def halt(robot: str) -> Tell:
+        halted.append(robot)
+        return lambda askers: told.extend(askers if let_go.wait(10) else [])
+
+    stops = Stops(lane, answers, halt)
+    for robot in ("", "left", "right"):
+        stops.add(robot, "console", robot)
+    eventually(lambda: halted == ["", "left", "right"], within=5)
+    assert told == []
+    assert len(stops) == 3
+    let_go.set()
+    eventually(lambda: len(stops) == 0, within=5)
+    assert [turn for _, turn in told] == ["", "left", "right"]
+    assert (lane.stop(2), answers.stop(2)) == ([], [])
+
+
+def test_names_that_nobody_bears_stand_in_no_line(peers: Fleet) -> None:
+    world, arm = Slow("left", "right"), Arm()
+    for robot, name in ((world, "sim-1"), (arm, "arm-1")):
+        peers.join(robot, name, "sim")
+    console, flood = peers.join(None, "console"), peers.stranger()
+    said: list[dict[str, Any]] = []
+    flood.declare_subscriber("strands/flood/response/sim-1/*", lambda each: said.append(json.loads(each.payload)))
+    asking = threading.Thread(target=lambda: console.send("sim-1", {"action": "stop"}, timeout=9))
+    asking.start()
+    assert world.halting.acquire(timeout=5)
+    for turn in range(500):
+        command = {"action": "stop", "robot_name": f"robot-{turn}"}
+        for name in ("sim-1", "arm-1"):
+            flood.put(f"strands/{name}/cmd", {"sender_id": "flood", "turn_id": f"t{turn}", "command": command})
+    assert len(said) == 500, "an unknown name is answered while a halt is carried out"
+    assert said[0]["result"]["ok"] is False
+    assert "there are left, right" in said[0]["result"]["error"]
+    assert list(peers.meshes[0]._assembled.server._stops._waiting) == []
+    assert set(peers.meshes[1]._assembled.server._stops._waiting) <= {""}
+    world.let_go.set()
+    asking.join(9)
+    assert world.halts == 1
+    assert console.send("arm-1", {"action": "stop", "robot_name": "whatever"}, timeout=5)["result"]["ok"] is True
+
+
+def test_a_stop_that_did_not_stop_is_refused_on_record_and_told_at_critical(
+    peers: Fleet, caplog: pytest.LogCaptureFixture
+) -> None:
+    peers.join(Arm("gripper", stops=False), "arm-1")
+    console = peers.join(None, "console")
+    assert console.send("arm-1", {"action": "stop"}, timeout=5)["result"]["ok"] is False
+    eventually(lambda: peers.events("command_refused"), within=2)
+    assert "gripper: the brake is stuck" in peers.events("command_refused")[0]["reason"]
+    assert peers.events("command_executed") == []
+    loud = [record.getMessage() for record in caplog.records if record.levelname == "CRITICAL"]
+    assert len(loud) == 1
+    assert "arm-1" in loud[0]
+    assert "gripper: the brake is stuck" in loud[0]
 
 
 def test_the_stop_of_one_robot_reaches_its_start_that_stands_in_line(peers: Fleet) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,7 @@ from strands_robots.mesh.serving import Line, MotionDoor, Server
 from strands_robots.mesh.state import StateReader
 from strands_robots.mesh.stream import StepFeed
 from strands_robots.mesh.subscriptions import Subscriptions
-from strands_robots.mesh.teleop import TeleopDesk
+from strands_robots.mesh.teleop import TeleopDesk, join
 from strands_robots.mesh.transport.base import Transport
 from strands_robots.mesh.transport.posture import Posture, credentials_from_settings
 from strands_robots.mesh.wire_identity import Identity, demanded, from_settings
@@ -136,7 +137,7 @@ class Assembled:
     def end(self, timeout: float) -> None:
         """Stop what publishes, then what hears, then the workers."""
         deadline = time.monotonic() + timeout
-        self.teleop.close()
+        streams = self.teleop.close()
         alive = self.scheduler.stop(max(0.0, deadline - time.monotonic()))
         alive += self.sensors.stop(max(0.0, deadline - time.monotonic()))
         alive += self.steps.stop(max(0.0, deadline - time.monotonic()))
@@ -151,6 +152,7 @@ class Assembled:
             each.undeclare()
         self.held = []
         alive += self.lanes.stop(max(0.0, deadline - time.monotonic()))
+        alive += join(streams, max(0.0, deadline - time.monotonic()))
         self.context.transport = None
         self.context.audit.close()
         if alive:
@@ -187,7 +189,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
     caller = Caller(context)
     safety = FleetSafety(context, door, caller, lanes.resumes, robot=robot is not None)
-    teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, _body(robot), source, device))
+    teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, _body(robot), source, device), lanes)
     inputs: dict[str, dict[str, Any]] = {}
 
     def halt(reason: str) -> StopVerdict:
@@ -203,11 +205,8 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     }
 
     def dispatch(command: dict[str, Any]) -> Any:
-        answer = (desk.get(command["action"]) or dispatcher)(command)
-        if command["action"] == "stop":
-            # After the halt, which voids their permits: it must not wait for a frame that a slow bus still takes.
-            teleop.close()
-        return answer
+        with teleop.stopping() if command["action"] == "stop" else nullcontext():
+            return (desk.get(command["action"]) or dispatcher)(command)
 
     line = Line(None if robot is None else robot.gate)
     approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
@@ -226,9 +225,16 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
 
     children: Children | None = None
     if isinstance(robot, WorldRobot):
-        admit = safety.on_resume_command
         children = Children(
-            context, robot, lanes, kind=mesh.peer_type, locked=safety.locked, resume=admit, audit=recorder
+            context,
+            robot,
+            lanes,
+            kind=mesh.peer_type,
+            line=line,
+            teleop=teleop,
+            locked=safety.locked,
+            resume=safety.on_resume_command,
+            audit=recorder,
         )
     return Assembled(
         mesh=mesh,
@@ -237,7 +243,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         lanes=lanes,
         door=door,
         caller=caller,
-        server=Server(context, lanes, approval_door, safety.locked, dispatch, line=line),
+        server=Server(context, lanes, approval_door, safety.locked, dispatch, line=line, meant=dispatcher.meant),
         herald=Herald(context, mesh.peer_type, facts),
         safety=safety,
         state=StateReader(peer, robot, parts.clock),

@@ -16,13 +16,14 @@ from strands_robots.contract import Observer, Unsubscribe, WorldRobot
 from strands_robots.envelope import Envelope, error
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.dispatch import Dispatcher
+from strands_robots.mesh.dispatch import Dispatcher, stop_one
 from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.presence import Herald
 from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.serving import Line, MotionDoor, Server
+from strands_robots.mesh.teleop import TeleopDesk
 from strands_robots.mesh.transport.base import LiveTransport, Subscription, TransportError
-from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
+from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)
@@ -73,21 +74,7 @@ class OneRobot:
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop this robot alone."""
-        name = self.tool_name_str
-        if not self.list_robots():
-            return StopVerdict()
-        ran = bool(self.list_policies_running())
-        answer: object
-        try:
-            answer = self._world.stop_policy(name)
-        except Exception as exc:  # noqa: BLE001 - whatever a stop raises is graded
-            answer = exc
-        outcome = grade(answer)
-        if outcome is Outcome.STOPPED:
-            return StopVerdict(halted=(name,) if ran else ())
-        if outcome.stopped is None:
-            return StopVerdict(unknown={name: explain(answer)})
-        return StopVerdict(not_stopped={name: explain(answer)})
+        return stop_one(self._world, self.tool_name_str) if self.list_robots() else StopVerdict()
 
     def facts(self) -> dict[str, Any]:
         """What presence says of it."""
@@ -119,6 +106,8 @@ class Children:
 
     Args:
         context: the parent's.
+        line: where the parent's commands stand, and the children's with them.
+        teleop: the parent's input streams, which may drive any of the robots.
         locked: whether the parent's lockout holds.
         resume: admits an assertion at the parent.
     """
@@ -130,6 +119,8 @@ class Children:
         lanes: Lanes,
         *,
         kind: str,
+        line: Line,
+        teleop: TeleopDesk,
         locked: Callable[[], bool],
         resume: Resume,
         audit: Callable[[str], Recorder],
@@ -138,6 +129,8 @@ class Children:
         self._world = world
         self._lanes = lanes
         self._kind = kind
+        self._line = line
+        self._teleop = teleop
         self._locked = locked
         self._resume = resume
         self._audit = audit
@@ -194,12 +187,17 @@ class Children:
                 return self._resume(command["assertion"])
             if action == "ping":
                 return {}
+            if action == "stop":
+                with self._teleop.stopping():
+                    return dispatcher(command)
             if action.startswith("teleop_"):
                 return error(f"{action}: {name} is one robot of a world; ask {parent.peer_id}.")
             return dispatcher(command)
 
         door = MotionDoor(context, hardware=False)
-        server = Server(context, self._lanes, door, self._locked, dispatch, line=Line(robot.gate))
+        server = Server(
+            context, self._lanes, door, self._locked, dispatch, line=self._line.of(name), meant=dispatcher.meant
+        )
         held: list[Subscription] = []
         child = _Child(context, Herald(context, self._kind, robot.facts), held)
         held.append(transport.declare_subscriber(topics.command(peer), server.on_command))

@@ -105,10 +105,13 @@ class Lane:
 
 
 class Lanes:
-    """The lanes of one peer: commands (4 workers, 32 waiting), stops, relayed resumes, and delivery to its user."""
+    """The lanes of one peer: commands (4 workers, 32 waiting), stops, their answers, relayed resumes, and delivery to
+    its user."""
 
     def __init__(self, peer_id: str) -> None:
         self.stop_lane = Lane(f"{peer_id}-stop", 1, 128)
+        # As deep as there may be stops without an answer, each of which is a job at most.
+        self.answers = Lane(f"{peer_id}-answer", 1, 8192)
         self.resumes = Lane(f"{peer_id}-resume", 1, 64)
         self.commands = Lane(f"{peer_id}-command", 4, 32)
         self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)
@@ -116,6 +119,6 @@ class Lanes:
     def stop(self, timeout: float) -> list[str]:
         deadline = time.monotonic() + timeout
         alive: list[str] = []
-        for lane in (self.commands, self.delivery, self.resumes, self.stop_lane):
+        for lane in (self.commands, self.delivery, self.resumes, self.stop_lane, self.answers):
             alive += lane.stop(max(0.0, deadline - time.monotonic()))
         return alive

@@ -79,17 +79,19 @@ class InputReceiver:
 
     @property
     def running(self) -> bool:
-        return self._running
+        """Whether a frame may still move the robot; False from the stop on that voids it."""
+        return self._running and self._permit is not None and self._permit.valid
 
     @property
     def stats(self) -> dict[str, Any]:
         """Counters; ``rejected`` is the sum of the ``rejected_*``, each a guard that refused a frame."""
-        counts, elapsed = self._counts, (time.monotonic() if self._running else self._ended) - self._opened
+        running = self.running
+        counts, elapsed = self._counts, (self._ended or time.monotonic()) - self._opened
         rejections = {f"rejected_{why}": counts[why] for why in REJECTIONS}
         return {
             "source": self._source,
             "device": self._device,
-            "running": self._running,
+            "running": running,
             "frames_received": counts["received"],
             "errors": counts["errors"],
             "out_of_order": counts["out_of_order"],
@@ -102,8 +104,9 @@ class InputReceiver:
 
     def start(self) -> None:
         """Open the stream, bound to the leader's announced session; :attr:`start_refusal` says why it did not."""
-        if self._running:
+        if self.running:
             return
+        self.close()
         self.start_refusal = self._open()
         fields = {"device": self._device, "session": self._session}
         if self.start_refusal is not None:
@@ -115,11 +118,29 @@ class InputReceiver:
 
     def stop(self) -> dict[str, Any]:
         """Close the stream, wait at most 2 s for a frame that is being applied, and return the counters."""
-        self._close()
-        lane = self._lane
-        if lane is not None and lane.join(2.0):
-            logger.warning("%s: an action is still being applied.", self.topic)
+        self.close()
+        self.join(2.0)
         return self.stats
+
+    def void(self) -> None:
+        """Let no frame move the robot from now on; one flag, which waits for nothing."""
+        if self._permit is not None:
+            self._permit.withdraw()
+
+    def close(self) -> None:
+        """Hear no further frame; one that is being applied is not waited for."""
+        if self._running:
+            self._running, self._ended = False, time.monotonic()
+            self._mesh.unsubscribe(self._name)
+            if self._lane is not None:
+                self._lane.close()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the frame that a closed stream still applies; False, with a warning, when that is not done."""
+        if self._lane is None or not self._lane.join(timeout):
+            return True
+        logger.warning("%s: an action is still being applied.", self.topic)
+        return False
 
     def on_frame(self, sample: Sample) -> None:
         """A frame on the transport's thread: queued for the stream's own."""
@@ -139,7 +160,7 @@ class InputReceiver:
             return f"{self._source} has not announced itself from any session"
         gate = getattr(self._robot, "gate", None) or getattr(self._mesh.robot, "gate", None)
         try:
-            self._permit = gate.permit("teleop_receive") if isinstance(gate, MotionGate) else None
+            self._permit = (gate if isinstance(gate, MotionGate) else MotionGate()).permit("teleop_receive")
         except MotionRefused as refused:
             return str(refused)
         if self._mesh.lockout_epoch is not None:
@@ -148,7 +169,7 @@ class InputReceiver:
         self._tokens, self._refilled = BURST, time.monotonic()
         self._counts = Counter()
         self._lane = Lane(f"mesh-follow-{self._device}", 1, DEPTH, drop_oldest=True)
-        self._opened, self._running = time.monotonic(), True
+        self._opened, self._ended, self._running = time.monotonic(), 0.0, True
         if not self._mesh.listen(self.topic, self.on_frame, self._name):
             self._running, self._ended = False, time.monotonic()
             return "the mesh is not running"
@@ -158,24 +179,17 @@ class InputReceiver:
     def _name(self) -> str:
         return f"input:{self._source}/{self._device}"
 
-    def _close(self) -> None:
-        if self._running:
-            self._running, self._ended = False, time.monotonic()
-            self._mesh.unsubscribe(self._name)
-            if self._lane is not None:
-                self._lane.close()
-
     def _take(self, sample: Sample, heard: float) -> None:
         if not self._running:
             return
         permit = self._permit
         if self._mesh.lockout_epoch is not None or (permit is not None and not permit.valid):
             self._counts["lockout"] += 1
-            self._close()
+            self.close()
             return
         if time.monotonic() - self._opened > settings.number("STRANDS_MESH_INPUT_STREAM_TTL_S"):
             self._counts["expired"] += 1
-            self._close()
+            self.close()
             self._mesh.record("input_stream_expired", self._source, device=self._device)
             return
         try:

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -15,10 +16,11 @@ from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, STOP_FIELDS, validate_command
-from strands_robots.mesh.stops import Asker, Stops
+from strands_robots.mesh.stops import Asker, Stops, Tell
 from strands_robots.mesh.transport.base import Sample, TransportError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate
+from strands_robots.safety.stopping import Outcome, explain, grade
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
@@ -35,6 +37,9 @@ REPLAY_S = wire.FRESH_S + wire.AHEAD_S
 REPLAYS_MAX = 4096
 
 Dispatch = Callable[[dict[str, Any]], Any]
+
+Meant = Callable[[str], str | dict[str, Any]]
+"""The robot that a stop means by a name, empty for all there is; or the answer, where there is none of that name."""
 
 
 class Refused(Exception):  # noqa: N818 - a refusal, not a fault
@@ -111,8 +116,15 @@ class Line:
 
     def __init__(self, gate: MotionGate | None) -> None:
         self._gate = gate
+        self._robot = ""
         self._lock = threading.Lock()
         self._standing: WeakKeyDictionary[Asked, str] = WeakKeyDictionary()
+
+    def of(self, robot: str) -> Line:
+        """The same line, for the peer of one robot of a world: whatever comes there means this one."""
+        line = Line(self._gate)
+        line._robot, line._lock, line._standing = robot, self._lock, self._standing
+        return line
 
     def join(self, command: object) -> AbstractContextManager[None]:
         """Taken when a command arrives; entered on the thread and at the time that carries it out."""
@@ -120,12 +132,12 @@ class Line:
             return nullcontext()
         asked = self._gate.asked()
         with self._lock:
-            self._standing[asked] = _robot(command)
+            self._standing[asked] = self._robot or _robot(command)
         return self._gate.asked_at(asked)
 
     def stopped(self, command: object) -> None:
         """A stop that names one robot has arrived; what came before it for this robot, or for any, is void."""
-        name = _robot(command)
+        name = _robot(command) or self._robot
         with self._lock:
             for asked, whose in self._standing.items() if name else ():
                 if whose in (name, ""):
@@ -144,6 +156,7 @@ class Server:
         locked: whether the lockout holds this peer.
         dispatch: carries out a validated command and returns its result.
         line: where a command stands until its turn comes, so that a stop in between refuses it.
+        meant: what a stop means by a name; by default all there is.
     """
 
     def __init__(
@@ -155,6 +168,7 @@ class Server:
         dispatch: Dispatch,
         *,
         line: Line | None = None,
+        meant: Meant = lambda name: "",
     ) -> None:
         self._context = context
         self._lanes = lanes
@@ -163,7 +177,8 @@ class Server:
         self._dispatch = dispatch
         self._line = line or Line(None)
         self._replays = Replays(context.monotonic)
-        self._stops = Stops(lanes.stop_lane, self._halt)
+        self._meant = meant
+        self._stops = Stops(lanes.stop_lane, lanes.answers, self._halt)
 
     def on_command(self, sample: Sample) -> None:
         """A sample on our command topic or on the broadcast topic; returns at once."""
@@ -204,21 +219,38 @@ class Server:
         except Refused as refused:
             self._refuse(request, refused)
             return
-        if not self._stops.add(command.get("robot_name", ""), request.sender_id, request.turn_id):
-            self._context.audit("command_refused", request.sender_id, action="stop", reason=BUSY)
+        audit, asker = self._context.audit, (request.sender_id, request.turn_id)
+        try:
+            robot = self._meant(command.get("robot_name", ""))
+        except Exception:
+            logger.exception("%s: who is meant by a stop is not known; everything is stopped.", self._context.peer_id)
+            robot = ""
+        if isinstance(robot, dict):
+            self._reply(request, result=robot)
+            audit("command_refused", asker[0], action="stop", turn_id=asker[1], reason=explain(robot))
+        elif not self._stops.add(robot, *asker):
+            audit("command_refused", asker[0], action="stop", reason=BUSY)
             self._reply(request, error=BUSY)
 
-    def _halt(self, robot: str, askers: list[Asker]) -> None:
+    def _halt(self, robot: str) -> Tell:
         result, failed = None, ""
         try:
             result = self._dispatch({"action": "stop", **({"robot_name": robot} if robot else {})})
         except Exception:
             logger.exception("%s: a stop failed.", self._context.peer_id)
             failed = DISPATCH
-        event = "command_refused" if failed or is_error(result) else "command_executed"
+        return partial(self._tell, result, failed)
+
+    def _tell(self, result: Any, failed: str, askers: list[Asker]) -> None:
+        audit, event, fields = self._context.audit, "command_executed", {"action": "stop"}
+        if failed or grade(result) is not Outcome.STOPPED:
+            event, fields["reason"] = "command_refused", failed or explain(result)
+            logger.critical("%s was asked to stop over the mesh: %s.", self._context.peer_id, fields["reason"])
         for sender, turn in askers:
             self._answer(sender, turn, result=result, error=failed)
-            self._context.audit(event, sender, action="stop", turn_id=turn, **({"reason": failed} if failed else {}))
+            audit(event, sender, turn_id=turn, **fields)
+        if not askers:
+            audit(event, **fields)
 
     def _serve(self, request: wire.Request, sample: Sample) -> None:
         audit = self._context.audit

@@ -2,7 +2,8 @@
 
 A halt of a slow robot may last a second, and a flood brings a thousand stops meanwhile. Every stop that arrives while
 one is carried out is served by the next, which begins after it and whose verdict is therefore true for all of them.
-What is kept of a stop is who asked; one robot of a world is a line of its own.
+What is kept of a stop is who asked; one robot of a world is a line of its own. The answers are given on another lane:
+thousands of them hold up no halt.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from strands_robots.mesh.executor import Lane
 
@@ -19,22 +20,27 @@ logger = logging.getLogger(__name__)
 Asker = tuple[str, str]
 """Sender and turn."""
 
-Halt = Callable[[str, list[Asker]], None]
-"""Halts the robot of a name, or everything for the empty one, and answers those who asked."""
+Tell = Callable[[list[Asker]], None]
+"""Answers those who asked."""
+
+Halt = Callable[[str], Tell]
+"""Halts the robot of a name, or everything for the empty one; what is returned tells the verdict."""
 
 EACH = 256
 MOST = 4096
 
 
 class Stops:
-    """Stops that wait, by the robot that they name.
+    """Stops without an answer, by the robot that they name: in line, or carried out and about to be answered.
 
     Args:
         lane: whose worker halts. One job of it at a time is ours, one halt each, so that others come between.
+        answers: whose worker tells the verdicts.
     """
 
-    def __init__(self, lane: Lane, halt: Halt) -> None:
+    def __init__(self, lane: Lane, answers: Lane, halt: Halt) -> None:
         self._lane = lane
+        self._answers = answers
         self._halt = halt
         self._waiting: dict[str, dict[Asker, None]] = {}
         self._held: Counter[str] = Counter()
@@ -43,10 +49,10 @@ class Stops:
         self.unanswered = 0
 
     def add(self, robot: str, sender: str, turn: str) -> bool:
-        """Take a stop; False only when the lane is closed.
+        """Take a stop of a robot that there is, or of all for the empty name; False only when the lane is closed.
 
-        A sender beyond 256 waiting stops, and the one with the most of them beyond 4096 in all, loses the answer to its
-        oldest. The halt that it asked for comes all the same, unless it named one robot and nobody else asks for that.
+        A sender beyond 256 stops without an answer, and the one with the most in line beyond 4096 in all, loses the
+        answer to its oldest. The halt that it asked for comes all the same.
         """
         with self._lock:
             askers = self._waiting.setdefault(robot, {})
@@ -56,7 +62,8 @@ class Stops:
             if self._held[sender] > EACH:
                 self._shed(sender)
             elif self._held.total() > MOST:
-                self._shed(self._held.most_common(1)[0][0])
+                in_line = Counter(who for each in self._waiting.values() for who, _ in each)
+                self._shed(in_line.most_common(1)[0][0])
             begin, self._halting = not self._halting, True
         return not begin or self._lane.submit(self._run)
 
@@ -67,26 +74,37 @@ class Stops:
         with self._lock:
             robot = next(iter(self._waiting))
             askers = list(self._waiting.pop(robot))
-            self._held.subtract(sender for sender, _ in askers)
-            self._held = +self._held
+        told = False
         try:
-            self._halt(robot, askers)
+            tell = self._halt(robot)
+            told = self._answers.submit(lambda: self._answer(tell, askers))
         except Exception:
             logger.exception("A stop failed.")  # and the next one is carried out
         with self._lock:
+            if not told:
+                self._release(askers)
+                self.unanswered += len(askers)
             self._halting = bool(self._waiting)
             more = self._halting
         if more:
             self._lane.submit(self._run)
 
+    def _answer(self, tell: Tell, askers: list[Asker]) -> None:
+        try:
+            tell(askers)
+        finally:
+            with self._lock:
+                self._release(askers)
+
+    def _release(self, askers: Iterable[Asker]) -> None:
+        self._held.subtract(sender for sender, _ in askers)
+        self._held = +self._held
+
     def _shed(self, sender: str) -> None:
-        for robot, askers in self._waiting.items():
+        for askers in self._waiting.values():
             oldest = next((asker for asker in askers if asker[0] == sender), None)
-            if oldest is None:
-                continue
-            del askers[oldest]
-            self._held[sender] -= 1
-            self.unanswered += 1
-            if robot and not askers:
-                del self._waiting[robot]
-            return
+            if oldest is not None:
+                del askers[oldest]
+                self._release([oldest])
+                self.unanswered += 1
+                return

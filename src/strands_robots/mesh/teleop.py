@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.input_receiver import InputReceiver
 
 STREAMS_MAX = 8
+JOIN_S = 2.0
+
+Key = tuple[str, str]
 
 
 class TeleopDesk:
-    """Opens, tells and closes receivers; at most eight at once."""
+    """Opens, tells and closes receivers; at most eight at once.
 
-    def __init__(self, open_receiver: Callable[[str, str], InputReceiver]) -> None:
+    Args:
+        lanes: off the stop lane, ``answers`` closes what a stop has voided, and ``commands`` waits for it.
+    """
+
+    def __init__(self, open_receiver: Callable[[str, str], InputReceiver], lanes: Lanes) -> None:
         self._open = open_receiver
-        self._receivers: dict[tuple[str, str], InputReceiver] = {}
+        self._lanes = lanes
+        self._receivers: dict[Key, InputReceiver] = {}
         self._lock = threading.Lock()
 
     def receive(self, command: dict[str, Any]) -> Envelope:
         """Follow ``source_peer_id``'s device (``leader`` by default)."""
         key = (command["source_peer_id"], command.get("device_name", "leader"))
         with self._lock:
-            for old in [name for name, each in self._receivers.items() if not each.running]:
-                self._receivers.pop(old).stop()
+            self._end(lambda key, each: not each.running)
             if key in self._receivers:
                 return success(f"Already following {key[0]}/{key[1]}.", **self._receivers[key].stats)
             if len(self._receivers) >= STREAMS_MAX:
@@ -44,17 +54,49 @@ class TeleopDesk:
         return success(f"{sum(stream['running'] for stream in streams)} input streams run.", streams=streams)
 
     def stop(self, command: dict[str, Any]) -> Envelope:
-        """Close the named stream, or all of them."""
+        """Close the named stream, or all of them, and wait at most 2 s for the frames that are being applied."""
         source, device = command.get("source_peer_id"), command.get("device_name")
         with self._lock:
-            chosen = [
-                key
-                for key in self._receivers
-                if (source is None or key[0] == source) and (device is None or key[1] == device)
-            ]
-            streams = [self._receivers.pop(key).stop() for key in chosen]
-        return success(f"{len(streams)} input streams closed.", streams=streams)
+            ended = self._end(lambda key, _: source in (None, key[0]) and device in (None, key[1]))
+        join(ended, JOIN_S)
+        return success(f"{len(ended)} input streams closed.", streams=[each.stats for each in ended])
 
-    def close(self) -> None:
-        """Close all of them."""
-        self.stop({})
+    def close(self) -> list[InputReceiver]:
+        """Close all of them; those closed, to :func:`join`."""
+        with self._lock:
+            return self._end(lambda key, each: True)
+
+    @contextmanager
+    def stopping(self) -> Iterator[None]:
+        """Around a stop, of the robot or of one of a world's: no frame moves anything from its beginning on.
+
+        Voiding a stream waits for nothing, neither for the lock nor for a frame that a slow bus still takes.
+        """
+        for receiver in list(self._receivers.values()):
+            receiver.void()
+        try:
+            yield
+        finally:
+            self._lanes.answers.submit(self._reap)
+
+    def _reap(self) -> None:
+        with self._lock:
+            ended = self._end(lambda key, each: not each.running)
+
+        def wait() -> None:
+            join(ended, JOIN_S)
+
+        if ended:
+            self._lanes.commands.submit(wait)
+
+    def _end(self, chosen: Callable[[Key, InputReceiver], bool]) -> list[InputReceiver]:
+        ended = [self._receivers.pop(key) for key, each in list(self._receivers.items()) if chosen(key, each)]
+        for receiver in ended:
+            receiver.close()
+        return ended
+
+
+def join(closed: Iterable[InputReceiver], timeout: float) -> list[str]:
+    """Wait for the frames that closed streams still apply, ``timeout`` seconds in all; whose are not done by then."""
+    deadline = time.monotonic() + timeout
+    return [each.topic for each in closed if not each.join(max(0.0, deadline - time.monotonic()))]
