@@ -8,6 +8,7 @@ import pytest
 from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
+from tests.mesh.test_repeats import Strict
 
 from strands_robots.mesh import pursuit, safety
 from strands_robots.mesh.core import Mesh
@@ -87,3 +88,39 @@ def test_a_peer_that_is_heard_and_never_answers_is_given_up(
     ghost.put("strands/ghost/presence", {**heartbeat, "timestamp": peers.clock()})
     eventually(lambda: "is in reach and does not answer" in caplog.text, within=5)
     assert len(asked) == pursuit.TRIES
+
+
+def test_a_peer_that_comes_back_and_does_not_stop_is_named_once_and_asked_until_it_does(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pursuit, "EVERY_S", 0.05)
+    _, _, arm = cut_off(peers)
+    arm.stops = False
+    peers.bus.partition(peers.transports["arm-1"], cut=False)
+    peers.meet()
+    eventually(lambda: len(arm.halts) > pursuit.TRIES, within=5, what="it is asked on and on")
+    named = [line for line in caplog.records if line.levelname == "CRITICAL" and "did NOT stop" in line.message]
+    assert len(named) == 1
+    assert "the brake is stuck" in named[0].message
+    assert "has answered emergency stop" not in caplog.text
+    arm.stops = True
+    eventually(lambda: "has answered emergency stop" in caplog.text, within=3)
+
+
+def test_an_error_for_an_answer_is_no_stop(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pursuit, "EVERY_S", 0.05)
+    console = peers.join(None, "console")
+    faulty = Strict(peers, "faulty", 0.0, first={"type": "error", "error": "dispatch error"})
+    peers.bus.partition(faulty.wire)
+    peers.clock.pass_(1)
+    console.emergency_stop()
+    peers.clock.pass_(1)
+    assert faulty.turns == []
+    peers.bus.partition(faulty.wire, cut=False)
+    faulty.wire.put("strands/faulty/presence", {"robot_id": "faulty", "timestamp": peers.clock()})
+    eventually(lambda: "faulty was out of reach and has answered" in caplog.text, within=3)
+    faulty.join()
+    assert len(faulty.turns) == 2
+    assert any(line.levelname == "CRITICAL" and "dispatch error" in line.message for line in caplog.records)

@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -17,6 +17,7 @@ from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.security import validate_command
 from strands_robots.mesh.transport.base import PutConfirmed, Sample, TransportError
+from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.utils import ValidationError, number, shown
 
 logger = logging.getLogger(__name__)
@@ -257,6 +258,13 @@ class Caller:
         with self._lock:
             for turn_id in turn.ids:
                 self._turns.pop(turn_id, None)
+
+
+def stop_outcome(reply: Mapping[str, Any]) -> Outcome:
+    """What a raw reply to a ``stop`` says; only a peer's result can say stopped, and what is no reply is silence."""
+    if reply.get("type") == "response":
+        return grade(reply.get("result"))
+    return Outcome.RAISED if reply.get("type") == "error" else Outcome.TIMED_OUT
 
 
 def refused(why: str) -> Refusal:
