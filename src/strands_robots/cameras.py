@@ -71,7 +71,7 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
         frames = frames_of(robot)
         if frames is None or names is None:
             return frames
-        return lambda: {name: picture for name, picture in frames().items() if name in names}
+        return lambda: _only(frames(), names)
     features = robot.get_features()
     known = [str(name) for name in features.get("cameras", ())]
     own = [name for name in known if "/" in name] or [OVERVIEW]
@@ -80,6 +80,11 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
         if name not in known:
             raise ValidationError(f"camera must be one of {', '.join(known)}, not {shown(name)}.")
     return lambda: Shots({name.replace("/", "."): partial(render, name) for name in wanted})
+
+
+def _only(seen: Mapping[str, Any], names: Sequence[str]) -> Shots:
+    """Those of ``names``, each taken when it is asked for where ``seen`` takes it so."""
+    return Shots({name: partial(seen.__getitem__, name) for name in seen if name in names})
 
 
 def jpeg(name: str, pixels: Any) -> bytes:

@@ -117,6 +117,28 @@ def test_a_camera_that_fails_is_told_once_and_the_joints_go_on(arm: HardwareRobo
     assert events(path) == ["notRecorded"]
 
 
+def test_a_camera_that_fails_costs_the_ones_behind_it_nothing(arm: HardwareRobot, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    arm.device.cameras["wrist"] = Camera()
+    arm.device.cameras["front"].broken = True
+    with (
+        Recorder(path, joints_of_events=False) as recorder,
+        RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
+    ):
+        eventually(lambda: recorder.counts["/arm-1/notRecorded"] == 1)
+        eventually(lambda: recorder.counts["/arm-1/camera/wrist"] >= 15)
+    (told,) = [entry.payload for entry in read_entries(path) if entry.event == "notRecorded"]
+    assert told["what"] == "pictures of front"
+
+
+def test_only_the_chosen_cameras_are_looked_at(arm: HardwareRobot) -> None:
+    arm.device.cameras["wrist"] = Camera()
+    frames = chosen_frames(arm, ["wrist", "nowhere"])
+    assert frames is not None
+    assert {name: picture.shape for name, picture in frames().items()} == {"wrist": (24, 32, 3)}
+    assert arm.device.cameras["front"].looks == 0
+
+
 def test_a_world_records_each_of_its_robots(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     world = Simulation("bench")

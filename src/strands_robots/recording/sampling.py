@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Self
 
@@ -31,7 +31,8 @@ class RobotRecording:
     """Writes what a robot does to ``recorder`` while it is entered as a context.
 
     What cannot be read for half a second is told once in the log and once in the recording, as the event
-    ``notRecorded``, and is asked for again at every beat. A beat that is missed is left out.
+    ``notRecorded``, and is asked for again at every beat; a camera that fails costs no other its picture. A beat that
+    is missed is left out.
 
     Args:
         robot: behind the contract, or an object that :func:`~strands_robots.contract.adapt` makes fit.
@@ -95,16 +96,19 @@ class RobotRecording:
     def _paced(self, what: str, hz: float, work: Callable[[], None]) -> None:
         began, beat = time.monotonic(), 0
         while not self._ending.wait(max(0.0, began + beat / hz - time.monotonic())):
-            try:
-                work()
-            except Exception as exc:  # noqa: BLE001 - a robot's read raises what it likes; the recording goes on
-                self._note(what, f"{type(exc).__name__}: {exc}")
-            else:
-                self._failing.pop(what, None)
+            self._attempt(what, work)
             due = max(beat + 1, int((time.monotonic() - began) * hz))
             if due > beat + 1:
                 self.skipped[what] += due - beat - 1
             beat = due
+
+    def _attempt(self, what: str, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as exc:  # noqa: BLE001 - a robot's read raises what it likes; the recording goes on
+            self._note(what, f"{type(exc).__name__}: {exc}")
+        else:
+            self._failing.pop(what, None)
 
     def _joints(self) -> None:
         told = self._robot.get_state()
@@ -117,8 +121,12 @@ class RobotRecording:
         self._recorder.take_joints(self._device, numbers(told.get("joints") or {}))
 
     def _pictures(self) -> None:
-        for camera, pixels in self._frames().items() if self._frames is not None else ():
-            self._recorder.take_picture(self._device, camera, jpeg(camera, pixels))
+        seen = self._frames() if self._frames is not None else {}
+        for camera in seen:
+            self._attempt(f"pictures of {camera}", partial(self._picture, seen, camera))
+
+    def _picture(self, seen: Mapping[str, Any], camera: str) -> None:
+        self._recorder.take_picture(self._device, camera, jpeg(camera, seen[camera]))
 
     def _look(self) -> None:
         gate = self._robot.gate
