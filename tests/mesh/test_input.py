@@ -224,6 +224,19 @@ def test_the_first_frame_is_bounded_from_where_the_follower_stands(stream: Strea
     assert stream.arm.actions == [{"shoulder.pos": 11.0}]
 
 
+def test_no_frame_is_applied_while_the_follower_cannot_tell_its_joints_just_now(stream: Stream) -> None:
+    told = {"joints": {"shoulder.pos": 90.0}, "joints_error": "The bus was busy for 1 s."}
+    stream.arm.get_state = lambda: success("state", **told)  # type: ignore[method-assign]
+    for _ in range(2):
+        stream.send(action={"shoulder.pos": 90.0})
+    eventually(lambda: stream.stat("slew_rejected")() == 2, within=2)
+    told.update(joints={"shoulder.pos": 10.0}, joints_error="")
+    stream.send(action={"shoulder.pos": 90.0})
+    eventually(lambda: stream.stat("slew_rejected")() == 3, within=2)
+    stream.send(action={"shoulder.pos": 11.0})
+    eventually(lambda: stream.arm.actions == [{"shoulder.pos": 11.0}], within=2)
+
+
 def test_a_follower_that_cannot_tell_its_joints_is_led_all_the_same(stream: Stream) -> None:
     def unread() -> Any:
         raise ConnectionError("no status packet")

@@ -52,6 +52,27 @@ def test_the_limit_is_twice_full_scale_in_the_followers_units(arm: HardwareRobot
     assert joint_limits(object()) == {}
 
 
+def test_the_first_frame_of_a_simulation_is_bounded_from_where_its_robot_stands(
+    simulation: Simulation, peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_MESH_INPUT_SLEW_ABS", "10")
+    (joints,) = simulation.get_state()["robots"].values()
+    joint = simulation.get_features()["robots"]["so100"]["action_features"][0]
+    follower, leader = peers.join(simulation, "follower", "sim"), peers.stranger()
+    leader.put("strands/lead/presence", {"robot_id": "lead", "timestamp": peers.clock()})
+    receiver = InputReceiver(follower, simulation, "lead")
+    receiver.start()
+    frame: dict[str, Any] = {"peer_id": "lead", "device": "leader", "method": "arm", "events": None}
+    try:
+        for sequence, ahead in enumerate((1.0, 0.05)):
+            action = {joint: joints[joint] + ahead}
+            leader.put("strands/lead/input/leader", {**frame, "t": peers.clock(), "seq": sequence, "action": action})
+        eventually(lambda: receiver.stats["frames_received"] == 1, within=3)
+    finally:
+        receiver.stop()
+    assert (receiver.stats["slew_rejected"], receiver.stats["errors"]) == (1, 0)
+
+
 def test_a_value_beyond_its_joints_scale_moves_nothing(arm: HardwareRobot, peers: Fleet) -> None:
     follower, leader = peers.join(arm, "follower"), peers.stranger()
     leader.put("strands/lead/presence", {"robot_id": "lead", "timestamp": peers.clock()})

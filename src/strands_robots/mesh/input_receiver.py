@@ -255,8 +255,14 @@ class InputReceiver:
             return False
         if not self._seeded:
             # A leader that stands apart is let in when the slew bound would have brought the follower to it.
+            try:
+                present = present_joints(self._robot)
+            except ConnectionError as exc:
+                if not self._counts["slew"]:
+                    logger.warning("%s: nothing is applied until the follower's joints are read: %s", self.topic, exc)
+                return True
             self._seeded = True
-            self._last = {joint: (value, now) for joint, value in present_joints(self._robot).items()}
+            self._last = {joint: (value, now) for joint, value in present.items()}
         for joint, value in action.items():
             known = self._last.get(joint)
             if known is not None and abs(value - known[0]) > fastest * max(now - known[1], floor):
@@ -296,12 +302,21 @@ def joint_limits(robot: Any) -> dict[str, float]:
 
 
 def present_joints(robot: Any) -> dict[str, float]:
-    """Where the joints of a follower are, by name; empty where it does not tell them now."""
+    """Where the joints of a follower are, by name, of a world those of its first robot; empty where it cannot tell.
+
+    Raises:
+        ConnectionError: it can tell, but not now, as while its bus is busy.
+    """
     reader = getattr(robot, "get_state", None)
     try:
         state = reader() if callable(reader) else {"joints": read_joints(robot)}
     except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the first frame is then bounded by its range
         logger.warning("A follower's joints could not be read: %s: %s", type(exc).__name__, exc)
         return {}
-    joints = state.get("joints") if isinstance(state, Mapping) and "joints_error" not in state else None
+    if not isinstance(state, Mapping):
+        return {}
+    if state.get("joints_error"):
+        raise ConnectionError(state["joints_error"])
+    robots = state.get("robots")
+    joints = next(iter(robots.values()), None) if isinstance(robots, Mapping) else state.get("joints")
     return numbers(joints) if isinstance(joints, Mapping) else {}
