@@ -17,7 +17,9 @@ from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
 from strands_robots.mesh.presence import Herald
 from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.transport import bridge as bridges
 from strands_robots.mesh.transport.base import TransportError
+from strands_robots.mesh.transport.bridge import BridgeTransport
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity
 
@@ -211,6 +213,46 @@ def test_who_does_not_come_back_with_the_link_is_gone(monkeypatch: pytest.Monkey
     assert not reachable(registry)
     assert registry.conflicts("arm-1", "bb") is None
     herald.stop()
+
+
+class Late(MemoryTransport):
+    """A leg that connects when a test lets it."""
+
+    up = False
+
+    def connect(self) -> None:
+        if not self.up:
+            raise TransportError("not yet")
+        super().connect()
+
+
+def test_a_bridge_whose_local_leg_came_late_shows_who_is_alive_and_watches_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(bridges, "RETRY_S", 0.02)
+    bus, registry, shown = MemoryBus(), PeerRegistry(), list[tuple[str, bool]]()
+    late, other = Late(bus), MemoryTransport(bus)
+    both = BridgeTransport(late, MemoryTransport(MemoryBus(), sessionless=True))
+    both.connect()
+    other.connect()
+    other.watch_tokens(topics.token("*", "*"), lambda key, there: shown.append((key, there)))
+    registry.update("arm-1", "robot", "host", {}, session="aa")
+    context = Context("console", registry, Recorder("console"), Identity(), transport=both)
+    herald = Herald(context, "robot", dict)
+    herald.start()
+    herald.judge_tokens()
+    late.up = True
+    eventually(lambda: both.session_id, within=3)
+    for _ in range(2):
+        herald.judge_tokens()
+    assert shown == [(topics.token("console", str(both.session_id)), True)]
+    other.declare_token(topics.token("arm-1", "aa")).undeclare()
+    herald.judge_tokens(0.0)
+    assert not reachable(registry)
+    shown.clear()
+    herald.stop()
+    assert [there for _, there in shown] == [False]
+    both.close()
 
 
 def test_a_row_that_is_refreshed_without_a_session_keeps_the_living_peers_binding() -> None:

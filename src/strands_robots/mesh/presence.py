@@ -41,23 +41,29 @@ class Herald:
         self._trouble = ""
         self.described = threading.Event()
         self._leaving: dict[tuple[str, str], float] = {}
-        self._judged_later = False
+        self._judged_later = self._shown = False
         self._anchored_at: float | None = None
         self._held: list[Subscription] = []
         self._host = socket.gethostname()
 
     def start(self) -> None:
-        """Hear presence, and show and watch liveliness where the transport has it."""
+        """Hear presence, and show and watch liveliness where the transport has it, or as soon as it has."""
         transport = self._context.transport
         if transport is None:
             raise TransportError("the mesh is not running.")
         self._held.append(transport.declare_subscriber(topics.presence("*"), self.on_presence))
-        session = transport.session_id
-        if isinstance(transport, LiveTransport) and session is not None:
-            self._held.append(transport.declare_token(topics.token(self._context.peer_id, session)))
-            # Where a link can be lost, its loss and that of the tokens come in any order.
-            self._judged_later = hasattr(transport, "lost_link_at")
-            self._held.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
+        self._show()
+
+    def _show(self) -> None:
+        """Show our token and watch those of others, once there is a session: that of a bridge may come later."""
+        transport, session = self._context.transport, self._context.session_id()
+        if self._shown or session is None or transport is None or not isinstance(transport, LiveTransport):
+            return
+        self._shown = True
+        self._held.append(transport.declare_token(topics.token(self._context.peer_id, session)))
+        # Where a link can be lost, its loss and that of the tokens come in any order.
+        self._judged_later = hasattr(transport, "lost_link_at")
+        self._held.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
 
     def stop(self) -> None:
         held, self._held = self._held, []
@@ -148,6 +154,7 @@ class Herald:
         When a hub dies every token goes at once, and none of the sessions need have ended. Those that live show their
         tokens again on the next hub; what has not come back a while after our own link did is gone.
         """
+        self._show()
         now, transport = time.monotonic(), self._context.transport
         anchored, lost_link = getattr(transport, "anchored", None), getattr(transport, "lost_link_at", None)
         if callable(anchored) and not anchored():
