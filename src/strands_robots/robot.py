@@ -21,6 +21,9 @@ logger = logging.getLogger(__name__)
 
 _SIM_PACKAGES = ("mujoco", "numpy", "PIL")
 
+NO_SUCH_MODEL = "NO_SUCH_MODEL"
+"""The code of the refusal of a simulated robot whose model is not known, or cannot be had."""
+
 
 class Networked:
     """What :func:`Robot` adds to a robot: its place on the networks."""
@@ -175,7 +178,7 @@ def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any
     answer = simulation.add_robot(label, model=name)
     if is_error(answer):
         simulation.cleanup()
-        raise ValidationError(str(answer["reason"]))
+        raise ValidationError(str(answer["reason"]), NO_SUCH_MODEL)
     return simulation
 
 

@@ -45,3 +45,12 @@ def test_a_recording_is_replayed_to_no_device_of_device_connect(run: Run, tmp_pa
     reason = json.loads(result.stdout)["reason"]
     assert "'arm-1' is not known" in reason
     assert "mesh:PEER" in reason
+
+
+def test_an_option_that_is_refused_is_not_taken_for_an_unknown_follower(run: Run, tmp_path: Path) -> None:
+    write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
+    result = run("teleop", str(tmp_path / "run.csv"), "so100", "--publish", "safety", "--json")
+    assert result.exit_code == 2
+    reason = json.loads(result.stdout)["reason"]
+    assert "safety" in reason
+    assert "Device Connect" not in reason

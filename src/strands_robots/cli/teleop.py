@@ -176,13 +176,13 @@ def _follow(
 
 def _made(follower: str, options: dict[str, Any], **more: Any) -> Any:
     """The follower of this machine: ``TYPE@PORT``, or a model in simulation."""
-    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
+    from strands_robots.robot import NO_SUCH_MODEL, Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
     try:
         return Robot(kind, mode="real" if at else "sim", **more, **({**options, "port": port} if at else {}))
     except ValidationError as exc:
-        if at or "/" in kind or "." in kind:
+        if exc.code != NO_SUCH_MODEL or "/" in kind or "." in kind:
             raise
         far = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
         raise ValidationError(f"{exc} {far}") from exc
