@@ -14,7 +14,7 @@ PACKAGE = ROOT / "src" / "strands_robots"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 FLOORS: list[set[str]] = [
-    {"envelope", "settings", "utils", "agent_tool", "_mesh_switch"},
+    {"envelope", "settings", "utils", "quaternions", "agent_tool", "_mesh_switch"},
     {"safety", "audit", "contract"},
     {"policies", "rollout", "teleop", "teleop_mixin", "leaders", "recording", "cameras"},
     {

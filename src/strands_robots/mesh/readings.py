@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.envelope import is_error, text_of
+from strands_robots.quaternions import w_positive, yaw_of
 from strands_robots.utils import shown
 
 ENVELOPE_KEYS = ("status", "content")
@@ -46,8 +47,7 @@ def pose(fields: Mapping[str, Any] | None) -> dict[str, Any] | None:
         norm = math.sqrt(sum(value * value for value in quat))
         if len(quat) != 4 or not math.isfinite(norm) or norm == 0:
             return None
-        sign = -1.0 if quat[0] < 0 else 1.0
-        found["quat"] = [sign * value / norm for value in quat]
+        found["quat"] = [value / norm for value in w_positive(quat)]
     return found
 
 
@@ -85,9 +85,3 @@ def from_ros(message: Mapping[str, Any], source: str | None = None) -> dict[str,
     if not all(math.isfinite(value) for value in (x, y, z, yaw, *quat)):
         raise NoReadingError(f"{source or 'the message'} holds a pose that is no number")
     return {"x": x, "y": y, "z": z, "theta": yaw, "quat": quat, "source": source or "ros", "frame": frame or None}
-
-
-def yaw_of(quat: list[float]) -> float:
-    """Rotation about z, radians, of a quaternion w, x, y, z; it need not be normalised."""
-    w, x, y, z = quat
-    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from strands_robots.quaternions import w_positive, yaw_of
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.parts import RobotParts
 from strands_robots.simulation.physics import Snapshot
@@ -31,11 +32,8 @@ def base_pose(snapshot: Snapshot, robot: RobotParts) -> dict[str, Any]:
     else:
         plan = next(each for each in snapshot.stage.plan.robots if each.name == robot.name)
         position, quat = list(plan.position), [math.cos(plan.yaw / 2), 0.0, 0.0, math.sin(plan.yaw / 2)]
-    quat = [-value for value in quat] if quat[0] < 0 else quat
-    w, i, j, k = quat
-    yaw = math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
     x, y, z = position
-    return {"x": x, "y": y, "z": z, "theta": yaw, "quat": quat}
+    return {"x": x, "y": y, "z": z, "theta": yaw_of(quat), "quat": w_positive(quat)}
 
 
 def base_velocity(snapshot: Snapshot, robot: RobotParts) -> dict[str, list[float]]:
