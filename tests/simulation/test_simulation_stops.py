@@ -110,3 +110,34 @@ def test_a_locked_world_is_not_started_over(world: Simulation) -> None:
     world.gate.attach(Locked())
     assert world.create_world()["reason"] == "create_world is locked."
     assert world.list_robots() == ["left", "right"]
+
+
+def test_stopping_a_robot_on_its_way_to_a_single_target_freezes_it_and_no_other(world: Simulation) -> None:
+    for name in ("left", "right"):
+        world.send_action({"shoulder_pan": 1.0}, name)
+    world.step(50)
+    answer = world.stop_policy("left")
+    assert (answer["stopped"], answer["was_running"]) == (True, False)
+    where = world.get_observation("left")["shoulder_pan"]
+    assert world.body("left").targets["shoulder_pan"] == pytest.approx(where, abs=0.05)
+    assert world.body("right").targets["shoulder_pan"] == 1.0
+    world.step(1000)
+    assert world.get_observation("right")["shoulder_pan"] > 0.8
+    assert world.get_observation("left")["shoulder_pan"] < 0.8
+
+
+def test_an_action_that_was_overtaken_by_the_stop_of_its_robot_sets_nothing(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    idle = world._idle
+
+    def meanwhile(name: str) -> None:
+        idle(name)
+        monkeypatch.undo()
+        assert world.stop_policy("left")["stopped"] is True
+
+    for robot, status in (("left", "error"), ("right", "success")):
+        monkeypatch.setattr(world, "_idle", meanwhile)
+        answer = world.send_action({"shoulder_pan": 1.0}, robot)
+        assert answer["status"] == status
+        assert (world.body(robot).targets["shoulder_pan"] == 1.0) is (status == "success")

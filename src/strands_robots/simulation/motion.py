@@ -93,14 +93,17 @@ class Rollouts(Pictures, TeleopMixin):
     def stop_policy(self, robot_name: str) -> Envelope:
         """Stop what drives one robot, a policy or a leader, and freeze the robot where it is.
 
-        ``stopped`` is false if the loop outlived it. A policy or a leader that is still made ready never begins.
+        ``stopped`` is false if the loop outlived it. A policy or a leader that is still made ready never begins, and
+        targets that a single action has set are given up.
         """
         body = self.body(robot_name)
         self._waiting.void(body.name)
         self.void_leaders(body.name)
         rollout = self._running().get(body.name) or self.teleoperating().get(self.teleoperated_by(body.name))
         if rollout is None:
-            return success(f"{body.name} runs no policy.", robot=body.name, stopped=True, was_running=False)
+            # A single action goes on by itself: the servos run to its targets.
+            body.hold()
+            return success(f"{body.name} ran no policy; it is held.", robot=body.name, stopped=True, was_running=False)
         return self._stop(body, rollout, STOP_JOIN_S)
 
     def list_policies_running(self) -> list[dict[str, Any]]:

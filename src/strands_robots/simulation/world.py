@@ -71,11 +71,12 @@ class Simulation(Rollouts):
         self._open()
         body = self.body(robot_name)
         permit = self.gate.permit("send_action")
-        self._idle(body.name)
-        try:
-            sent = body.send_action(action, permit)
-        except PermitVoidError as void:
-            raise ValidationError(f"send_action was overtaken by a stop: {void}.") from None
+        with self._waiting.until_begun(permit, body.name):
+            self._idle(body.name)
+            try:
+                sent = body.send_action(action, permit)
+            except PermitVoidError as void:
+                raise ValidationError(f"send_action was overtaken by a stop: {void}.") from None
         return success(f"Sent {len(sent)} targets to {body.name}.", robot=body.name, sent=sent)
 
     @answered
