@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 from fixtures.ros_bases import TOPIC, FaultyLink, Lock, Made, memory, none_left, velocities
 from fixtures.waiting import eventually
 
-from strands_robots.ros.link import Heard, MemoryLink, Unwatch
+from strands_robots.ros.link import Heard, MemoryLink, RosError, Unwatch
 from strands_robots.safety.stopping import Outcome, grade
 
 
@@ -227,22 +229,17 @@ def test_a_base_that_rolls_on_did_not_stop_and_one_that_says_nothing_is_unknown(
     assert made(odom_topic="/odom").halt().stopped is None
 
 
-def test_a_stop_of_a_base_that_never_told_a_speed_says_what_was_done_and_what_nobody_knows(
+def test_a_stop_of_a_base_that_tells_no_speed_is_no_success_on_any_road(
     made: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
-    link = MemoryLink()
-    robot = made(link, odom_topic="/odom")
-    answer = robot.stop()
-    assert (answer["status"], answer["stopped"]) == ("success", None)
-    assert "never told a speed" in answer["content"][0]["text"]
-    assert grade(answer) is Outcome.UNKNOWN
-    assert grade(robot.halt()) is Outcome.UNKNOWN
-    monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 0.01)
-    still = {"linear": {"x": 0.0}, "angular": {"z": 0.0}}
-    link.publish("/odom", "nav_msgs/msg/Odometry", {"twist": {"twist": still}})
-    fallen_silent = robot.stop()
-    assert (fallen_silent["status"], fallen_silent["stopped"]) == ("error", None)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    robot = made(odom_topic="/odom")
+    tool = next(each for each in robot.tools if each.tool_name == "stop_rover")
+    for stop in (robot.stop, robot.stop_task, tool, lambda: robot.halt("stop").envelope()):
+        answer = stop()
+        assert (answer["status"], answer["stopped"]) == ("error", None)
+        assert "/odom says nothing" in answer["reason"]
+        assert grade(answer) is Outcome.UNKNOWN
 
 
 def test_a_stop_whose_zero_is_not_taken_is_an_error_also_of_a_base_that_never_told_a_speed(
@@ -289,3 +286,35 @@ def test_zeros_come_once_a_second_at_least_however_slow_the_rate(made: Made) -> 
     robot = made(link, publish_rate=1e-300)
     assert robot.halt().stopped
     eventually(lambda: len(link.sent) >= 2, within=4)
+
+
+class TwoWays(MemoryLink):
+    """A link with a second way, which is there or not."""
+
+    def __init__(self, second: type[Exception] | None = None) -> None:
+        super().__init__()
+        self.urgent: list[Mapping[str, Any]] = []
+        self._second = second
+
+    def prepare_urgent(self, topic: str, kind: str) -> None:
+        """It is ready."""
+
+    def publish_urgent(self, topic: str, kind: str, fields: Mapping[str, Any]) -> None:
+        if self._second is not None:
+            raise self._second("no second way")
+        self.urgent.append(fields)
+
+    def cut(self) -> None:
+        pytest.fail("nothing is clogged")
+
+
+@pytest.mark.parametrize(("second", "urgent", "behind"), [(None, 1, 0), (RosError, 0, 1), (RuntimeError, 0, 1)])
+def test_a_halt_that_gets_no_thread_sends_its_one_zero_by_whichever_way_there_is(
+    made: Made, monkeypatch: pytest.MonkeyPatch, second: type[Exception] | None, urgent: int, behind: int
+) -> None:
+    link = TwoWays(second)
+    robot = made(link)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", none_left)
+        assert robot.halt().stopped
+    assert (len(link.urgent), velocities(link)) == (urgent, [(0.0, 0.0)] * behind)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from fixtures.ros_bases import memory, none_left, velocities
 from fixtures.waiting import eventually
 
 from strands_robots.contract import TaskRobot
@@ -140,6 +141,23 @@ def test_a_goal_that_does_not_obey_its_cancel_is_lost_and_every_stop_asks_again(
     stack.obeys = True
     assert robot.halt("test").halted == ("navigation",)
     assert (robot.halt("test").stopped, stack.cancels) == (True, 3)
+
+
+def test_a_stop_that_gets_no_thread_to_ask_a_lost_goal_again_revokes_sends_its_zero_and_says_so(
+    made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, stack.obeys = made(), False
+    assert robot.navigate_to(1.0, 2.0, timeout=0.05)["goal_state"] == "lost"
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    permit = robot.gate.permit("drive")
+    before = len(velocities(memory(robot)))
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", none_left)
+        verdict = robot.halt("test")
+    assert not permit.valid
+    assert velocities(memory(robot))[before:] == [(0.0, 0.0)]
+    assert verdict.stopped is False
+    assert "was not asked again: can't start new thread" in verdict.not_stopped["navigation"]
 
 
 def test_a_stop_cancels_the_goal_and_says_so(made: Made, stack: Stack) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -24,20 +25,28 @@ class Behind:
         self._problem = ""
 
     def offer(self) -> float:
-        """Have a zero sent, unless one still waits for its turn: then for how many seconds it has."""
+        """Have a zero sent, unless one still waits for its turn: then for how many seconds it has.
+
+        Where no thread is to be had none is sent, which :meth:`confirm` makes good.
+        """
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
                 return time.monotonic() - self._began
             self._began = time.monotonic()
             self._problem = ""
-            self._thread = threading.Thread(target=self._run, name="hold-behind", daemon=True)
-            self._thread.start()
+            self._thread = None
+            thread = threading.Thread(target=self._run, name="hold-behind", daemon=True)
+            with contextlib.suppress(RuntimeError):  # the other way of the zero is still open, and needs no thread
+                thread.start()
+                self._thread = thread
             return 0.0
 
     def confirm(self, within_s: float) -> None:
-        """Wait until the zero is sent. Raises :class:`RosError` when it was not."""
+        """Wait until the zero is sent, or send the one that got no thread. Raises :class:`RosError` where it was not."""
         thread = self._thread
-        if thread is not None:
+        if thread is None:
+            self._run()
+        else:
             thread.join(within_s)
             if thread.is_alive():
                 raise RosError(f"the connection has not taken a zero within {within_s:g} s")

@@ -154,20 +154,10 @@ class MobileBaseRobot:
     def stop(self, tool_context: Any = None) -> Envelope:
         """Stop the base: a zero at once and more until it is still. Needs nobody's leave; the answer is the verdict.
 
-        Where the zero was taken and the odometry topic has never told a speed, the base is one that nobody measures:
-        a success with ``stopped`` None, which no grader takes for a base that stands.
+        It is the one that every network gives: where odometry is silent, an error with ``stopped`` None.
         """
         del tool_context
-        verdict = self.halt("stop")
-        told = verdict.envelope()
-        if verdict.stopped is not None or self._odometry.heard:
-            return told
-        fields = {name: told[name] for name in ("stopped", "halted", "not_stopped", "unknown", "elapsed_ms")}
-        return success(
-            f"A zero was taken, and more are sent; whether {self.tool_name_str} stands nobody knows, because "
-            f"{self._odometry.topic} has never told a speed.",
-            **fields,
-        )
+        return self.halt("stop").envelope()
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Void every permit, send zeros until the base is still, and say within the deadline what is known.

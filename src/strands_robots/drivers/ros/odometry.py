@@ -126,11 +126,6 @@ class Odometry:
         return self._still_in_a_row >= STILL_SAMPLES
 
     @property
-    def heard(self) -> bool:
-        """It has told a speed at some time."""
-        return self._speeds is not None
-
-    @property
     def last_speeds(self) -> tuple[float, float] | None:
         """Linear (m/s) and angular (rad/s) speed of the last usable sample."""
         return self._speeds

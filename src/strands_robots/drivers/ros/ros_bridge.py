@@ -142,10 +142,9 @@ class RosBridgedRobot(PosedBaseRobot):
         began = time.monotonic()
         going = self._navigation
         was_going = going is not None and going.doubt is not None
-        # Revoking the permits, the first thing there, is what cancels a goal that is waited for.
-        if going is not None and was_going and going.ended.is_set():
-            # One that nobody waits for any longer is asked again, beside the zeros: a broken link may hold this up.
-            threading.Thread(target=going.cancel_again, name=f"cancel-{self.node_name}", daemon=True).start()
+        # This is what cancels a goal that is waited for.
+        self.gate.revoke()
+        unasked = self._ask_again(going) if going is not None and was_going and going.ended.is_set() else ""
         verdict = super().halt(reason)
         if going is None or not was_going:
             return verdict
@@ -155,7 +154,7 @@ class RosBridgedRobot(PosedBaseRobot):
         spent = (time.monotonic() - began) * 1000
         if doubt is None:
             return replace(verdict, halted=(*verdict.halted, "navigation"), elapsed_ms=spent)
-        return replace(verdict, not_stopped={**verdict.not_stopped, "navigation": doubt}, elapsed_ms=spent)
+        return replace(verdict, not_stopped={**verdict.not_stopped, "navigation": doubt + unasked}, elapsed_ms=spent)
 
     def disconnect(self) -> None:
         """Cancel the navigation goal too, and give it a moment to end; see :meth:`MobileBaseRobot.disconnect`."""
@@ -221,6 +220,17 @@ class RosBridgedRobot(PosedBaseRobot):
             if not held:
                 self._slot.release()
         return going
+
+    def _ask_again(self, going: Navigation) -> str:
+        """Ask for the end of a goal that nobody waits for any longer; what to add to its doubt when that cannot be.
+
+        On a thread, because a broken link may hold it up; beside the zeros, because its stack may drive against them.
+        """
+        try:
+            threading.Thread(target=going.cancel_again, name=f"cancel-{self.node_name}", daemon=True).start()
+        except RuntimeError as exc:
+            return f"; its server was not asked again: {exc}"
+        return ""
 
     def _travel(self, going: Navigation) -> Envelope:
         self._observers.started(going)

@@ -70,7 +70,8 @@ class VelocityWire:
         self._clogged = clogged
         try:
             self._urgent.publish_urgent(self.topic, self.kind, self._zero)
-        except RosError:
+        except RuntimeError:
+            # A RosError; or the second way is not there, and no thread to make it.
             self._behind.confirm(CLOGGED_S)
 
     def _prepare(self, urgent: UrgentLink) -> None:
