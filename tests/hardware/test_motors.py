@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from fixtures.devices import RecordingDevice
+from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
 
@@ -92,4 +93,20 @@ def test_a_busy_bus_is_not_waited_for() -> None:
     assert "busy" in robot.get_health()["reason"]
     done.set()
     holder.join()
+    robot.cleanup()
+
+
+def test_a_read_of_temperatures_that_gets_the_bus_gives_it_to_a_stop_that_waits() -> None:
+    bus = Bus()
+    robot = connected(bus)
+    halter = threading.Thread(target=robot.halt)
+    # Re-entrant: the read below gets its turn while the stop waits for this one to end.
+    with robot.body().lock:
+        halter.start()
+        eventually(lambda: robot.body().stop_waits)
+        bus.silent = True
+        assert "A stop waits" in robot.get_health()["reason"]
+        bus.silent = False
+    halter.join()
+    assert "temps" in robot.get_health()
     robot.cleanup()

@@ -135,6 +135,8 @@ class HardwareRobot(Tasks):
         if not self._body.lock.acquire(timeout=1 / self.control_hz):
             return error("The bus was busy; the motors' temperatures are not known now.")
         try:
+            if self._body.stop_waits:
+                return error("A stop waits for the bus; the motors' temperatures are not known now.")
             temps = temperatures(self.device)
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
             return error(f"The motors' temperatures could not be read: {type(exc).__name__}: {exc}")
