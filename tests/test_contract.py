@@ -202,3 +202,84 @@ def test_a_foreign_robot_that_tells_its_state_is_not_read() -> None:
             return success("Told.", joints={"a": 1.0})
 
     assert adapt(Telling(), read_joints).get_state()["joints"] == {"a": 1.0}
+
+
+class Driven(Foreign):
+    """Drives its own bus, without our lock on it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.status = "idle"
+        self.reads = 0
+        self.during: list[Envelope] = []
+        self.network: TaskRobot | None = None
+
+    def get_task_status(self) -> Envelope:
+        return success("Told.", task_status=self.status)
+
+    def get_observation(self) -> dict[str, Any]:
+        self.reads += 1
+        return {"pan.pos": float(self.reads)}
+
+    def start_task(self, instruction: str, **options: Any) -> Envelope:
+        self._look()
+        self.status = "running"
+        return super().start_task(instruction, **options)
+
+    def stop_task(self) -> Any:
+        self.status = "stopped"
+        self._look()
+        return super().stop_task()
+
+    def _look(self) -> None:
+        assert self.network is not None
+        self.during.append(self.network.get_state())
+
+
+@pytest.mark.parametrize("stop", ["stop_task", "halt"])
+def test_a_foreign_robot_is_not_read_on_any_network_while_it_starts_runs_or_stops(stop: str) -> None:
+    foreign = Driven()
+    robot, foreign.network = adapt(foreign, read_joints), adapt(foreign, read_joints)
+    assert robot.get_state()["joints"] == {"pan.pos": 1.0}
+    robot.start_task("wave")
+    running = robot.get_state()
+    getattr(robot, stop)()
+    assert foreign.reads == 1
+    assert "its task runs" in running["joints_error"]
+    assert all("started or stopped" in each["joints_error"] for each in foreign.during)
+    for told in (running, *foreign.during):
+        assert told["joints"] == {"pan.pos": 1.0}, "those of the last read"
+        assert told["joints_age_s"] >= 0
+    after = robot.get_state()
+    assert after["joints"] == {"pan.pos": 2.0}
+    assert "joints_error" not in after
+
+
+def test_a_read_that_waited_for_another_looks_anew_at_what_the_robot_does() -> None:
+    foreign, entered, free = Driven(), threading.Event(), threading.Event()
+
+    def slow(robot: Any) -> dict[str, float]:
+        entered.set()
+        assert free.wait(5)
+        return read_joints(robot)
+
+    one, two = adapt(foreign, slow), adapt(foreign, read_joints)
+    told: list[Envelope] = []
+    threads = [threading.Thread(target=lambda each=each: told.append(each.get_state())) for each in (one, two)]
+    threads[0].start()
+    assert entered.wait(5)
+    threads[1].start()
+    foreign.status = "running"
+    free.set()
+    for thread in threads:
+        thread.join(5)
+    assert foreign.reads == 1
+    assert sorted("joints_error" in each for each in told) == [False, True]
+
+
+def test_a_foreign_robot_without_joints_has_none_that_could_be_old() -> None:
+    foreign = Foreign()
+    robot = adapt(foreign, read_joints)
+    assert robot.get_state()["joints"] == {}
+    foreign.get_task_status = lambda: success("Told.", task_status="running")  # type: ignore[method-assign]
+    assert "joints_error" not in robot.get_state()

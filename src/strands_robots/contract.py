@@ -7,7 +7,10 @@ Networks, tools and the command line reach a robot only through these protocols.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
@@ -18,6 +21,9 @@ from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.utils import ValidationError, shown
 
 Joints = dict[str, float]
+
+RUNNING = frozenset({"running", "starting", "connecting", "busy"})
+"""Values of ``task_status`` of a task that may move its robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +82,10 @@ class TaskRobot(Haltable, Protocol):
         """``observation_features`` and ``action_features``, as data."""
 
     def get_state(self) -> Envelope:
-        """``joints`` (name to position in the device's unit) and ``task``."""
+        """``joints`` (name to position in the device's unit) and ``task``.
+
+        Where it can be told, ``joints_age_s``; where they are not those of now, ``joints_error`` says why.
+        """
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
         """Tell ``observer`` of every rollout event until the returned callable is called."""
@@ -158,23 +167,50 @@ def put_away(robot: Any) -> Callable[[], None]:
 
     For whoever halts a robot and then leaves its network: a motion asked for in between would outlive the process.
     """
-    gate, latch = _gate_of(robot), _PutAway()
+    gate, latch = _gate_of(robot, _shared(robot)), _PutAway()
     gate.attach(latch)
     return lambda: gate.detach(latch)
 
 
-_gates: WeakKeyDictionary[Any, MotionGate] = WeakKeyDictionary()
+class _Shared:
+    """What all wrappers of one foreign robot share, so that a stop on one network is one on every other."""
+
+    def __init__(self) -> None:
+        self.gate = MotionGate()
+        self.reading = threading.Lock()
+        self.read: tuple[float, Joints] | None = None
+        self._calls: set[object] = set()
+
+    @property
+    def called(self) -> bool:
+        """A verb that moves or stops the robot is under way."""
+        return bool(self._calls)
+
+    @contextmanager
+    def calling(self) -> Iterator[None]:
+        """The time of such a verb. It waits for nobody, because it may be a stop."""
+        call = object()
+        self._calls.add(call)
+        try:
+            yield
+        finally:
+            self._calls.discard(call)
 
 
-def _gate_of(robot: Any) -> MotionGate:
-    """The robot's own gate, else one for it: the same however often it is wrapped, so that a stop voids all roads."""
-    own = getattr(robot, "gate", None)
-    if isinstance(own, MotionGate):
-        return own
+_known: WeakKeyDictionary[Any, _Shared] = WeakKeyDictionary()
+
+
+def _shared(robot: Any) -> _Shared:
+    """The same for one robot, however often it is wrapped."""
     try:
-        return _gates.setdefault(robot, MotionGate())
+        return _known.setdefault(robot, _Shared())
     except TypeError:  # it cannot be a key; each wrapper has a gate, and every emergency stop knows them all
-        return MotionGate()
+        return _Shared()
+
+
+def _gate_of(robot: Any, shared: _Shared) -> MotionGate:
+    own = getattr(robot, "gate", None)
+    return own if isinstance(own, MotionGate) else shared.gate
 
 
 class AdaptedRobot:
@@ -184,7 +220,8 @@ class AdaptedRobot:
         self.wrapped = robot
         self._read_joints = joints
         self.tool_name_str: str = str(getattr(robot, "tool_name_str", "") or "robot")
-        self.gate = _gate_of(robot)
+        self._shared = _shared(robot)
+        self.gate = _gate_of(robot, self._shared)
 
     def start_task(
         self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
@@ -193,9 +230,10 @@ class AdaptedRobot:
             permit = self.gate.permit("start_task")
         except MotionRefused as refused:
             return refused.envelope
-        answer: Envelope = self.wrapped.start_task(
-            instruction, policy_provider=policy_provider, duration=duration, policy_port=policy_port
-        )
+        with self._shared.calling():
+            answer: Envelope = self.wrapped.start_task(
+                instruction, policy_provider=policy_provider, duration=duration, policy_port=policy_port
+            )
         if not permit.valid:
             # The stop came while the robot was starting, and may have found nothing to stop.
             again = self.halt("halted while it started")
@@ -204,7 +242,8 @@ class AdaptedRobot:
         return answer
 
     def stop_task(self) -> Envelope:
-        answer: Envelope = self.wrapped.stop_task()
+        with self._shared.calling():
+            answer: Envelope = self.wrapped.stop_task()
         return answer
 
     def get_task_status(self) -> Envelope:
@@ -216,18 +255,25 @@ class AdaptedRobot:
         return answer
 
     def get_state(self) -> Envelope:
-        """The robot's own state where it tells one, else its joints and task; ``joints_error`` says why it has none."""
+        """The robot's own state where it tells one, else its joints, ``joints_age_s`` and task.
+
+        While its task runs, or it is being started or stopped, its joints are not read: it drives its bus itself, and
+        does not know of our turns on it. They are then those of the last read, and ``joints_error`` says so.
+        """
         own = getattr(self.wrapped, "get_state", None)
         if callable(own):
             answer: Envelope = own()
             return answer
-        fields: dict[str, Any] = {"joints": {}, "task": _facts(self.get_task_status())}
-        try:
-            if self._read_joints is not None:
-                fields["joints"] = dict(self._read_joints(self.wrapped))
-        except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the answer says what
-            fields["joints_error"] = f"The joints could not be read: {type(exc).__name__}: {exc}"
-        return success(fields.get("joints_error") or f"{len(fields['joints'])} joints.", **fields)
+        # One at a time, so that one that waited looks anew at what the robot does. No stop ever waits for this.
+        with self._shared.reading:
+            task = _facts(self.get_task_status())
+            problem = self._refresh(str(task.get("task_status", "")).lower())
+            read_at, joints = self._shared.read or (None, {})
+        fields: dict[str, Any] = {"joints": dict(joints), "task": task}
+        fields["joints_age_s"] = None if read_at is None else round(time.monotonic() - read_at, 4)
+        if problem:
+            fields["joints_error"] = problem
+        return success(problem or f"{len(joints)} joints.", **fields)
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
         subscribe = getattr(self.wrapped, "subscribe", None)
@@ -241,12 +287,31 @@ class AdaptedRobot:
         self.gate.revoke()
         own = getattr(self.wrapped, "halt", None)
         if callable(own):
-            return halt_each({self.tool_name_str: lambda: own(reason)})
-        sources: dict[str, Callable[[], object]] = {"task": self.wrapped.stop_task}
-        teleop = getattr(self.wrapped, "stop_teleoperate", None)
-        if callable(teleop):
-            sources["teleoperation"] = teleop
-        return halt_each(sources)
+            sources: dict[str, Callable[[], object]] = {self.tool_name_str: lambda: own(reason)}
+        else:
+            sources = {"task": self.wrapped.stop_task}
+            teleop = getattr(self.wrapped, "stop_teleoperate", None)
+            if callable(teleop):
+                sources["teleoperation"] = teleop
+        with self._shared.calling():
+            return halt_each(sources)
+
+    def _refresh(self, status: str) -> str:
+        """Read the joints, where that disturbs nobody; else why these are not those of now."""
+        if self._read_joints is None:
+            return ""
+        busy = "it is being started or stopped" if self._shared.called else "its task runs" if status in RUNNING else ""
+        if busy:
+            known = self._shared.read
+            # A robot without joints has none that could be old.
+            none = known is not None and not known[1]
+            return "" if none else f"The joints are those of the last read: {busy}."
+        began = time.monotonic()
+        try:
+            self._shared.read = (began, dict(self._read_joints(self.wrapped)))
+        except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the answer says what
+            return f"The joints could not be read: {type(exc).__name__}: {exc}"
+        return ""
 
 
 def _facts(answer: object) -> dict[str, Any]:

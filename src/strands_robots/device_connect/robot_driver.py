@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from device_connect_edge.types import DeviceIdentity
 
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import AdaptedRobot, RolloutEvent, adapt
+from strands_robots.contract import RUNNING, AdaptedRobot, RolloutEvent, adapt
 from strands_robots.device_connect.base_driver import Call, RobotDriver
 from strands_robots.device_connect.declare import Labels, emit, rpc
 from strands_robots.device_connect.live_driver import Activity
@@ -19,9 +19,6 @@ from strands_robots.utils import ValidationError, identifier, number, text, whol
 
 DURATION_MAX_S = 3600.0
 """Longest task in seconds, the bound of both networks."""
-
-RUNNING = frozenset({"running", "starting", "connecting"})
-"""Task states in which a robot may move."""
 
 
 def task_arguments(
