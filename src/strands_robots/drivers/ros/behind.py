@@ -42,7 +42,7 @@ class Behind:
             return 0.0
 
     def confirm(self, within_s: float) -> None:
-        """Wait until the zero is sent, or send the one that got no thread. Raises :class:`RosError` where it was not."""
+        """Wait until the zero is sent, or send the one without a thread. Raises :class:`RosError` where it was not."""
         thread = self._thread
         if thread is None:
             self._run()
