@@ -223,9 +223,9 @@ def test_a_stop_reaches_the_commands_that_still_wait_for_their_turn(peers: Fleet
     release = threading.Event()
 
     class Slow(World):
-        def get_features(self) -> dict[str, Any]:
+        def reset(self) -> dict[str, Any]:
             release.wait(10)
-            return super().get_features()
+            return super().reset()
 
     world = Slow("left")
     console = peers.join(None, "console")
@@ -239,7 +239,7 @@ def test_a_stop_reaches_the_commands_that_still_wait_for_their_turn(peers: Fleet
 
     stranger.declare_subscriber("strands/agent/response/**", heard)
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
-    for turn, command in enumerate([{"action": "features"}] * 4 + [start]):
+    for turn, command in enumerate([{"action": "reset"}] * 4 + [start]):
         body = {"sender_id": "agent", "turn_id": f"t{turn}", "timestamp": peers.clock(), "command": command}
         stranger.put("strands/sim-1/cmd", body)
     assert console.send("sim-1", {"action": "stop"}, timeout=2)["result"]["ok"] is True

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import RolloutEvent, TaskRobot, WorldRobot, adapt
+from strands_robots.contract import RUNNING, RolloutEvent, TaskRobot, WorldRobot, adapt
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mesh.security import policy_host_refusal
 from strands_robots.safety.halting import verdict_of
@@ -32,7 +32,6 @@ POLICY_FIELDS = (
     "target_joints",
     "target_velocity",
 )
-RUNNING = frozenset({"running", "connecting", "starting", "busy"})
 
 Robot = TaskRobot | WorldRobot
 

@@ -105,8 +105,8 @@ class Lane:
 
 
 class Lanes:
-    """The lanes of one peer: commands (4 workers, 32 waiting), stops, their answers, relayed resumes, and delivery to
-    its user."""
+    """The lanes of one peer: motions (4 workers, 32 waiting), what reads or ends one (2, 32), stops, their answers,
+    resumes, and delivery to its user."""
 
     def __init__(self, peer_id: str) -> None:
         self.stop_lane = Lane(f"{peer_id}-stop", 1, 128)
@@ -114,11 +114,12 @@ class Lanes:
         self.answers = Lane(f"{peer_id}-answer", 1, 8192)
         self.resumes = Lane(f"{peer_id}-resume", 1, 64)
         self.commands = Lane(f"{peer_id}-command", 4, 32)
+        self.quick = Lane(f"{peer_id}-quick", 2, 32)
         self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)
 
     def stop(self, timeout: float) -> list[str]:
         deadline = time.monotonic() + timeout
         alive: list[str] = []
-        for lane in (self.commands, self.delivery, self.resumes, self.stop_lane, self.answers):
+        for lane in (self.commands, self.quick, self.delivery, self.resumes, self.stop_lane, self.answers):
             alive += lane.stop(max(0.0, deadline - time.monotonic()))
         return alive

@@ -18,12 +18,12 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.door import SafetyDoor
 from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.pursuit import KNOWN_S, Pursuit
-from strands_robots.mesh.rpc import Caller
+from strands_robots.mesh.rpc import Caller, stop_outcome
 from strands_robots.mesh.transport.base import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.orders import StopOrder, derived_epoch, new_epoch
 from strands_robots.safety.resume import REJECTED, configured_keys, sign
-from strands_robots.safety.stopping import Outcome, StopVerdict, grade
+from strands_robots.safety.stopping import Outcome, StopVerdict
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)
@@ -82,7 +82,8 @@ class FleetSafety:
         replies = self._caller.broadcast({"action": "stop"}, COLLECT_S, missing)
         verdict = local() if local is not None else None
         responses = [*self._own(order, verdict), *replies]
-        not_stopped = [str(each["responder_id"]) for each in responses if not _stopped(each)]
+        still = {str(each["responder_id"]) for each in responses if stop_outcome(each) is Outcome.STOPPED}
+        not_stopped = [name for each in responses if (name := str(each["responder_id"])) not in still]
         silent = sorted(roster - {str(each["responder_id"]) for each in replies})
         for peer in not_stopped:
             logger.critical("%s did NOT stop on emergency stop %s.", peer, order.epoch)
@@ -95,9 +96,7 @@ class FleetSafety:
         }
         self._publish_estop(order, counts)
         self._tell("emergency_stop", order.epoch)
-        unreached = (roster | context.registry.heard_within(KNOWN_S)) - {
-            str(each["responder_id"]) for each in responses
-        }
+        unreached = (roster | context.registry.heard_within(KNOWN_S)) - still - {context.peer_id}
         self._pursuit.begin(
             order.epoch,
             unreached,
@@ -289,7 +288,3 @@ def _agree(body: dict[str, Any], sample: Sample) -> None:
         return
     if not isinstance(stated, str) or stated != sample.session:
         raise wire.WireError("source_zid and the sample's session disagree")
-
-
-def _stopped(reply: dict[str, Any]) -> bool:
-    return reply.get("type") == "response" and grade(reply.get("result")) is Outcome.STOPPED

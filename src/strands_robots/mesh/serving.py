@@ -14,7 +14,7 @@ from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.executor import Lanes
+from strands_robots.mesh.executor import Lane, Lanes
 from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, STOP_FIELDS, validate_command
 from strands_robots.mesh.stops import Asker, Stops, Tell
 from strands_robots.mesh.transport.base import Sample, TransportError
@@ -209,9 +209,15 @@ class Server:
             with asked:
                 self._serve(request, sample)
 
-        if not self._lanes.commands.submit(serve):
+        if not self._lane_of(action).submit(serve):
             context.audit("command_refused", request.sender_id, reason=BUSY)
             self._reply(request, error=BUSY)
+
+    def _lane_of(self, action: object) -> Lane:
+        """A motion may hold its worker while it lasts; what reads, resumes or ends one never waits for that."""
+        if action == "resume":
+            return self._lanes.resumes
+        return self._lanes.commands if action in MOTION else self._lanes.quick
 
     def _take_stop(self, request: wire.Request, sample: Sample) -> None:
         try:
