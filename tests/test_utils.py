@@ -170,7 +170,7 @@ def test_what_is_shown_of_a_hostile_value_is_short_too() -> None:
 
 def test_a_missing_extra_is_one_sentence_that_names_it() -> None:
     error = utils.missing_extra("A simulated robot", "sim")
-    assert str(error) == "A simulated robot needs the [sim] extra: pip install 'strands-robots[sim]'."
+    assert str(error) == "A simulated robot needs the [sim] extra: in the clone, .venv/bin/pip install -e '.[sim]'."
     assert isinstance(error, ImportError)
 
 

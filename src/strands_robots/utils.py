@@ -33,9 +33,14 @@ class MissingExtraError(ImportError):
     """An optional dependency is not installed; the message says which extra brings it."""
 
 
+def install_line(extra: str) -> str:
+    """How an extra is added; from a clone, because the distribution is not published."""
+    return f"in the clone, .venv/bin/pip install -e '.[{extra}]'"
+
+
 def missing_extra(what: str, extra: str) -> MissingExtraError:
     """The one sentence for an absent optional package."""
-    return MissingExtraError(f"{what} needs the [{extra}] extra: pip install 'strands-robots[{extra}]'.")
+    return MissingExtraError(f"{what} needs the [{extra}] extra: {install_line(extra)}.")
 
 
 def shown(value: object) -> str:

@@ -44,7 +44,7 @@ def test_a_missing_required_package_is_broken_and_exits_with_1(run: Run, monkeyp
     result = run("doctor", "--json")
     assert result.exit_code == 1
     assert checked(result)["extra device-connect"]["mark"] == "broken"
-    assert "strands-robots[device-connect]" in checked(result)["extra device-connect"]["remedy"]
+    assert "'.[device-connect]'" in checked(result)["extra device-connect"]["remedy"]
     assert checked(result)["extra lerobot"]["mark"] == "note"
 
 

@@ -29,7 +29,7 @@ def test_no_road_at_all_is_one_sentence_that_says_what_to_install(monkeypatch: p
         Ros2Link().publish("/a", "std_msgs/msg/String", {})
     answer = ros_action("status")
     assert answer["status"] == "error"
-    assert "pip install 'strands-robots[ros2]'" in answer["reason"]
+    assert "pip install -e '.[ros2]'" in answer["reason"]
 
 
 def test_rclpy_asked_for_by_name_and_not_there_says_to_source_it() -> None:

@@ -61,7 +61,7 @@ def test_without_mujoco_one_sentence_names_the_extra() -> None:
         "except ImportError as e:\n    print(e)"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said == "Simulation needs the [sim] extra: pip install 'strands-robots[sim]'.\n"
+    assert said == "Simulation needs the [sim] extra: in the clone, .venv/bin/pip install -e '.[sim]'.\n"
 
 
 def test_stepping_by_hand_advances_exactly_that_many_steps(world: Simulation) -> None:

@@ -191,5 +191,5 @@ def test_without_strands_agents_one_sentence_names_the_extra() -> None:
         "except ImportError as exc:\n    print(exc)"
     )
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
-    assert "strands-robots[agent]" in told
+    assert "'.[agent]'" in told
     assert len(told.splitlines()) == 1

@@ -17,7 +17,7 @@ from strands_robots import settings
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Failure
 from strands_robots.safety.approval import state_dir
-from strands_robots.utils import MissingExtraError, ValidationError
+from strands_robots.utils import MissingExtraError, ValidationError, install_line
 
 FRAMEWORK = "0.2.5"
 """The release of device-connect-edge that the backends are written for."""
@@ -106,7 +106,7 @@ def _packages() -> Iterator[Finding]:
         if missing:
             absent = Mark.BROKEN if extra in _REQUIRED else Mark.NOTE
             said = "not installed" if len(missing) == len(names) else f"without {', '.join(missing)}"
-            yield Finding(f"extra {extra}", absent, said, f"pip install 'strands-robots[{extra}]'")
+            yield Finding(f"extra {extra}", absent, said, install_line(extra))
             continue
         versions = ", ".join(f"{name} {version}" for name, version in have.items())
         if extra == "device-connect" and have["device-connect-edge"] != FRAMEWORK:
@@ -224,7 +224,7 @@ def _credentials() -> Iterator[Finding]:
 
 def _rendering() -> Iterator[Finding]:
     if _version("mujoco") is None:
-        yield Finding("rendering", Mark.NOTE, "needs the [sim] extra", "pip install 'strands-robots[sim]'")
+        yield Finding("rendering", Mark.NOTE, "needs the [sim] extra", install_line("sim"))
         return
     from strands_robots.simulation.gl import remedy  # noqa: PLC0415 - the simulation is not loaded for other commands
 

@@ -11,11 +11,11 @@ from strands_robots.ros.dds import DOMAIN_MAX, DdsLink
 from strands_robots.ros.link import GivenUp, Goal, GoalLink, Heard, Message, RosError, RosLink, Unwatch, never
 from strands_robots.ros.rclpy_link import RclpyLink
 from strands_robots.ros.rclpy_session import sourced
-from strands_robots.utils import whole
+from strands_robots.utils import install_line, whole
 
 NO_ROAD = (
     "No road to a ROS 2 graph: source a ROS 2 installation, or install the [ros2] extra for topics over bare DDS: "
-    "pip install 'strands-robots[ros2]'."
+    f"{install_line('ros2')}."
 )
 
 

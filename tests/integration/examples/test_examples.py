@@ -79,9 +79,26 @@ def test_a_robot_of_ones_own_moves_for_the_allowed_and_stops_for_everybody(envir
         assert stopped.returncode == 0, stopped.stderr
 
 
-def test_a_robot_of_ones_own_moves_for_nobody_unless_told(environment: dict[str, str]) -> None:
-    with example("own_driver.py", environment):
-        eventually(lambda: live(environment, "pan-tilt"), within=WITHIN_S, what="the robot is live")
-        refused = command(environment, "call", "pan-tilt", "execute", "instruction=look around")
+def test_a_robot_that_knows_tasks_alone_is_started_for_the_allowed_and_stops(environment: dict[str, str]) -> None:
+    allowed = {"DEVICE_CONNECT_RPC_ALLOW": "strands-robots", "STRANDS_ROBOT_COMMAND_ALLOW": "execute"}
+    with example("own_robot.py", environment | allowed):
+        eventually(lambda: live(environment, "turntable"), within=WITHIN_S, what="the robot is live")
+        turn = ("call", "turntable", "execute", "instruction=turn", "duration=20")
+        assert command(environment, *turn, "--as", "stranger").returncode == 1
+        assert command(environment, *turn).returncode == 0
+        doing = json.loads(command(environment, "call", "turntable", "getStatus", "--json").stdout)
+        assert doing["task_status"] == "running"
+        stopped = command(environment, "stop", "turntable")
+        assert stopped.returncode == 0, stopped.stderr
+        done = json.loads(command(environment, "call", "turntable", "getStatus", "--json").stdout)
+        assert done["task_status"] == "idle"
+        assert 0 < done["step_count"] < 1000
+
+
+@pytest.mark.parametrize(("name", "peer"), [("own_driver.py", "pan-tilt"), ("own_robot.py", "turntable")])
+def test_a_robot_of_ones_own_moves_for_nobody_unless_told(environment: dict[str, str], name: str, peer: str) -> None:
+    with example(name, environment):
+        eventually(lambda: live(environment, peer), within=WITHIN_S, what="the robot is live")
+        refused = command(environment, "call", peer, "execute", "instruction=look around")
         assert refused.returncode == 1
         assert "DEVICE_CONNECT_RPC_ALLOW" in refused.stderr
