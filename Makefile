@@ -13,7 +13,7 @@ GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 help:  ## Show these targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
 
-venv:
+venv:  ## What tests, examples and every extra but lerobot need, in .venv
 	@./scripts/venv.sh $(VENV) requirements/dev.lock
 
 demo:  ## One arm in simulation: found, driven and stopped, by an agent in another process

@@ -2,7 +2,7 @@
 
 It counts as real hardware, which moves for nobody until you say for whom, and only with your approval::
 
-    DEVICE_CONNECT_RPC_ALLOW=strands-robots STRANDS_ROBOT_COMMAND_ALLOW=execute python examples/own_driver.py
+    DEVICE_CONNECT_RPC_ALLOW=strands-robots STRANDS_ROBOT_COMMAND_ALLOW=execute .venv/bin/python examples/own_driver.py
     strands-robots call pan-tilt execute instruction="look around" duration=5      # in another terminal
 """
 

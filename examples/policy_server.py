@@ -1,6 +1,6 @@
 """The reference policy server: answers observations with actions over a WebSocket, in JSON or MessagePack.
 
-    python examples/policy_server.py --port 8765
+    .venv/bin/python examples/policy_server.py --port 8765
     strands-robots call my-arm execute instruction='wave' policy_provider=remote policy_port=8765
 
 Its policy swings every joint that has a range around where it is. Replace ``Swing`` by your model.

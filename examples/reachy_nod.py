@@ -1,7 +1,7 @@
 """Let a Reachy Mini in MuJoCo wake up and nod under our driver, and draw what its joints did.
 
     ./scripts/reachy-daemon.sh 1.13.0
-    python -m examples.reachy_nod docs/images/reachy-mini-nod.png
+    .venv/bin/python -m examples.reachy_nod docs/images/reachy-mini-nod.png
 
 The daemon is Pollen's own in its MuJoCo simulation; the picture is Pollen's model, posed by the joint positions that
 the daemon streamed to our driver. Needs OpenGL (EGL or OSMesa) to draw.

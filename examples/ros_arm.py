@@ -1,6 +1,6 @@
 """Put an arm on a ROS 2 graph and drive it from there, over bare DDS and by rclpy, without ROS and without an arm.
 
-    python -m examples.ros_arm
+    .venv/bin/python -m examples.ros_arm
 
 The arm is simulated; a real one is given to the bridges in its place. The controller is a plain DDS peer, as a ROS 2
 node would be. This project's stand-in takes the place of rclpy, which comes with a ROS 2 installation.

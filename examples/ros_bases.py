@@ -1,6 +1,6 @@
 """Drive and stop three robots that speak ROS, without ROS and without a robot.
 
-    python -m examples.ros_bases
+    .venv/bin/python -m examples.ros_bases
 
 A rover behind a rosbridge server, a car behind the same server, and a base in a process of its own on loopback DDS.
 The far ends are this project's stand-ins; with a real robot, only the addresses differ.

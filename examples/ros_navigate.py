@@ -1,6 +1,6 @@
 """Let a ROS 2 base navigate to a place, and stop it on its way, without ROS and without a robot.
 
-    python -m examples.ros_navigate
+    .venv/bin/python -m examples.ros_navigate
 
 The navigation stack runs in a process of its own on loopback DDS. Where a ROS 2 is sourced the robot class speaks to it
 by rclpy; here this project's stand-in for rclpy takes its place, so that the example runs anywhere. With a real

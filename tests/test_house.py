@@ -28,7 +28,7 @@ FLOORS: list[set[str]] = [
         "bus_access",
     },
     {"device_connect", "mesh", "mesh_session"},
-    {"cli", "tools", "dashboard", "robot"},
+    {"cli", "tools", "robot"},
 ]
 
 

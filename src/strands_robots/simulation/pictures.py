@@ -33,7 +33,7 @@ class Pictures(Construction):
             camera: overview, front, side, top, or a robot's own (``wrist``, or ``arm/wrist`` where several have one).
             width: 16 to 1920 pixels.
             height: 16 to 1440 pixels.
-            quality: with shadows and anti-aliasing, at ten times the cost in software.
+            quality: with shadows and anti-aliasing, at many times the cost in software.
 
         Raises:
             ValidationError: an argument outside its domain.

@@ -1,7 +1,7 @@
 """A software picture of a world, without OpenGL: shaded faces through a depth buffer, in numpy alone.
 
-Good for machines that have no OpenGL at all; slower than it (a tenth of a second for 640 by 480) and plainer: one
-light, its shadow on the floor, flat faces. Every primitive and mesh is drawn, textures other than the floor's are not.
+Good for machines that have no OpenGL at all; slower than it and plainer: one light, its shadow on the floor, flat
+faces. Every primitive and mesh is drawn, textures other than the floor's are not.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class Renderer:
     def render(self, snapshot: Snapshot, camera: object, width: int, height: int, *, quality: bool) -> Picture:
         """An RGB picture (height, width, 3).
 
-        ``quality`` adds shadows, reflections and anti-aliasing, which cost ten times the time in software.
+        ``quality`` adds shadows, reflections and anti-aliasing, which cost many times the time in software.
 
         Raises:
             RenderingError: OpenGL does not work here.
