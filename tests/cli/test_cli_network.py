@@ -53,7 +53,7 @@ def test_insecure_and_certificates_are_ways_out(tmp_path: Path, monkeypatch: pyt
 
 def test_without_the_extra_one_sentence_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("strands_robots.cli.network.find_spec", lambda _: None)
-    with pytest.raises(MissingExtraError, match=r"strands-robots\[device-connect\]"):
+    with pytest.raises(MissingExtraError, match=r"the \[device-connect\] extra"):
         Network().link()
 
 
