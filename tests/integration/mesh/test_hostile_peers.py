@@ -183,6 +183,7 @@ def test_a_command_in_a_stolen_name_does_not_move_the_arm(net: OverZenoh, attack
 @pytest.mark.parametrize("sender", ["*", "**", "a/*", "$*", "", "a/b", None, 7, "x" * 129])
 def test_a_sender_that_is_no_identifier_gets_no_reply(net: OverZenoh, attacker: Attacker, sender: object) -> None:
     heard = attacker.hear("strands/**")
+    eventually(lambda: any(str(sample.key_expr) == "strands/sim-1/presence" for sample in heard))
     attacker.put("strands/sim-1/cmd", {**request("x", {"action": "ping"}), "sender_id": sender})
     attacker.put("strands/sim-1/cmd", request("probe", {"action": "ping"}))
     eventually(lambda: any("/response/" in str(sample.key_expr) for sample in heard), within=3)
