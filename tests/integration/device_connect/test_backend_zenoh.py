@@ -134,11 +134,16 @@ async def test_access_rules_admit_a_device_as_itself_alone(tmp_path):
                 heard = await bare.hears("robot-a", "emergencyStop")
                 genuine = await bare.hears("robot-b", "emergencyStop")
                 stop = json.dumps({"jsonrpc": "2.0", "method": "emergencyStop", "params": {}}).encode()
-                await other.client.publish("device-connect.default.robot-a.event.emergencyStop", stop)
-                await other.client.publish("device-connect.default.robot-b.event.emergencyStop", stop)
+
+                async def own_is_heard() -> bool:
+                    # A new subscription takes a moment to reach everybody.
+                    for name in ("robot-a", "robot-b"):
+                        await other.client.publish(f"device-connect.default.{name}.event.emergencyStop", stop)
+                    return len(genuine) >= 3
+
+                await eventually_async(own_is_heard)
                 with pytest.raises(MessagingError):
                     await other.call("robot-a", "getStatus", wait_s=0.5)
-                await until(lambda: genuine)
                 assert heard == []
 
 

@@ -12,7 +12,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.nats_server import NatsServer
 from fixtures.toy_robots import ToyRobot, ToyWorld
-from fixtures.waiting import eventually, free_port
+from fixtures.waiting import eventually, eventually_async, free_port
 
 from strands_robots.audit import read_audit_log, verify_audit_integrity
 from strands_robots.device_connect import (
@@ -171,12 +171,15 @@ def test_the_frameworks_own_road_and_the_lane_meet_and_halt_once(floor: Floor) -
         client = await open_client(floor.link)
         payload = notification(ESTOP, {"reason": "button", "estop_id": new_epoch()})
         separator = "." if floor.link.transport == "nats" else "/"
-        await client.publish(separator.join(("device-connect", "default", "panel-1", "event", ESTOP)), payload)
-        await asyncio.sleep(0.2)
+
+        async def locked() -> bool:
+            await client.publish(separator.join(("device-connect", "default", "panel-1", "event", ESTOP)), payload)
+            return len(plane().lockouts()) == 2
+
+        await eventually_async(locked)
         await client.close()
 
     asyncio.run(emit())
-    eventually(lambda: len(plane().lockouts()) == 2)
     time.sleep(0.1)
     records = [each for each in read_audit_log() if each["event"] == "remote_estop_engaged"]
     assert sorted(each["peer_id"] for each in records) == ["arm-1", "sim-1"]
