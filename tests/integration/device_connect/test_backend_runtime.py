@@ -36,7 +36,7 @@ async def runtime(link):
 async def test_a_ready_device_is_callable_and_discoverable_at_once(runtime, link):
     async with Caller(client=await open_client(link)) as caller:
         assert (await caller.call("arm-1", "getStatus", {"value": "x"}))["result"]["value"] == "x"
-        await caller.sees("arm-1", within=2)
+        await caller.sees("arm-1", within=8)
 
 
 async def test_the_status_that_presence_tells_is_the_live_one(runtime, link):

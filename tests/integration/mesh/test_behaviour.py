@@ -242,7 +242,7 @@ def test_a_leader_moves_its_follower_in_order_until_a_stop(net: Network) -> None
     stats = arm.ask("followed")
     assert (stats["rejected"], stats["errors"], stats["out_of_order"]) == (0, 0, 0)
     console.ask("send", "arm-1", {"action": "stop"}, 5)
-    eventually(lambda: arm.ask("followed")["running"] is False, within=2)
+    eventually(lambda: arm.ask("followed")["running"] is False, within=8)
     still = len(arm.ask("actions"))
     time.sleep(0.1)
     assert len(arm.ask("actions")) == still

@@ -169,7 +169,7 @@ def test_a_stop_while_the_broker_is_away_stops_here_and_everybody_when_it_is_bac
     assert sim.ask("moving") == ["left"]
     broker.start()
     eventually(lambda: sim.ask("epoch") == arm.ask("epoch"), within=25)
-    eventually(lambda: sim.ask("moving") == [], within=2)
+    eventually(lambda: sim.ask("moving") == [], within=8)
 
 
 @pytest.mark.system

@@ -131,5 +131,5 @@ def test_the_fleet_of_the_guide_works_with_rules_and_stated_endpoints(join: Join
     eventually(lambda: one.ask("epoch") == console.ask("epoch") == two.ask("epoch"), within=3)
     eventually(lambda: one.ask("moving") == [], within=2, what="it stands still")
     two.kill()
-    eventually(lambda: "sim-2" not in console.ask("reachable"), within=2)
-    eventually(lambda: "sim-2" not in one.ask("reachable"), within=2)
+    eventually(lambda: "sim-2" not in console.ask("reachable"), within=8)
+    eventually(lambda: "sim-2" not in one.ask("reachable"), within=8)
