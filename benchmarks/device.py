@@ -164,7 +164,7 @@ def _fleet(count: int) -> Iterator[Row]:
         mine = ours["after"][what] - (ours["before"][what] if what == "mb" else 0)
         bare = theirs["after"][what] - (theirs["before"][what] if what == "mb" else 0)
         yield Row(
-            f"{count} robots in one process{', over their own' if what == 'mb' else ''}",
+            f"{count} robots in one process{', what joining the network adds' if what == 'mb' else ''}",
             f"{mine:.0f}{unit}",
             f"{count} bare runtimes {bare:.0f}{unit}",
             mine / bare if bare else None,
