@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from fixtures.driver_bench import DriverBench
+from fixtures.planes import own_plane
 
 from strands_robots.device_connect.bringup import driver_for
 from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
@@ -73,10 +74,8 @@ MAKERS: dict[str, Callable[[Far, pytest.MonkeyPatch], MobileBaseRobot]] = {
 
 @pytest.fixture
 def plane() -> Iterator[SafetyPlane]:
-    here = SafetyPlane(deadline_s=2.0)
-    yield here
-    for entry in list(here.robots.values()):
-        entry.close()
+    with own_plane(2.0) as here:
+        yield here
 
 
 @pytest.mark.parametrize("kind", MAKERS)

@@ -100,11 +100,16 @@ def test_a_signature_counts_only_near_its_time_and_its_certificates(folder: Path
         verifier(folder, clock).verify(message)
 
 
-def test_a_certificate_of_another_authority_does_not_count(folder: Path, tmp_path: Path) -> None:
-    clock = Clock()
+def signed_elsewhere(tmp_path: Path, clock: Clock) -> dict[str, Any]:
+    """A message of an ``arm-1`` of another authority."""
     keys.init(tmp_path)
     keys.issue(tmp_path, "arm-1")
-    message = signer(tmp_path, "arm-1", clock).sign(BODY)
+    return signer(tmp_path, "arm-1", clock).sign(BODY)
+
+
+def test_a_certificate_of_another_authority_does_not_count(folder: Path, tmp_path: Path) -> None:
+    clock = Clock()
+    message = signed_elsewhere(tmp_path, clock)
     with pytest.raises(IdentityError, match="issued"):
         verifier(folder, clock).verify(message)
 
@@ -121,9 +126,7 @@ def test_a_certificate_whose_name_is_no_text_does_not_count(folder: Path) -> Non
 
 def test_the_issuer_is_asked_before_the_certificates_dates(folder: Path, tmp_path: Path) -> None:
     clock = Clock()
-    keys.init(tmp_path)
-    keys.issue(tmp_path, "arm-1")
-    message = signer(tmp_path, "arm-1", clock).sign(BODY)
+    message = signed_elsewhere(tmp_path, clock)
     clock.pass_(100 * 365 * 86400.0)
     with pytest.raises(IdentityError, match="issued"):
         verifier(folder, clock).verify(message)

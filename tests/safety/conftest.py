@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from fixtures.planes import own_plane
 from fixtures.recording_robot import RecordingRobot
 
 from strands_robots.safety.plane import SafetyPlane
@@ -15,10 +16,8 @@ Add = Callable[..., RecordingRobot]
 
 @pytest.fixture
 def plane() -> Iterator[SafetyPlane]:
-    here = SafetyPlane(deadline_s=0.5)
-    yield here
-    for entry in list(here.robots.values()):
-        entry.close()
+    with own_plane(0.5) as here:
+        yield here
 
 
 @pytest.fixture
