@@ -63,23 +63,27 @@ def test_a_halt_that_comes_while_a_permit_is_given_refuses_it() -> None:
         gate.permit("start")
 
 
-def test_generations_rise_whoever_revokes() -> None:
+def test_a_halt_voids_the_permits_of_whoever_halts_at_the_same_time() -> None:
     gate = MotionGate()
-    seen: list[int] = []
+    void: list[bool] = []
 
     def revoke() -> None:
         for _ in range(500):
-            permit = gate.permit("x")
+            try:
+                permit = gate.permit("x")
+            except MotionRefused:
+                # Another thread's halt fell into the asking: nothing was given that could be void.
+                void.append(True)
+                continue
             gate.revoke()
-            assert not permit.valid
-            seen.append(gate.generation)
+            void.append(not permit.valid)
 
     threads = [threading.Thread(target=revoke) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(seen) == 2000
+    assert void == [True] * 2000
 
 
 def test_a_motion_asked_for_before_a_halt_is_refused_when_its_turn_comes_after() -> None:
