@@ -92,6 +92,7 @@ def run(quick: bool = False) -> list[Row]:
         rows = [*pings(console, session, shared, 200 if quick else 2000), publishing(console, session, quick)]
         rows.append(teleoperation(console, session, echo, shared, 5 if quick else 60))
         rows += stops(console, shared, state, 10 if quick else 100)
+        rows += losses(state)
         rows.append(presence(5 if quick else 20))
         rows += idle(shared, state)
     return rows
@@ -223,6 +224,38 @@ def _after_hub_loss(state: str) -> float:
         for fleet in fleets:
             fleet.close()
     return (max(halted) - issued) * 1000 if all(halted) else float("inf")
+
+
+def losses(state: str) -> list[Row]:
+    """From the death of a process to what the others make of it: a child by its hub, and a hub by its children."""
+    shared = {"STRANDS_MESH_PORT": str(free_port())}
+    with ExitStack() as stack:
+
+        def join(peer_id: str) -> MeshPeer:
+            return stack.enter_context(
+                MeshPeer(peer_id, "none", {**shared, "STRANDS_STATE_DIR": _folder(state, peer_id)})
+            )
+
+        hub = join("first")
+        children = [join(f"child-{number}") for number in range(3)]
+        for peer in (hub, *children[:2]):
+            peer.sees(*(other.peer_id for other in children if other is not peer))
+        dead = _killed(children[2])
+        eventually(lambda: "child-2" not in hub.ask("reachable"), within=30)
+        gone = time.monotonic() - dead
+        dead = _killed(hub)
+        eventually(lambda: children[0].ask("ping", "child-1", 0.2)["status"] == "ok", within=30)
+        again = time.monotonic() - dead
+    return [
+        _stop_row("a killed peer is out of reach", gone * 1000, 1000),
+        _stop_row("the hub is killed, and its children answer one another", again * 1000, 2000),
+    ]
+
+
+def _killed(peer: MeshPeer) -> float:
+    at = time.monotonic()
+    peer.kill()
+    return at
 
 
 def _stop_row(what: str, took: float, most: float) -> Row:

@@ -54,4 +54,4 @@ def no_thread_of_ours_left(state_directory: Path) -> Iterator[None]:
     def left() -> list[str]:
         return [t.name for t in threading.enumerate() if t not in before and t.name.startswith(OURS)]
 
-    eventually(lambda: not left(), within=3, what=f"the end of {left()}")
+    eventually(lambda: not left(), within=10, what=f"the end of {left()}")

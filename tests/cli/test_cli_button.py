@@ -44,7 +44,7 @@ def made(controller: FakeController) -> Button:
 def test_a_press_stops_whoever_is_known_then(controller: FakeController) -> None:
     bar = made(controller)
     bar.press()
-    eventually(lambda: bar.report is not None, within=5.0)
+    eventually(lambda: bar.report is not None)
     assert controller.expected == [("arm-1",)]
     assert not bar.running
 
@@ -55,9 +55,9 @@ def test_a_key_that_is_held_is_one_stop(controller: FakeController) -> None:
     for _ in range(50):
         bar.press()
     controller.answer.set()
-    eventually(lambda: bar.report is not None, within=5.0)
+    eventually(lambda: bar.report is not None)
     bar.press()
-    eventually(lambda: not bar.running, within=5.0)
+    eventually(lambda: not bar.running)
     assert len(set(controller.ids)) == 1
     assert len(controller.ids) <= 2
     assert bar.presses == 51
@@ -69,9 +69,9 @@ def test_a_later_press_is_a_stop_of_its_own(controller: FakeController, monkeypa
     controller.answer.clear()
     bar.press()
     bar.press()
-    eventually(lambda: len(set(controller.ids)) == 2, within=5.0)
+    eventually(lambda: len(set(controller.ids)) == 2)
     controller.answer.set()
-    eventually(lambda: not bar.running, within=5.0)
+    eventually(lambda: not bar.running)
 
 
 def test_a_robot_that_was_resumed_meanwhile_is_stopped_under_a_new_name(controller: FakeController) -> None:
@@ -79,7 +79,7 @@ def test_a_robot_that_was_resumed_meanwhile_is_stopped_under_a_new_name(controll
     controller.refused = {"arm-1": Answer("arm-1", None, 1.0, "this stop was resumed before it came again")}
     for presses in (1, 2):
         bar.press()
-        eventually(lambda: not bar.running, within=5.0)
+        eventually(lambda: not bar.running)
         assert len(set(controller.ids)) == presses
 
 
@@ -87,7 +87,7 @@ def test_a_stop_that_never_left_goes_on_under_its_name(controller: FakeControlle
     controller.links = [False, False, True]
     bar = made(controller)
     bar.press()
-    eventually(lambda: bar.report is not None and not bar.running, within=5.0)
+    eventually(lambda: bar.report is not None and not bar.running)
     assert len(controller.ids) == 3
     assert len(set(controller.ids)) == 1
 
@@ -96,7 +96,7 @@ def test_a_stop_goes_on_until_nobody_is_silent(controller: FakeController) -> No
     controller.silent = [("arm-1",), ("arm-1",), ()]
     bar = made(controller)
     bar.press()
-    eventually(lambda: not bar.running, within=5.0)
+    eventually(lambda: not bar.running)
     assert len(controller.ids) == 3
     assert len(set(controller.ids)) == 1
     assert bar.report is not None

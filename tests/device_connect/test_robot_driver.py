@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from typing import Any
 
 import pytest
@@ -22,10 +21,8 @@ from strands_robots.utils import ValidationError
 
 async def test_execute_starts_a_task_and_returns_at_once(robot: ToyRobot) -> None:
     async with DriverBench(drive(robot)) as bench:
-        began = time.monotonic()
-        answer = await bench.call("execute", instruction="wave", duration=0.3)
+        answer = await bench.call("execute", instruction="wave", duration=1.0)
         assert answer["status"] == "success"
-        assert time.monotonic() - began < 0.25
         assert (await bench.call("getStatus"))["task_status"] == "running"
         await bench.until(lambda: bench.of("taskComplete"))
         assert bench.of("taskStarted")[0]["instruction"] == "wave"

@@ -62,7 +62,7 @@ def test_a_robot_is_served_until_its_event_and_is_halted_first() -> None:
     )
     thread.start()
     try:
-        assert eventually(lambda: status_of(port, "run-arm"), within=15)
+        assert eventually(lambda: status_of(port, "run-arm"))
         robot.start_task("wave", duration=30)
         eventually(lambda: robot.device.writes)
     finally:

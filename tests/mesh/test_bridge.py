@@ -140,14 +140,14 @@ def test_a_leg_that_is_down_at_start_is_brought_up_with_what_was_subscribed_and_
     for count in (0, 2):
         stop = {"peer_id": "a", "t": 1.0, "estop_id": "e" * 32, "source_zid": both.session_id, "peers_silent": count}
         both.put("strands/safety/estop", stop)
-    eventually(lambda: stops, within=5)
+    eventually(lambda: stops)
     assert stops == [{"peer_id": "a", "t": 1.0, "estop_id": "e" * 32, "peers_silent": 2}]
     for name in ("b", "a"):
         body = {"sender_id": "x", "turn_id": name, "command": {"action": "stop"}}
-        eventually(late.is_alive, within=2)
+        eventually(late.is_alive)
         far.put(f"strands/{name}/cmd", body)
     assert heard == ["strands/a/cmd"]
-    eventually(lambda: not [each for each in threading.enumerate() if each is both._mender], within=2)
+    eventually(lambda: not [each for each in threading.enumerate() if each is both._mender])
     kept.undeclare()
     both.close()
 

@@ -22,7 +22,7 @@ def joined(peers: Fleet) -> tuple[World, Mesh, Mesh]:
     world = World("left", "right")
     mesh = peers.join(world, "sim-1", "sim")
     console = peers.join(None, "console")
-    eventually(lambda: {"sim-1", "sim-1__left", "sim-1__right"} <= set(console.peers_by_id), within=3)
+    eventually(lambda: {"sim-1", "sim-1__left", "sim-1__right"} <= set(console.peers_by_id))
     return world, mesh, console
 
 
@@ -73,7 +73,7 @@ class Led(World):
 def test_the_stop_of_a_child_ends_the_streams_that_drive_its_world(peers: Fleet) -> None:
     world = Led("left", "right")
     _, console, lead = peers.join(world, "sim-1", "sim"), peers.join(None, "console"), peers.join(None, "lead")
-    eventually(lambda: "sim-1__left" in console.peers_by_id, within=3)
+    eventually(lambda: "sim-1__left" in console.peers_by_id)
     receive = {"action": "teleop_receive", "source_peer_id": "lead"}
     assert console.send("sim-1", receive, timeout=5)["result"]["status"] == "success"
 
@@ -82,7 +82,7 @@ def test_the_stop_of_a_child_ends_the_streams_that_drive_its_world(peers: Fleet)
         lead.publish("strands/lead/input/leader", {**frame, "action": {"pan": 1.0}, "events": None})
 
     lead_on(1)
-    eventually(lambda: world.sent == [True], within=2)
+    eventually(lambda: world.sent == [True])
     world.free.clear()
     lead_on(2)
     assert world.asked.acquire(timeout=2)
@@ -91,7 +91,7 @@ def test_the_stop_of_a_child_ends_the_streams_that_drive_its_world(peers: Fleet)
     assert console.send("sim-1", {"action": "teleop_status"}, timeout=5)["result"]["streams"] == []
     lead_on(3)
     world.free.set()
-    eventually(lambda: world.sent == [True, False], within=2, what="the frame that waited for the bus to be refused")
+    eventually(lambda: world.sent == [True, False], what="the frame that waited for the bus to be refused")
 
 
 @pytest.mark.parametrize("stopped", ["sim-1__left", "sim-1"])
@@ -100,7 +100,7 @@ def test_the_stop_of_one_robot_reaches_its_starts_in_line_wherever_they_were_ask
 ) -> None:
     world = Led("left", "right")
     mesh, console = peers.join(world, "sim-1", "sim"), peers.join(None, "console")
-    eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id), within=3)
+    eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id))
     world.free.clear()
     answers: dict[str, Any] = {}
 
@@ -127,7 +127,7 @@ def test_a_fleets_stop_of_one_name_leaves_the_robots_of_others_alone(peers: Flee
     world = ToyWorld()
     peers.join(world, "sim-1", "sim")
     console = peers.join(None, "console")
-    eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id), within=3)
+    eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id))
     for name in ("left", "right"):
         console.send(f"sim-1__{name}", START, timeout=5)
     answers = console.broadcast({"action": "stop", "robot_name": "right"}, 0.5)
@@ -136,9 +136,9 @@ def test_a_fleets_stop_of_one_name_leaves_the_robots_of_others_alone(peers: Flee
         "sim-1__left": False,
         "sim-1__right": True,
     }
-    eventually(lambda: [row["robot"] for row in world.list_policies_running()] == ["left"], within=2)
+    eventually(lambda: [row["robot"] for row in world.list_policies_running()] == ["left"])
     steps = world.rollouts["left"].steps
-    eventually(lambda: world.rollouts["left"].steps > steps + 5, within=2)
+    eventually(lambda: world.rollouts["left"].steps > steps + 5)
     world.close()
 
 
@@ -157,7 +157,7 @@ def test_an_emergency_stop_finds_no_child_silent_and_locks_them(peers: Fleet) ->
     recorded = peers.events("emergency_stop")[0]
     assert (recorded["not_stopped"], recorded["silent"]) == ([], [])
     assert world.running == {}
-    eventually(lambda: mesh.lockout_epoch is not None, within=2)
+    eventually(lambda: mesh.lockout_epoch is not None)
     assert console.send("sim-1__left", START, timeout=5)["error"] == "command rejected"
 
 
@@ -166,10 +166,10 @@ def test_robots_come_and_go_with_their_world(peers: Fleet) -> None:
     world.names.remove("right")
     children = mesh._assembled.children
     assert children is not None
-    eventually(lambda: not children._children, within=3)
-    eventually(lambda: not console.peers_by_id["sim-1__left"]["reachable"], within=3)
+    eventually(lambda: not children._children)
+    eventually(lambda: not console.peers_by_id["sim-1__left"]["reachable"])
     world.names.append("middle")
-    eventually(lambda: "sim-1__middle" in console.peers_by_id, within=3)
+    eventually(lambda: "sim-1__middle" in console.peers_by_id)
     mesh.stop()
     assert console.send("sim-1__middle", {"action": "ping"}, timeout=0.1)["status"] == "timeout"
 

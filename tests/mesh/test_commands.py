@@ -31,7 +31,7 @@ def ask(
     )
     request = {"sender_id": sender, "turn_id": "t1", "timestamp": peers.clock(), **body}
     transport.put(f"strands/{target}/cmd", request)
-    eventually(lambda: replies, within=2, what="a reply")
+    eventually(lambda: replies, what="a reply")
     handle.undeclare()
     return replies
 
@@ -125,7 +125,7 @@ def test_leaving_the_mesh_ends_an_execute_with_the_reason(peers: Fleet, monkeypa
     told = Dispatcher(fit(arm), lambda reason: StopVerdict(), left.is_set)
     asking = threading.Thread(target=lambda: answers.append(told(execute)))
     asking.start()
-    eventually(lambda: arm.moving, within=2)
+    eventually(lambda: arm.moving)
     left.set()
     asking.join(5)
     assert answers[0]["status"] == "error"
@@ -178,7 +178,7 @@ def test_a_sender_that_is_no_identifier_gets_no_reply(peers: Fleet, sender: obje
     stranger = peers.stranger()
     stranger.declare_subscriber("strands/*/response/**", lambda sample: heard.append(sample.key))
     stranger.put("strands/arm-1/cmd", {"sender_id": sender, "turn_id": "t", "command": {"action": "ping"}})
-    eventually(lambda: peers.events("command_rejected"), within=2)
+    eventually(lambda: peers.events("command_rejected"))
     assert not heard
 
 
@@ -244,7 +244,7 @@ def test_a_stop_reaches_the_commands_that_still_wait_for_their_turn(peers: Fleet
         stranger.put("strands/sim-1/cmd", body)
     assert console.send("sim-1", {"action": "stop"}, timeout=2)["result"]["ok"] is True
     release.set()
-    eventually(lambda: "t4" in results, within=5)
+    eventually(lambda: "t4" in results)
     assert "halted after it was asked for" in results["t4"]["reason"]
     assert world.running == {}
 

@@ -72,7 +72,7 @@ def heard(peers: Fleet, teleoperator: Any) -> dict[str, Any]:
     publisher = InputPublisher(lead, teleoperator, hz=50)
     assert listener.subscribe(publisher.topic, lambda key, data: frames.append(data))
     publisher.start()
-    eventually(lambda: frames, within=5)
+    eventually(lambda: frames)
     publisher.stop()
     frame: dict[str, Any] = frames[0]
     return frame
@@ -85,7 +85,7 @@ def test_a_leaders_actions_reach_the_follower_in_order(peers: Fleet) -> None:
     publisher = InputPublisher(lead, Leader(), hz=50)
     receiver.start()
     publisher.start()
-    eventually(lambda: len(arm.actions) >= 10, within=5)
+    eventually(lambda: len(arm.actions) >= 10)
     sent, got = publisher.stop(), receiver.stop()
     values = [action["shoulder.pos"] for action in arm.actions]
     assert values == sorted(values)
@@ -104,7 +104,7 @@ def test_a_leader_that_begins_again_is_followed_on(peers: Fleet) -> None:
         arm.actions.clear()
         publisher = InputPublisher(lead, Leader(), hz=50)
         publisher.start()
-        eventually(lambda: len(arm.actions) >= 5, within=5)
+        eventually(lambda: len(arm.actions) >= 5)
         publisher.stop()
     assert receiver.stop()["out_of_order"] == 0
 
@@ -119,10 +119,10 @@ def test_a_stream_needs_a_leader_that_was_seen(peers: Fleet) -> None:
 
 def test_a_locked_follower_opens_no_stream_and_an_open_one_ends(stream: Stream) -> None:
     stream.send()
-    eventually(lambda: stream.arm.actions, within=2)
+    eventually(lambda: stream.arm.actions)
     stream.follower.emergency_stop()
     stream.send()
-    eventually(lambda: stream.stat("rejected_lockout")() == 1, within=2)
+    eventually(lambda: stream.stat("rejected_lockout")() == 1)
     assert len(stream.arm.actions) == 1
     assert stream.receiver.stats["running"] is False
     stream.receiver.start()
@@ -133,7 +133,7 @@ def test_a_halt_ends_a_stream_without_locking(stream: Stream) -> None:
     stream.arm.halt("by hand")
     assert stream.receiver.stats["running"] is False
     stream.send()
-    eventually(lambda: stream.stat("rejected_lockout")() == 1, within=2)
+    eventually(lambda: stream.stat("rejected_lockout")() == 1)
     assert stream.arm.actions == []
 
 
@@ -142,19 +142,19 @@ def test_a_stream_that_a_halt_ended_opens_again_when_asked(stream: Stream) -> No
     stream.receiver.start()
     assert stream.receiver.running
     stream.send()
-    eventually(lambda: stream.arm.actions, within=2)
+    eventually(lambda: stream.arm.actions)
 
 
 def test_another_session_on_the_leaders_topic_moves_nothing(stream: Stream) -> None:
     stream.peers.stranger().put("strands/lead/input/leader", stream.frame())
-    eventually(lambda: stream.stat("rejected_source")() == 1, within=2)
+    eventually(lambda: stream.stat("rejected_source")() == 1)
     assert stream.arm.actions == []
 
 
 @pytest.mark.parametrize("stamp", [-61.0, 6.0, None, "now", True])
 def test_a_frame_that_is_not_fresh_is_refused(stream: Stream, stamp: object) -> None:
     stream.send(t=stream.peers.clock() + stamp if isinstance(stamp, float) else stamp)
-    eventually(lambda: stream.stat("rejected_freshness")() == 1, within=2)
+    eventually(lambda: stream.stat("rejected_freshness")() == 1)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_a_frame_that_is_not_fresh_is_refused(stream: Stream, stamp: object) -> 
 )
 def test_an_action_out_of_bounds_is_refused(stream: Stream, action: object) -> None:
     stream.send(action=action)
-    eventually(lambda: stream.stat("rejected_invalid")() == 1, within=2)
+    eventually(lambda: stream.stat("rejected_invalid")() == 1)
     assert stream.receiver.stats["rejected"] == 1
     assert stream.arm.actions == []
 
@@ -181,10 +181,10 @@ def test_a_null_action_an_old_frame_and_a_burst_move_nothing(stream: Stream) -> 
     stream.send(action=None)
     stream.send(seq=10)
     stream.send(seq=10)
-    eventually(lambda: stream.stat("out_of_order")() == 1, within=2)
+    eventually(lambda: stream.stat("out_of_order")() == 1)
     for number in range(11, 111):
         stream.leader.put("strands/lead/input/leader", stream.frame(seq=number))
-    eventually(lambda: stream.stat("rate_dropped")() >= 70, within=2)
+    eventually(lambda: stream.stat("rate_dropped")() >= 70)
     assert len(stream.arm.actions) <= 25
 
 
@@ -202,25 +202,25 @@ def test_frames_that_waited_for_a_slow_bus_are_no_flood(stream: Stream) -> None:
     for _ in range(25):
         stream.send()
     free.set()
-    eventually(lambda: len(taken) == 25, within=2)
+    eventually(lambda: len(taken) == 25)
     assert receiver.stop()["rate_dropped"] == 0
 
 
 def test_a_joint_commanded_too_fast_is_refused(stream: Stream) -> None:
     stream.send(action={"shoulder.pos": 0.0})
     stream.send(action={"shoulder.pos": 300.0})
-    eventually(lambda: stream.stat("slew_rejected")() == 1, within=2)
+    eventually(lambda: stream.stat("slew_rejected")() == 1)
     stream.send(action={"shoulder.pos": 5.0})
-    eventually(lambda: stream.stat("frames_received")() == 2, within=2)
+    eventually(lambda: stream.stat("frames_received")() == 2)
 
 
 def test_the_first_frame_is_bounded_from_where_the_follower_stands(stream: Stream) -> None:
     where = success("state", joints={"shoulder.pos": 10.0}, task={})
     stream.arm.get_state = lambda: where  # type: ignore[method-assign]
     stream.send(action={"shoulder.pos": 700.0})
-    eventually(lambda: stream.stat("slew_rejected")() == 1, within=2)
+    eventually(lambda: stream.stat("slew_rejected")() == 1)
     stream.send(action={"shoulder.pos": 11.0})
-    eventually(lambda: stream.stat("frames_received")() == 1, within=2)
+    eventually(lambda: stream.stat("frames_received")() == 1)
     assert stream.arm.actions == [{"shoulder.pos": 11.0}]
 
 
@@ -229,12 +229,12 @@ def test_no_frame_is_applied_while_the_follower_cannot_tell_its_joints_just_now(
     stream.arm.get_state = lambda: success("state", **told)  # type: ignore[method-assign]
     for _ in range(2):
         stream.send(action={"shoulder.pos": 90.0})
-    eventually(lambda: stream.stat("slew_rejected")() == 2, within=2)
+    eventually(lambda: stream.stat("slew_rejected")() == 2)
     told.update(joints={"shoulder.pos": 10.0}, joints_error="")
     stream.send(action={"shoulder.pos": 90.0})
-    eventually(lambda: stream.stat("slew_rejected")() == 3, within=2)
+    eventually(lambda: stream.stat("slew_rejected")() == 3)
     stream.send(action={"shoulder.pos": 11.0})
-    eventually(lambda: stream.arm.actions == [{"shoulder.pos": 11.0}], within=2)
+    eventually(lambda: stream.arm.actions == [{"shoulder.pos": 11.0}])
 
 
 def test_a_follower_that_cannot_tell_its_joints_is_led_all_the_same(stream: Stream) -> None:
@@ -243,14 +243,14 @@ def test_a_follower_that_cannot_tell_its_joints_is_led_all_the_same(stream: Stre
 
     stream.arm.get_state = unread  # type: ignore[method-assign]
     stream.send(action={"shoulder.pos": 90.0})
-    eventually(lambda: stream.arm.actions, within=2)
+    eventually(lambda: stream.arm.actions)
 
 
 def test_a_stream_ends_with_its_lifetime(stream: Stream, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_MESH_INPUT_STREAM_TTL_S", "1")
     stream.receiver._opened -= 2
     stream.send()
-    eventually(lambda: stream.peers.events("input_stream_expired"), within=2)
+    eventually(lambda: stream.peers.events("input_stream_expired"))
     assert stream.receiver.stats["rejected_expired"] == 1
     assert stream.receiver.stats["running"] is False
 
@@ -258,7 +258,7 @@ def test_a_stream_ends_with_its_lifetime(stream: Stream, monkeypatch: pytest.Mon
 def test_a_robot_that_refuses_every_frame_reads_as_errors(stream: Stream) -> None:
     for _ in range(3):
         stream.send(action={"broken": 1.0})
-    eventually(lambda: stream.stat("errors")() == 3, within=2)
+    eventually(lambda: stream.stat("errors")() == 3)
     assert stream.receiver.stats["frames_received"] == 3
 
 
@@ -271,7 +271,7 @@ def test_streams_are_opened_told_and_closed_by_command(peers: Fleet, monkeypatch
     assert lead.send("follower", receive, timeout=5)["result"]["status"] == "success"
     publisher = InputPublisher(lead, Leader(), hz=50)
     publisher.start()
-    eventually(lambda: arm.actions, within=3)
+    eventually(lambda: arm.actions)
     told = lead.send("follower", {"action": "teleop_status"}, timeout=5)["result"]
     assert told["streams"][0]["running"] is True
     closed = lead.send("follower", {"action": "teleop_stop"}, timeout=5)["result"]
@@ -342,7 +342,7 @@ def test_an_action_without_a_number_is_an_error_and_no_frame(peers: Fleet, actio
     leader.get_action = lambda: action  # type: ignore[method-assign, assignment, return-value]
     publisher = InputPublisher(peers.join(None, "lead"), leader, hz=200)
     publisher.start()
-    eventually(lambda: publisher.stats["errors"] >= 3, within=3)
+    eventually(lambda: publisher.stats["errors"] >= 3)
     assert publisher.stop()["frames"] == 0
 
 
@@ -368,7 +368,7 @@ def test_a_publisher_whose_loop_outlived_its_stop_starts_no_second_one(
     monkeypatch.undo()
     assert publisher.stop()["thread_alive"] is False
     publisher.start()
-    eventually(lambda: publisher.stats["frames"] >= 3, within=3)
+    eventually(lambda: publisher.stats["frames"] >= 3)
     assert publisher.stop()["thread_alive"] is False
 
 
@@ -385,7 +385,7 @@ def test_a_device_that_fails_is_counted_and_goes_on(peers: Fleet) -> None:
 
     publisher = InputPublisher(peers.join(None, "lead"), Flaky(), hz=200)
     publisher.start()
-    eventually(lambda: publisher.stats["frames"] >= 3, within=3)
+    eventually(lambda: publisher.stats["frames"] >= 3)
     stats = publisher.stop()
     assert stats["errors"] == 1
     assert stats["event_read_errors"] >= 3

@@ -32,13 +32,13 @@ def test_joints_task_and_simulated_time_are_published(peers: Fleet) -> None:
     states = heard(peers, "strands/*/state")
     peers.join(Arm(), "arm-1")
     peers.join(World("left"), "sim-1", "sim")
-    eventually(lambda: {body["peer_id"] for body in states} == {"arm-1", "sim-1"}, within=3)
+    eventually(lambda: {body["peer_id"] for body in states} == {"arm-1", "sim-1"})
     arm = next(body for body in states if body["peer_id"] == "arm-1")
     sim = next(body for body in states if body["peer_id"] == "sim-1")
     assert arm["joints"] == {"shoulder": 1.5}
     assert arm["task"]["status"] == "idle"
     assert sim["joints"]["joint"]["position"] == 0.5
-    eventually(lambda: {"joint": {"position": 0.5, "velocity": 0.0}} in [body["joints"] for body in states], within=3)
+    eventually(lambda: {"joint": {"position": 0.5, "velocity": 0.0}} in [body["joints"] for body in states])
     assert sim["sim_time"] == 1.25
     assert sim["robots"] == {"left": False}
 
@@ -64,7 +64,7 @@ def test_a_robot_that_cannot_be_read_says_so_and_stays_seen() -> None:
 def test_a_provider_cannot_speak_for_another_peer(peers: Fleet) -> None:
     mesh, imu = peers.join(Arm(), "arm-1"), heard(peers, "strands/arm-1/imu")
     mesh.add_sensor("imu", lambda: {"peer_id": "other", "t": 0, "gyro": [1, 2, 3]}, hz=50)
-    eventually(lambda: imu, within=3)
+    eventually(lambda: imu)
     assert imu[0]["peer_id"] == "arm-1"
     assert imu[0]["t"] > 1
     assert imu[0]["gyro"] == [1, 2, 3]
@@ -82,10 +82,10 @@ def test_a_robots_own_sensors_are_published_and_named_in_presence(peers: Fleet) 
     poses, hosts = heard(peers, "strands/rover/pose"), heard(peers, "strands/rover/health")
     console = peers.join(None, "console")
     peers.join(Rover(), "rover")
-    eventually(lambda: poses and hosts, within=3)
+    eventually(lambda: poses and hosts)
     assert poses[0]["quat"] == [1.0, 0.0, 0.0, 0.0]
     assert {"cpu_load", "mem_pct", "disk_free_gb", "uptime_s", "battery_pct"} <= set(hosts[0])
-    eventually(lambda: "pose" in (console.get_peer("rover") or {}).get("topics", []), within=3)
+    eventually(lambda: "pose" in (console.get_peer("rover") or {}).get("topics", []))
 
 
 def test_a_quaternion_is_normalised_or_not_published() -> None:
@@ -115,7 +115,7 @@ def test_frames_are_jpeg_and_the_privacy_switch_is_read_before_one_is_built(
     time.sleep(0.1)
     assert not built
     monkeypatch.setenv("STRANDS_MESH_CAMERA_DISABLED", "false")
-    eventually(lambda: frames, within=3)
+    eventually(lambda: frames)
     body = frames[0]
     assert (body["cam"], body["shape"], body["dtype"], body["encoding"]) == ("wrist", [24, 32, 3], "uint8", "jpeg")
     assert body["data"].startswith("/9j/")
@@ -131,7 +131,7 @@ def test_policy_steps_carry_numbers_and_are_thinned_out(peers: Fleet, monkeypatc
     observation = {"j": 1.5, "image": np.zeros((4, 4)), "near": np.arange(3.0), "far": [0.0] * 100, "nan": float("nan")}
     for number in range(50):
         one.publish_step(number, observation, {"j": 2}, "wave", "mock")
-    eventually(lambda: steps, within=2)
+    eventually(lambda: steps)
     assert steps[0]["observation"] == {"j": 1.5, "near": [0.0, 1.0, 2.0]}
     assert steps[0]["instruction"] == "wave"
     assert len(steps) <= 3
@@ -169,7 +169,7 @@ def test_a_wedged_read_does_not_hold_up_presence_and_stop_names_it() -> None:
     scheduler.every("bus", 100, lambda: release.wait(5) and None)
     scheduler.every("presence", 100, lambda: beats.append(1), quick=True)
     scheduler.start()
-    eventually(lambda: len(beats) > 5, within=2)
+    eventually(lambda: len(beats) > 5)
     assert scheduler.stop(0.05) == ["wedged-sampler"]
     release.set()
 
@@ -183,7 +183,7 @@ def test_a_failing_job_goes_on() -> None:
 
     scheduler.every("job", 200, fail)
     scheduler.start()
-    eventually(lambda: len(runs) >= 3, within=2)
+    eventually(lambda: len(runs) >= 3)
     assert scheduler.stop(1) == []
 
 

@@ -29,8 +29,8 @@ def test_an_arm_is_driven_watched_and_stopped_over_the_mesh(peers: Fleet, arm: S
     console = peers.join(None, "console")
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 20}
     assert console.send("sim-1", start, timeout=10)["result"]["status"] == "success"
-    eventually(lambda: states and states[-1].get("robots") == {"so100": True}, within=5)
-    eventually(lambda: any(joint["velocity"] for joint in states[-1]["joints"].values()), within=5)
+    eventually(lambda: states and states[-1].get("robots") == {"so100": True})
+    eventually(lambda: any(joint["velocity"] for joint in states[-1]["joints"].values()))
     assert console.send("sim-1", {"action": "stop"}, timeout=5)["result"]["ok"] is True
     assert arm.list_policies_running() == []
     console.emergency_stop()
@@ -63,7 +63,7 @@ def test_the_steps_of_a_rollout_are_published_without_anybody_asking(peers: Flee
     console.on_stream("sim-1", lambda key, data: steps.append(data))
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 20}
     assert console.send("sim-1", start, timeout=10)["result"]["status"] == "success"
-    eventually(lambda: len(steps) > 5, within=5)
+    eventually(lambda: len(steps) > 5)
     first = steps[0]
     assert set(first) == {"peer_id", "step", "t", "instruction", "policy", "observation", "action"}
     assert (first["peer_id"], first["instruction"], first["policy"]) == ("sim-1", "wave", "mock")
@@ -73,7 +73,7 @@ def test_the_steps_of_a_rollout_are_published_without_anybody_asking(peers: Flee
     mesh.stop()
     told = len(steps)
     assert arm.list_policies_running(), "leaving the mesh ends no rollout"
-    eventually(lambda: arm.list_policies_running()[0]["step"] > first["step"] + 20, within=5)
+    eventually(lambda: arm.list_policies_running()[0]["step"] > first["step"] + 20)
     assert len(steps) == told
 
 
@@ -82,6 +82,6 @@ def test_a_simulated_robot_publishes_where_it_is(peers: Fleet, arm: Simulation) 
     peers.stranger().declare_subscriber("strands/sim-1/pose", lambda sample: poses.append(json.loads(sample.payload)))
     peers.join(arm, "sim-1", "sim")
     console = peers.join(None, "console")
-    eventually(lambda: poses, within=3)
+    eventually(lambda: poses)
     assert set(poses[0]) == {"peer_id", "t", "x", "y", "z", "theta", "quat", "source", "frame"}
-    eventually(lambda: (console.get_peer("sim-1") or {}).get("topics") == ["health", "pose"], within=3)
+    eventually(lambda: (console.get_peer("sim-1") or {}).get("topics") == ["health", "pose"])

@@ -56,7 +56,7 @@ def test_a_blind_base_is_told_zeros_for_its_time_and_no_longer(made: Made, monke
     monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.2)
     robot = made(publish_rate=50.0)
     robot.halt()
-    eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()), within=2)
+    eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()))
     assert 8 <= len(memory(robot).sent) <= 12
 
 
@@ -70,7 +70,7 @@ def test_a_link_that_returns_after_the_blind_hold_still_gets_zeros_for_its_whole
     assert robot.halt().stopped is False
     eventually(lambda: link.tries > 25, what="tries beyond the time of a blind hold")
     link.faults = ()
-    eventually(lambda: not robot.holding, within=2)
+    eventually(lambda: not robot.holding)
     assert 6 <= len(link.sent) <= 12, "as many as a link that was never down gets"
 
 
@@ -81,7 +81,7 @@ def test_a_link_that_drops_out_within_the_hold_gets_zeros_for_its_whole_time_aga
     link = FaultyLink(tuple(range(4, 30)))
     robot = made(link, publish_rate=50.0)
     assert robot.halt().stopped
-    eventually(lambda: not robot.holding, within=3)
+    eventually(lambda: not robot.holding)
     assert 9 <= len(link.sent) <= 15, "three before the drop-out and the whole time after it"
 
 
@@ -111,7 +111,7 @@ def test_a_moving_base_whose_odometry_falls_silent_is_held_for_the_blind_time_fr
     finally:
         wheels.close()
     silent_from = len(velocities(link))
-    eventually(lambda: not robot.holding, within=2)
+    eventually(lambda: not robot.holding)
     assert len(velocities(link)) - silent_from >= 15
 
 
@@ -139,7 +139,7 @@ def test_a_graph_that_is_asked_for_a_type_for_seconds_does_not_delay_the_zeros(
     robot = made(link, odom_topic="/odom", publish_rate=100.0)
     assert robot.halt().stopped is None
     try:
-        eventually(lambda: len(link.sent) > 10, within=2, what="zeros while the watch still blocks")
+        eventually(lambda: len(link.sent) > 10, what="zeros while the watch still blocks")
     finally:
         link.free.set()
     robot.disconnect()
@@ -205,7 +205,7 @@ def test_with_odometry_a_stop_waits_until_the_base_is_still(made: Made) -> None:
         assert verdict.stopped is True
         assert wheels.speed <= 0.01
         assert verdict.elapsed_ms > 150
-        eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()), within=2)
+        eventually(lambda: not any(t.name == "hold-rover" for t in threading.enumerate()))
         sent = len(velocities(link))
         time.sleep(0.1)
         assert len(velocities(link)) == sent, "a base that is still gets no more zeros"
@@ -285,7 +285,7 @@ def test_zeros_come_once_a_second_at_least_however_slow_the_rate(made: Made) -> 
     link = MemoryLink()
     robot = made(link, publish_rate=1e-300)
     assert robot.halt().stopped
-    eventually(lambda: len(link.sent) >= 2, within=4)
+    eventually(lambda: len(link.sent) >= 2)
 
 
 class TwoWays(MemoryLink):

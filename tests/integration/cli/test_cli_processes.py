@@ -90,7 +90,7 @@ def test_peers_lists_the_arm_and_what_it_can_do(shell: Shell, arm: dict[str, Any
 def test_a_motion_is_called_watched_and_stopped(shell: Shell, arm: dict[str, Any]) -> None:
     code, said = shell.json("call", "arm-1", "execute", "instruction=wave hello", "duration=30")
     assert (code, said["status"]) == (0, "success")
-    assert eventually(lambda: running(shell), within=10.0)
+    assert eventually(lambda: running(shell))
     watched = shell.run("watch", "arm-1", "--for", "1")
     assert watched.returncode == 0
     assert "wave hello" in watched.stdout

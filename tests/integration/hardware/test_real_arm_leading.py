@@ -134,7 +134,7 @@ def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) ->
     def looked() -> None:
         """The command has read every joint since now."""
         before = fresh.answers
-        eventually(lambda: fresh.answers > before + 3 * len(MOTORS), within=10, what="two looks at the joints")
+        eventually(lambda: fresh.answers > before + 3 * len(MOTORS), what="two looks at the joints")
 
     name = f"by-hand-{machine}"
     words = ["calibrate", "so101", "--port", fresh.port, "--id", name, *(["--json"] if machine else [])]
@@ -148,7 +148,7 @@ def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) ->
         terminal.press("\r")
         # LeRobot sets each to 0 first.
         taken = 2 * len(MOTORS)
-        eventually(lambda: len(fresh.written_after(0.0, "homing_offset")) == taken, within=10, what="the middle, taken")
+        eventually(lambda: len(fresh.written_after(0.0, "homing_offset")) == taken, what="the middle, taken")
         for move in (-900, 800):
             looked()
             for servo in fresh.servos.values():

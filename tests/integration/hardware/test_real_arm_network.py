@@ -60,7 +60,7 @@ class Bench:
             self.robots.append(robot)
             self.runtimes.append(init_device_connect_sync(robot, peer_id=f"arm-{number}", link=link))
         assert self.controller.wait_link(10)
-        eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
+        eventually(lambda: all(seat.link.up for seat in lane().seats))
 
     def move(self) -> None:
         for name in ("arm-1", "arm-2"):

@@ -40,7 +40,7 @@ class Peer(Protocol):
 
     def ask(self, verb: str, *arguments: Any) -> Any: ...
 
-    def sees(self, *others: str, within: float = 8.0) -> None: ...
+    def sees(self, *others: str, within: float = 20.0) -> None: ...
 
 
 class Network:
@@ -100,7 +100,7 @@ class _Local:
         except Exception as exc:
             raise RuntimeError(f"{type(exc).__name__}: {exc}") from exc
 
-    def sees(self, *others: str, within: float = 8.0) -> None:
+    def sees(self, *others: str, within: float = 20.0) -> None:
         eventually(lambda: set(others) <= set(self.ask("reachable")), within)
 
 

@@ -42,7 +42,7 @@ def net(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         for peer_id, robot in names.items():
             made.join(peer_id, robot)
         for peer_id, peer in made.peers.items():
-            peer.sees(*(other for other in names if other != peer_id), within=15)
+            peer.sees(*(other for other in names if other != peer_id))
         yield made
 
 
@@ -78,7 +78,7 @@ def until_answered(transport: Transport, key: str, body: dict[str, Any], found: 
             time.sleep(0.1)
         return found[0] if found else None
 
-    return eventually(ask, within=5, what="an answer") or {}
+    return eventually(ask, what="an answer") or {}
 
 
 # Who is there.
@@ -186,7 +186,7 @@ def test_what_is_published_is_heard_until_one_is_deaf(net: Network) -> None:
         found: list[Any] = console.ask("heard", "notes")
         return found
 
-    assert eventually(heard, within=5)[0] == {"key": "strands/sim-1/notes", "words": "good morning"}
+    assert eventually(heard)[0] == {"key": "strands/sim-1/notes", "words": "good morning"}
     console.ask("deaf", "notes")
     sim.ask("publish", "strands/sim-1/notes", {"words": "good night"})
     assert console.ask("heard", "notes") == []
@@ -205,7 +205,7 @@ def test_the_state_of_a_robot_and_of_a_world_is_published(net: Network) -> None:
         found = {each["peer_id"]: each for each in console.ask("heard", "states")}
         return found if len(found) >= 2 else None
 
-    found = eventually(by_peer, within=5) or {}
+    found = eventually(by_peer) or {}
     console.ask("deaf", "states")
     assert found["arm-1"]["joints"] == {"shoulder": 1.5}
     assert found["sim-1"]["sim_time"] == 1.25
@@ -221,7 +221,7 @@ def test_a_policys_steps_are_streamed(net: Network) -> None:
         found: list[Any] = console.ask("heard", "steps")
         return found
 
-    step = eventually(heard, within=5)[0]
+    step = eventually(heard)[0]
     console.ask("deaf", "steps")
     assert (step["peer_id"], step["step"], step["instruction"], step["policy"]) == ("sim-1", 7, "wave", "mock")
     assert step["action"] == {"joint": 0.6}
@@ -236,13 +236,13 @@ def test_a_leader_moves_its_follower_in_order_until_a_stop(net: Network) -> None
     before = len(arm.ask("actions"))
     assert arm.ask("follow", "console") is None
     console.ask("lead")
-    eventually(lambda: len(arm.ask("actions")) - before >= 15, within=5)
+    eventually(lambda: len(arm.ask("actions")) - before >= 15)
     moved = [action["shoulder.pos"] for action in arm.ask("actions")[before:]]
     assert moved == sorted(moved)
     stats = arm.ask("followed")
     assert (stats["rejected"], stats["errors"], stats["out_of_order"]) == (0, 0, 0)
     console.ask("send", "arm-1", {"action": "stop"}, 5)
-    eventually(lambda: arm.ask("followed")["running"] is False, within=8)
+    eventually(lambda: arm.ask("followed")["running"] is False)
     still = len(arm.ask("actions"))
     time.sleep(0.1)
     assert len(arm.ask("actions")) == still
@@ -262,7 +262,7 @@ def test_frames_of_another_session_move_nothing(net: Network) -> None:
         count: int = arm.ask("followed")["rejected_source"]
         return count
 
-    eventually(refused, within=5)
+    eventually(refused)
     assert arm.ask("unfollow")["running"] is False
     assert len(arm.ask("actions")) == before
 
@@ -288,7 +288,7 @@ def test_a_command_is_carried_out_once(net: Network) -> None:
         mallory.put("strands/sim-1/cmd", step)
     # The bridge takes a command that comes again for the other leg's copy and does not even answer it.
     again = [] if net.kind == "bridge" else ["replay rejected", "replay rejected"]
-    eventually(lambda: len(found) == 1 + len(again), within=5)
+    eventually(lambda: len(found) == 1 + len(again))
     assert sorted(reply.get("error", "") for reply in found) == ["", *again]
     assert sim.ask("steps") == before + 3
 
@@ -328,7 +328,7 @@ def test_an_emergency_stop_halts_and_locks_everybody_until_the_signed_resume(net
         assert console.ask("send", "sim-1", {"action": action}, 5)["type"] == "response"
     assert console.ask("resume", str(net.folder / "operator.pem"), PASSPHRASE) == {"status": "ok"}
     for peer in (arm, sim):
-        eventually(lambda peer=peer: peer.ask("epoch") is None, within=3, what=f"{peer.peer_id} is free")
+        eventually(lambda peer=peer: peer.ask("epoch") is None, what=f"{peer.peer_id} is free")
     assert console.ask("send", "sim-1", WAVE, 5)["result"]["status"] == "success"
 
 
@@ -336,7 +336,7 @@ def test_a_stop_of_anybody_counts_and_a_resume_of_anybody_does_not(net: Network,
     keygen(tmp_path / "own.pem", PASSPHRASE)
     console, arm = net.peers["console"], net.peers["arm-1"]
     arm.ask("estop")
-    eventually(lambda: console.ask("epoch"), within=3)
+    eventually(lambda: console.ask("epoch"))
     assert console.ask("resume", str(tmp_path / "own.pem"), PASSPHRASE) == {
         "status": "error",
         "error": "resume rejected",
@@ -364,4 +364,4 @@ def test_a_reply_in_anothers_name_does_not_count(net: Network) -> None:
         assert net.peers["console"].ask("send", "ghost", {"action": "ping"}, 0.3).get("type") is None
         return len(asked) >= 2
 
-    eventually(unanswered, within=5, what="two commands that the liar answered")
+    eventually(unanswered, what="two commands that the liar answered")

@@ -33,10 +33,10 @@ async def test_who_comes_second_shares_the_port_and_a_survivor_takes_it_over(joi
             await caller.sees("dev-1", "dev-2")
             assert (await caller.call("dev-2", "getStatus", {"value": "a"}))["result"]["value"] == "a"
             (one if first == "device" else console).kill()
-            eventually(lambda: accepts(port), within=5, what="somebody at the port again")
+            eventually(lambda: accepts(port), what="somebody at the port again")
             assert (await caller.call("dev-2", "getStatus", {"value": "b"}))["result"]["value"] == "b"
         other = join("sim-2")
-        eventually(lambda: other.ask("ping", "sim-1", 0.5)["status"] == "ok", within=8)
+        eventually(lambda: other.ask("ping", "sim-1", 0.5)["status"] == "ok")
         sim.sees("sim-2")
         async with Caller(client=await open_client(link)) as late:
             await late.sees("dev-2")
@@ -68,7 +68,7 @@ async def test_one_process_serves_its_robot_on_both(join: Join, port: int, serve
     def on_mesh() -> Any:
         return next((row for row in console.ask("peers") if row.get("sim_robots") == ["so100"]), None)
 
-    peer = eventually(on_mesh, within=8, what="the arm on the mesh")["peer_id"]
+    peer = eventually(on_mesh, what="the arm on the mesh")["peer_id"]
     assert console.ask("send", peer, {"action": "status"}, 5)["result"]["status"] == "success"
     async with Caller(client=await open_client(loopback_config(port))) as caller:
         await caller.sees(served_on_both)

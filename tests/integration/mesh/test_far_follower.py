@@ -49,7 +49,7 @@ def ended(replaying: subprocess.Popen[str]) -> tuple[int, list[dict[str, Any]]]:
 
 
 def followed(arm: MeshPeer, least: int) -> None:
-    eventually(lambda: len(arm.ask("actions")) >= least, within=15, what="the follower is led")
+    eventually(lambda: len(arm.ask("actions")) >= least, what="the follower is led")
 
 
 def test_an_approved_arm_is_led_to_the_end_and_stopped(join: Join, replay: Any, wave: Path) -> None:

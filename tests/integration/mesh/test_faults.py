@@ -16,7 +16,7 @@ from fixtures.waiting import accepts, eventually
 from tests.integration.mesh.conftest import Join
 
 
-def meet(peers: Sequence[MeshPeer], within: float = 10.0) -> None:
+def meet(peers: Sequence[MeshPeer], within: float = 20.0) -> None:
     """Wait until each has all the others in reach."""
     for peer in peers:
         peer.sees(*(other.peer_id for other in peers if other is not peer), within=within)
@@ -28,7 +28,7 @@ def everybody_answers_everybody(peers: Sequence[MeshPeer]) -> None:
             if other is not peer:
                 eventually(
                     lambda peer=peer, other=other: peer.ask("ping", other.peer_id, 0.5)["status"] == "ok",
-                    within=4,
+                    within=20,
                     what=f"{other.peer_id} answers {peer.peer_id}",
                 )
 
@@ -43,7 +43,7 @@ def test_two_peers_outlive_a_restart_of_the_other_and_of_their_own_session(join:
     hub, child = join("hub", "none"), join("child")
     meet([hub, child])
     child.close()
-    eventually(lambda: hub.ask("reachable") == [], within=2)
+    eventually(lambda: hub.ask("reachable") == [])
     child = join("child")
     meet([hub, child])
     for each in (child, hub):
@@ -59,7 +59,7 @@ def test_five_peers_lose_their_hub_and_get_it_back(join: Join, port: int) -> Non
     everybody_answers_everybody([hub, *others])
     sessions = {each.peer_id: others[0].ask("zid", each.peer_id) for each in others[1:]}
     hub.kill()
-    eventually(lambda: accepts(port), within=2, what="a survivor takes the port")
+    eventually(lambda: accepts(port), what="a survivor takes the port")
     everybody_answers_everybody(others)
     replies = others[0].ask("broadcast", {"action": "ping"}, 0.7)
     assert sorted(reply["responder_id"] for reply in replies) == ["arm-1", "sim-1", "sim-2"]
@@ -72,7 +72,7 @@ def test_five_peers_lose_their_hub_and_get_it_back(join: Join, port: int) -> Non
     [relay] = [each for each in others if port in listened_on(each)]
     relay.kill()
     left = [back, *(other for other in others if other is not relay)]
-    eventually(lambda: accepts(port), within=2, what="the next survivor takes the port")
+    eventually(lambda: accepts(port), what="the next survivor takes the port")
     everybody_answers_everybody(left)
 
 
@@ -84,8 +84,8 @@ def test_a_suspended_robot_is_told_as_silent_and_stops_when_it_goes_on(join: Joi
     answers = console.ask("estop")[1]
     assert answers == []
     arm.signal(signal.SIGCONT)
-    eventually(lambda: arm.ask("epoch") == console.ask("epoch"), within=6)
-    eventually(lambda: arm.ask("moving") is False, within=2, what="it stands still")
+    eventually(lambda: arm.ask("epoch") == console.ask("epoch"))
+    eventually(lambda: arm.ask("moving") is False, what="it stands still")
 
 
 def test_a_suspended_hub_holds_the_mesh_up_and_a_stop_arrives_when_it_goes_on(join: Join, port: int) -> None:
@@ -103,7 +103,7 @@ def test_a_suspended_hub_holds_the_mesh_up_and_a_stop_arrives_when_it_goes_on(jo
     assert arm.ask("epoch") is None
     hub.signal(signal.SIGCONT)
     eventually(lambda: arm.ask("epoch") == console.ask("epoch"), within=20)
-    eventually(lambda: arm.ask("moving") is False, within=2, what="it stands still")
+    eventually(lambda: arm.ask("moving") is False, what="it stands still")
     meet([hub, console, arm])
     everybody_answers_everybody([hub, console, arm])
 
@@ -115,7 +115,7 @@ def test_a_suspended_hub_that_is_killed_is_replaced(join: Join, port: int) -> No
     hub.signal(signal.SIGSTOP)
     assert console.ask("ping", "sim-1", 0.3)["status"] == "timeout"
     hub.kill()
-    eventually(lambda: accepts(port), within=2, what="a survivor takes the port")
+    eventually(lambda: accepts(port), what="a survivor takes the port")
     everybody_answers_everybody([console, sim])
 
 
@@ -128,11 +128,11 @@ def test_stated_endpoints_connect_in_any_order_and_outlive_the_listener(join: Jo
     everybody_answers_everybody([console, one, two])
     console.kill()
     console = join("console", "none", ZENOH_LISTEN=endpoint)
-    meet([console, one, two], within=14)
+    meet([console, one, two])
     everybody_answers_everybody([console, one, two])
     one.ask("start", "wave")
     assert {each["responder_id"] for each in two.ask("estop")[1]} == {"console", "sim-1", "sim-2"}
-    eventually(lambda: one.ask("moving") == [], within=2, what="it stands still")
+    eventually(lambda: one.ask("moving") == [], what="it stands still")
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
@@ -147,7 +147,7 @@ def test_a_bare_session_of_any_mode_takes_part_through_the_listener(join: Join, 
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as bare:
         heard: list[str] = []
         bare.declare_subscriber("strands/*/presence", lambda sample: heard.append(str(sample.key_expr)))
-        eventually(lambda: {"strands/console/presence", "strands/sim-1/presence"} <= set(heard), within=5)
+        eventually(lambda: {"strands/console/presence", "strands/sim-1/presence"} <= set(heard))
 
         def seen() -> bool:
             heartbeat = {"robot_id": "bare", "robot_type": "robot", "timestamp": time.time()}
@@ -155,5 +155,5 @@ def test_a_bare_session_of_any_mode_takes_part_through_the_listener(join: Join, 
             bare.put("strands/bare/presence", json.dumps(heartbeat).encode(), source_info=source)
             return all("bare" in peer.ask("reachable") for peer in (console, sim))
 
-        eventually(seen, within=5)
+        eventually(seen)
         assert sim.ask("zid", "bare") == console.ask("zid", "bare") == str(bare.id.zid)

@@ -70,7 +70,7 @@ def net(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         for peer_id, robot in names.items():
             made.join(peer_id, robot)
         for peer_id, peer in made.peers.items():
-            peer.sees(*(other for other in names if other != peer_id), within=15)
+            peer.sees(*(other for other in names if other != peer_id))
         yield made
 
 
@@ -96,11 +96,11 @@ def request(sender: str, command: object, **fields: Any) -> dict[str, Any]:
 def stolen_source(attacker: Attacker, victim: str) -> Any:
     """The source that the victim puts on its own messages."""
     heard = attacker.hear(f"strands/{victim}/presence")
-    return eventually(lambda: heard and heard[0].source_info, within=3, what=f"a heartbeat of {victim}")
+    return eventually(lambda: heard and heard[0].source_info, what=f"a heartbeat of {victim}")
 
 
 def audited(net: Network, peer: str, event: str) -> None:
-    eventually(lambda: event in net.peers[peer].ask("audited"), within=3, what=f"{peer} audits {event}")
+    eventually(lambda: event in net.peers[peer].ask("audited"), what=f"{peer} audits {event}")
 
 
 def test_a_forged_presence_binds_nobody_anew_and_is_audited(net: OverZenoh, attacker: Attacker) -> None:
@@ -118,7 +118,7 @@ def test_a_presence_of_another_time_is_nobody(net: OverZenoh, attacker: Attacker
     name = f"ghost-{abs(int(shift)) % 1000}"
     attacker.put(f"strands/{name}/presence", presence(name, timestamp=time.time() + shift))
     attacker.put("strands/now/presence", presence("now"))
-    eventually(lambda: "now" in net.peers["sim-1"].ask("reachable"), within=8)
+    eventually(lambda: "now" in net.peers["sim-1"].ask("reachable"))
     assert name not in net.peers["sim-1"].ask("reachable")
 
 
@@ -151,7 +151,7 @@ def test_a_recorded_command_moves_nothing_when_it_is_played_back(net: OverZenoh,
     console, sim, arm = (net.peers[name] for name in ("console", "sim-1", "arm-1"))
     heard = attacker.hear("strands/*/cmd")
     # A new subscription takes a moment to reach everybody.
-    eventually(lambda: console.ask("ping", "sim-1") and heard, within=8)
+    eventually(lambda: console.ask("ping", "sim-1") and heard)
     heard.clear()
     step = {"action": "step", "steps": 2}
     assert console.ask("send", "sim-1", step, 5)["result"]["status"] == "success"
@@ -162,7 +162,7 @@ def test_a_recorded_command_moves_nothing_when_it_is_played_back(net: OverZenoh,
         found = {json.loads(sample.payload.to_bytes())["command"]["action"]: sample for sample in list(heard)}
         return found if {"step", "start"} <= set(found) else None
 
-    tapes = eventually(recorded, within=8) or {}
+    tapes = eventually(recorded) or {}
     steps = sim.ask("steps")
     for tape in (tapes["step"], tapes["start"]):
         for stolen in (None, tape.source_info):
@@ -186,7 +186,7 @@ def test_a_sender_that_is_no_identifier_gets_no_reply(net: OverZenoh, attacker: 
     eventually(lambda: any(str(sample.key_expr) == "strands/sim-1/presence" for sample in heard))
     attacker.put("strands/sim-1/cmd", {**request("x", {"action": "ping"}), "sender_id": sender})
     attacker.put("strands/sim-1/cmd", request("probe", {"action": "ping"}))
-    eventually(lambda: any("/response/" in str(sample.key_expr) for sample in heard), within=8)
+    eventually(lambda: any("/response/" in str(sample.key_expr) for sample in heard))
     replies = [str(sample.key_expr) for sample in heard if "/response/" in str(sample.key_expr)]
     assert all(key.startswith("strands/probe/response/sim-1/") for key in replies)
     audited(net, "sim-1", "command_rejected")
@@ -299,7 +299,7 @@ def test_a_flood_on_any_topic_leaves_pings_and_stops_answered_and_nothing_behind
         assert sim.ask("moving") == [], name
         flood.join()
         # The queues are empty again: an ordinary command is served, not refused as busy.
-        eventually(lambda: console.ask("send", "sim-1", {"action": "status"}, 3).get("type") == "response", 5, name)
+        eventually(lambda: console.ask("send", "sim-1", {"action": "status"}, 3).get("type") == "response", what=name)
         sizes.append([resident(peer) for peer in peers])
     followed = arm.ask("unfollow")
     assert received <= followed["frames_received"] <= sent

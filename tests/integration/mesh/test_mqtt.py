@@ -115,13 +115,13 @@ def test_a_late_joiner_locks_on_the_kept_stop_and_not_once_it_was_resumed(join: 
     first, console = join("sim-1", **trusted), join("console", "none", **trusted)
     console.sees("sim-1")
     console.ask("estop")
-    eventually(lambda: first.ask("epoch"), within=3)
+    eventually(lambda: first.ask("epoch"))
     late = join("sim-2", **trusted)
-    eventually(lambda: late.ask("epoch") == console.ask("epoch"), within=3)
+    eventually(lambda: late.ask("epoch") == console.ask("epoch"))
     console.sees("sim-1", "sim-2")
     assert console.ask("resume", key, PASSPHRASE) == {"status": "ok"}
     for peer in (first, late):
-        eventually(lambda peer=peer: peer.ask("epoch") is None, within=3)
+        eventually(lambda peer=peer: peer.ask("epoch") is None)
     late.close()
     again = join("sim-2", **trusted)
     again.sees("sim-1")
@@ -137,11 +137,11 @@ def test_a_stop_of_a_bridge_reaches_who_is_on_the_broker_alone_and_the_other_way
     far.sees("bridge")
     bridge.ask("estop")
     for peer in (near, far):
-        eventually(lambda peer=peer: peer.ask("epoch") == bridge.ask("epoch"), within=3)
+        eventually(lambda peer=peer: peer.ask("epoch") == bridge.ask("epoch"))
     for peer in (near, far, bridge):
         peer.ask("clear")
     far.ask("estop")
-    eventually(lambda: bridge.ask("epoch") == far.ask("epoch"), within=3)
+    eventually(lambda: bridge.ask("epoch") == far.ask("epoch"))
 
 
 @pytest.mark.system
@@ -150,7 +150,7 @@ def test_peers_meet_again_when_the_broker_comes_back(join: Join, broker: MqttBro
     console.sees("sim-1")
     broker.stop()
     broker.start()
-    eventually(lambda: console.ask("ping", "sim-1", 1)["status"] == "ok", within=15)
+    eventually(lambda: console.ask("ping", "sim-1", 1)["status"] == "ok")
     assert sim.ask("reachable")
 
 
@@ -163,13 +163,13 @@ def test_a_stop_while_the_broker_is_away_stops_here_and_everybody_when_it_is_bac
     for peer in (sim, arm):
         peer.ask("start", "wave")
     broker.stop()
-    eventually(lambda: arm.ask("alive") is False, within=5, what="the broker is missed")
+    eventually(lambda: arm.ask("alive") is False, what="the broker is missed")
     assert arm.ask("estop")[1][0]["result"]["ok"] is True
     assert arm.ask("moving") is False
     assert sim.ask("moving") == ["left"]
     broker.start()
     eventually(lambda: sim.ask("epoch") == arm.ask("epoch"), within=25)
-    eventually(lambda: sim.ask("moving") == [], within=8)
+    eventually(lambda: sim.ask("moving") == [])
 
 
 @pytest.mark.system

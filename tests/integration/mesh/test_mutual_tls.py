@@ -36,7 +36,7 @@ def test_certified_peers_see_and_command_each_other_with_signed_messages(join: J
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
     assert console.ask("send", "sim-1", start, 5)["result"]["status"] == "success"
     console.ask("estop")
-    eventually(lambda: sim.ask("epoch"), within=3)
+    eventually(lambda: sim.ask("epoch"))
 
 
 def test_the_access_rules_keep_a_robot_from_commanding_another(join: Join, fleet: Fleet) -> None:
@@ -100,11 +100,11 @@ def test_an_expired_certificate_gets_no_link(join: Join, tmp_path: Path, port: i
 def test_a_peer_whose_certificate_expires_is_cut_off_at_that_time(join: Join, tmp_path: Path) -> None:
     authority = Authority(tmp_path / "fleet")
     console = join("console", "none", **certified(authority, "console", 3600))
-    sim = join("sim-1", **certified(authority, "sim-1", 7))
-    console.sees("sim-1", within=6)
+    sim = join("sim-1", **certified(authority, "sim-1", 15))
+    console.sees("sim-1")
     assert console.ask("ping", "sim-1")["status"] == "ok"
-    eventually(lambda: console.ask("ping", "sim-1", 0.3)["status"] != "ok", within=8)
-    eventually(lambda: console.ask("reachable") == [], within=11)
+    eventually(lambda: console.ask("ping", "sim-1", 0.3)["status"] != "ok")
+    eventually(lambda: console.ask("reachable") == [])
     assert sim.ask("alive") is not None
 
 
@@ -122,14 +122,14 @@ def test_the_fleet_of_the_guide_works_with_rules_and_stated_endpoints(join: Join
     console = join("console", "none", ZENOH_LISTEN=endpoint, **fleet["console"])
     two = join("sim-2", ZENOH_CONNECT=endpoint, **fleet["sim-2"])
     for peer, others in ((console, ("sim-1", "sim-2")), (one, ("console", "sim-2")), (two, ("console", "sim-1"))):
-        peer.sees(*others, within=12)
+        peer.sees(*others)
     assert console.ask("ping", "sim-1")["status"] == console.ask("ping", "sim-2")["status"] == "ok"
     assert one.ask("ping", "sim-2", 0.5)["status"] == "timeout"
     one.ask("start", "wave")
     # A robot commands nobody, but its emergency stop is everybody's.
     two.ask("estop")
-    eventually(lambda: one.ask("epoch") == console.ask("epoch") == two.ask("epoch"), within=3)
-    eventually(lambda: one.ask("moving") == [], within=2, what="it stands still")
+    eventually(lambda: one.ask("epoch") == console.ask("epoch") == two.ask("epoch"))
+    eventually(lambda: one.ask("moving") == [], what="it stands still")
     two.kill()
-    eventually(lambda: "sim-2" not in console.ask("reachable"), within=8)
-    eventually(lambda: "sim-2" not in one.ask("reachable"), within=8)
+    eventually(lambda: "sim-2" not in console.ask("reachable"))
+    eventually(lambda: "sim-2" not in one.ask("reachable"))

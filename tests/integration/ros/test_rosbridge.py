@@ -158,7 +158,7 @@ def test_a_lost_server_refuses_at_once_and_is_found_again_with_its_subscriptions
     server.ops.clear()
     heard.clear()
     server.start()
-    eventually(lambda: server.tell("/odom", {"n": 2}) and heard, within=10)
+    eventually(lambda: server.tell("/odom", {"n": 2}) and heard)
     link.publish("/cmd_vel", TWIST, {"back": 1})
     eventually(lambda: ("/cmd_vel", {"back": 1}) in server.published)
     assert [op["topic"] for op in server.seen("advertise")] == ["/cmd_vel"]
@@ -255,7 +255,7 @@ def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still
     assert rover.halt().stopped is False
     server.published.clear()
     server.start()
-    eventually(lambda: server.published, within=4, what="the hold's zero on the new connection")
+    eventually(lambda: server.published, what="the hold's zero on the new connection")
     assert server.published[0][1]["linear"]["x"] == 0.0
 
 
@@ -276,7 +276,7 @@ def test_a_server_that_returns_under_the_lockout_brings_zeros_for_their_whole_ti
         assert rover.holding
         server.published.clear()
         server.start()
-        eventually(lambda: not rover.holding, within=10, what="the end of the hold on the new connection")
+        eventually(lambda: not rover.holding, what="the end of the hold on the new connection")
         assert len(server.published) >= 10
         assert {message["linear"]["x"] for _, message in server.published} == {0.0}
         assert "e" * 32 in rover.drive(0.5)["reason"]
@@ -314,7 +314,7 @@ def test_a_clogged_connection_holds_up_neither_a_stop_nor_its_verdict(server: Ro
         stuffing.join(10)
         assert not stuffing.is_alive()
         assert not any(each["msg"]["linear"]["x"] for each in server.ops[before:] if each["op"] == "publish")
-        eventually(lambda: robot.halt("again").stopped, within=10)
+        eventually(lambda: robot.halt("again").stopped)
     finally:
         robot.disconnect()
 

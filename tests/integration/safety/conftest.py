@@ -39,7 +39,7 @@ class Stage:
         """Robots that are on the network and on the lane."""
         state = {"STRANDS_STATE_DIR": str(self.folder), **settings}
         child = self._stack.enter_context(robots(self.link, *ids, environment=state, within=self._here))
-        eventually(lambda: child.ask("ready"), 15, "the robots' stop lane")
+        eventually(lambda: child.ask("ready"), what="the robots' stop lane")
         return child
 
     def controller(self, controller_id: str = "safety-1", seed: str = "") -> Child:

@@ -51,7 +51,7 @@ def site_of(network: Network) -> Iterator[Callable[..., Site]]:
 
     def one(*names: str, **options: object) -> Site:
         made.append(Site(network[0], *names, **options))  # type: ignore[arg-type]
-        eventually(made[-1].ready, within=10)
+        eventually(made[-1].ready)
         return made[-1]
 
     yield one

@@ -107,7 +107,7 @@ def floor(link: LinkConfig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Floor]:
     monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "execute")
     made = Floor(link)
     try:
-        eventually(made.ready, within=15)
+        eventually(made.ready)
         yield made
     finally:
         made.close()

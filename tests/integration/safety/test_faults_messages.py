@@ -53,13 +53,13 @@ def stop_as(link: StopLink, robots: Child, source: str) -> str:
         link.publish(source, ESTOP, notification(ESTOP, {"estop_id": epoch, "t": time.time()}))
         return epoch in held(robots)
 
-    eventually(holds, 10, f"a stop of {source}")
+    eventually(holds, what=f"a stop of {source}")
     return epoch
 
 
 def test_the_allowlist_takes_globs_ignores_blanks_and_minds_the_case(stage: Stage, link: StopLink) -> None:
     robots = stage.robots("arm-1", DEVICE_CONNECT_ESTOP_ALLOW="safety-*, ,Guard")
-    eventually(lambda: link.up, 10)
+    eventually(lambda: link.up)
     stop_as(link, robots, "safety-7")
     stop_as(link, robots, "Guard")
     robots.ask("clear")
@@ -71,7 +71,7 @@ def test_the_allowlist_takes_globs_ignores_blanks_and_minds_the_case(stage: Stag
             link.publish(source, ESTOP, notification(ESTOP, {"estop_id": new_epoch()}))
         return strangers <= {each["source"] for each in events(robots, "estop_refused")}
 
-    eventually(all_refused, 15)
+    eventually(all_refused)
     # What was sent after all of them has arrived, and holds alone.
     assert robots.ask("facts")["arm-1"]["moving"]
     last = stop_as(link, robots, "safety-8")
@@ -80,21 +80,21 @@ def test_the_allowlist_takes_globs_ignores_blanks_and_minds_the_case(stage: Stag
 
 def test_a_blank_allowlist_is_no_list(stage: Stage, link: StopLink) -> None:
     robots = stage.robots("arm-1", DEVICE_CONNECT_ESTOP_ALLOW=" , ")
-    eventually(lambda: link.up, 10)
+    eventually(lambda: link.up)
     epoch = stop_as(link, robots, "anybody")
     assert eventually(lambda: [e for e in events(robots, "remote_estop_engaged") if e["estop_id"] == epoch])
 
 
 def test_a_recorded_stop_played_again_after_its_resume_holds_nobody(stage: Stage, link: StopLink) -> None:
     robots = stage.robots("arm-1")
-    eventually(lambda: link.up, 10)
+    eventually(lambda: link.up)
     recorded = notification(ESTOP, {"estop_id": new_epoch(), "t": time.time()})
 
     def holds() -> bool:
         link.publish("safety-1", ESTOP, recorded)
         return bool(held(robots))
 
-    eventually(holds, 10, "the first time")
+    eventually(holds, what="the first time")
     robots.ask("clear")
     robots.ask("move")
     for _ in range(20):
@@ -114,7 +114,7 @@ def test_a_signed_stop_comes_through_ten_thousand_forged_ones_a_second(stage: St
     robots.ask("move")
     before = robots.ask("facts")["arm-1"]
     forger.ask("forge", ["forger", "safety-9", "safety-1"], 10_000.0, 3.0)
-    eventually(lambda: {"forger", "safety-9"} <= {each["source"] for each in events(robots, "estop_refused")}, 10)
+    eventually(lambda: {"forger", "safety-9"} <= {each["source"] for each in events(robots, "estop_refused")})
     during = robots.ask("facts")["arm-1"]
     assert during["moving"]
     assert during["halts"] == before["halts"]
@@ -129,7 +129,7 @@ def test_a_signature_does_not_pass_from_one_source_or_stop_to_another(stage: Sta
     key = Ed25519PrivateKey.generate()
     public = ed25519.encode(ed25519.public_half(key))
     robots = stage.robots("arm-1", DEVICE_CONNECT_ESTOP_PUBLIC_KEYS=public)
-    eventually(lambda: link.up, 10)
+    eventually(lambda: link.up)
 
     def signed(source: str, **changed: Any) -> bytes:
         fields: dict[str, Any] = {"estop_id": new_epoch(), "t": time.time(), "nonce": new_epoch()}
@@ -144,14 +144,14 @@ def test_a_signature_does_not_pass_from_one_source_or_stop_to_another(stage: Sta
         link.publish("safety-4", ESTOP, signed("safety-4", t=time.time() + 1))
         return {"safety-2", "safety-3", "safety-4"} == {each["source"] for each in events(robots, "estop_refused")}
 
-    eventually(all_refused, 15)
+    eventually(all_refused)
     assert held(robots) == []
 
     def holds() -> bool:
         link.publish("safety-1", ESTOP, true)
         return bool(held(robots))
 
-    eventually(holds, 10, "the true one")
+    eventually(holds, what="the true one")
     assert len(held(robots)) == 1
 
 

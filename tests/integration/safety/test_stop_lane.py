@@ -67,7 +67,7 @@ def open_site(network: tuple[LinkConfig, Broker | None]) -> Iterator[Callable[..
     def one(*names: str, **options: Any) -> tuple[Site, Listener]:
         site, listener = Site(network[0], *names, **options), Listener(network[0])
         made.append((site, listener))
-        eventually(lambda: site.ready() and listener.link.up, within=10)
+        eventually(lambda: site.ready() and listener.link.up)
         if not options.get("decide", Decision)().signed:
             probe(site, listener)
         return site, listener
@@ -86,7 +86,7 @@ def probe(site: Site, listener: Listener) -> None:
         listener.send("probe-1", estop_id=epoch)
         return bool(listener.verdicts(epoch))
 
-    eventually(answered, within=10)
+    eventually(answered)
     site.plane.clear_local("test")
 
 
@@ -199,14 +199,14 @@ def test_a_broker_that_was_killed_is_noticed_and_the_next_stop_comes_through(
     eventually(lambda: not listener.link.up)
     assert listener.send("safety-1") is False
     broker.start()
-    eventually(lambda: site.ready() and listener.link.up, within=15)
+    eventually(lambda: site.ready() and listener.link.up)
 
     def stopped() -> bool:
         listener.send("safety-1", estop_id=epoch)
         return site.robots["arm-1"].refuses()
 
     epoch = new_epoch()
-    eventually(stopped, within=10)
+    eventually(stopped)
 
 
 def test_a_check_in_reaches_the_plane_from_who_may(open_site: Callable[..., tuple[Site, Listener]]) -> None:
