@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -37,8 +38,22 @@ class DeafLink:
         self.up = False
 
 
+class SteppingClock:
+    """Goes on by 10 ms with every look, so that how long a stop has lasted depends on no machine."""
+
+    time = staticmethod(time.time)
+
+    def __init__(self) -> None:
+        self._now = 0.0
+
+    def monotonic(self) -> float:
+        self._now += 0.01
+        return self._now
+
+
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> DeafLink:
+    monkeypatch.setattr(controllers, "time", SteppingClock())
     monkeypatch.setattr(controllers, "RENEW_S", 0.3)
     monkeypatch.setattr(controllers, "SETTLE_S", 0.05)
     return DeafLink()
