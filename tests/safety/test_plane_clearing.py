@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -81,7 +82,7 @@ def test_a_slip_laid_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane
     clearance.lay("ann", ["arm-1"])
     eventually(lambda: not robots["arm-1"].refuses())
     assert robots["arm-2"].refuses()
-    assert list(clearance.clearances().iterdir()) == []
+    eventually(lambda: list(clearance.clearances().iterdir()) == [])
 
 
 def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_says_of_a_third_that_it_is_free(
@@ -98,6 +99,51 @@ def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_say
     assert not after.refuses()
     cleared = [each for each in read_audit_log() if each["event"] == "resume_local"]
     assert {each["peer_id"] for each in cleared} == {"arm-1", "arm-2"}
+
+
+class SlowProcess:
+    """A process that takes every order for ``arm-1`` and carries it out when it is let go."""
+
+    def __init__(self) -> None:
+        self.doing, self.go_on = threading.Event(), threading.Event()
+        self._desk = clearance.ClearanceDesk(lambda: ["arm-1"], self._clear)
+        self._thread = threading.Thread(target=lambda: eventually(self._took, within=60))
+
+    def _clear(self, who: str, names: list[str]) -> None:
+        self.doing.set()
+        self.go_on.wait()
+
+    def _took(self) -> bool:
+        self._desk.look(0.0)
+        return self.doing.is_set()
+
+    def __enter__(self) -> SlowProcess:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.go_on.set()
+        self._thread.join()
+
+
+def test_cleared_is_said_once_the_process_has_done_it() -> None:
+    said: list[dict[str, str]] = []
+    asking = threading.Thread(target=lambda: said.append(clearance.clear_here("ann", ["arm-1"], wait_s=30)))
+    with SlowProcess() as process:
+        asking.start()
+        assert process.doing.wait(20)
+        asking.join(0.2)
+        assert said == []
+        process.go_on.set()
+        asking.join()
+    assert said == [{"arm-1": "cleared"}]
+
+
+def test_an_order_that_its_process_does_not_carry_out_is_not_said_to_be_cleared() -> None:
+    with SlowProcess():
+        said = clearance.clear_here("ann", ["arm-1"], wait_s=2.0)
+    assert "has not carried it out" in said["arm-1"]
+    assert list(clearance.clearances().iterdir()) == []
 
 
 def test_a_slip_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:

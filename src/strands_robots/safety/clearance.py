@@ -51,8 +51,9 @@ def lay(who: str, robot_ids: Iterable[str]) -> list[Path]:
 def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[str, str]:
     """Clear robots of this machine at the word of ``who``, whether their process runs or not.
 
-    Returns, for each name: ``cleared`` by its running process, ``cleared on disk`` where none runs, or ``not locked
-    here``. Recorded in the audit either way.
+    Returns, for each name: ``cleared`` once its running process has done so and kept it, ``cleared on disk`` where
+    none runs, ``not locked here``, or that the process took the order and has not carried it out in ``wait_s``
+    seconds. Recorded in the audit either way.
 
     Raises:
         ValidationError: ``who`` is blank, or a name is no identifier.
@@ -60,18 +61,38 @@ def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[
     """
     names = list(dict.fromkeys(robot_ids))
     slips = dict(zip(names, lay(who, names), strict=True))
-    deadline = time.monotonic() + wait_s
-    while any(path.exists() for path in slips.values()) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    _until(lambda: not any(path.exists() for path in slips.values()), wait_s)
     outcome: dict[str, str] = {}
     for name, path in slips.items():
         try:
             path.unlink()
         except FileNotFoundError:
-            outcome[name] = "cleared"
+            outcome[name] = _answered(path, wait_s)
         else:
             outcome[name] = "cleared on disk" if _clear_on_disk(who, name) else "not locked here"
     return outcome
+
+
+def _answered(slip: Path, wait_s: float) -> str:
+    taken = _taken(slip)
+    if _until(lambda: not taken.exists(), wait_s):
+        return "cleared"
+    taken.unlink(missing_ok=True)
+    return "its process took the order and has not carried it out; ask for its state"
+
+
+def _until(condition: Callable[[], bool], wait_s: float) -> bool:
+    deadline = time.monotonic() + wait_s
+    while not condition():
+        if time.monotonic() >= deadline:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def _taken(slip: Path) -> Path:
+    """Where a slip lies while the process that took it clears the robot."""
+    return slip.with_suffix(".taken")
 
 
 def _clear_on_disk(who: str, name: str) -> bool:
@@ -117,10 +138,13 @@ class ClearanceDesk:
         for path, slip in _slips():
             if slip["robot_id"] not in self._here():
                 continue
-            with contextlib.suppress(FileNotFoundError):  # another process took it
-                path.unlink()
-                if -5.0 < time.time() - slip["t"] < VALID_S:
-                    self._clear(slip["who"], [slip["robot_id"]])
+            try:
+                taken = path.replace(_taken(path))
+            except FileNotFoundError:
+                continue  # another process took it
+            if -5.0 < time.time() - slip["t"] < VALID_S:
+                self._clear(slip["who"], [slip["robot_id"]])
+            taken.unlink(missing_ok=True)
 
 
 def _slips() -> Iterator[tuple[Path, dict[str, Any]]]:
