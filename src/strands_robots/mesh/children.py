@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.contract import Observer, Unsubscribe, WorldRobot
@@ -99,6 +100,8 @@ class _Child:
     context: Context
     herald: Herald
     held: list[Subscription]
+    leaving: threading.Lock = field(default_factory=threading.Lock)
+    gone: bool = False
 
 
 class Children:
@@ -155,7 +158,10 @@ class Children:
 
     def announce(self) -> None:
         for child in list(self._children.values()):
-            child.herald.announce()
+            with child.leaving:
+                # A heartbeat after its token went would have it in reach again.
+                if not child.gone:
+                    child.herald.announce()
 
     def close(self) -> None:
         self._open = False
@@ -209,6 +215,8 @@ class Children:
 
     @staticmethod
     def _end(child: _Child) -> None:
+        with child.leaving:
+            child.gone = True
         for each in child.held:
             with contextlib.suppress(TransportError):  # the session may be gone already, and the subscriber with it
                 each.undeclare()
