@@ -163,10 +163,16 @@ class DeviceBody:
         # Halts take turns on the freezer's thread, so that nobody else counts here.
         self._stops += 1
         try:
-            with self.lock:
-                yield
-        finally:
+            self.lock.acquire()
+        except BaseException:
             self._stops -= 1
+            raise
+        try:
+            yield
+        finally:
+            # Before the bus is free: whoever reads next waits for no stop that is over.
+            self._stops -= 1
+            self.lock.release()
 
     def stop(self) -> None:
         """Freeze, or let go, as the stop level says.
