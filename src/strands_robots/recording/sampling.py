@@ -85,10 +85,11 @@ class RobotRecording:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._look()
         self._ending.set()
         for thread in self._threads:
             thread.join()
+        # After the thread that looks has ended: of two looks at a time each would tell of the same halt.
+        self._look()
         self._unsubscribe()
         if self.skipped:
             self._recorder.take(self._device, "samplesSkipped", dict(self.skipped))
