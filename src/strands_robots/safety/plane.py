@@ -182,9 +182,12 @@ class SafetyPlane:
                 return
             self._robots = {name: each for name, each in self._robots.items() if each is not entry}
             self._bequeath(entry)
-            reporter, self._reporter = self._reporter, None if not self._robots else self._reporter
-        if not self._robots and reporter is not None:
-            reporter.close()
+            # Decided here: a robot that registers meanwhile has a reporter of its own, and this one ends all the same.
+            last = None
+            if not self._robots:
+                last, self._reporter = self._reporter, None
+        if last is not None:
+            last.close()
         entry.worker.close()
 
     def _inherit(self, entry: Registered) -> None:
