@@ -61,7 +61,7 @@ def flush_audit(timeout: float = FLUSH_S) -> bool:
 
 def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
     """Every record over all rotations, oldest first; with ``since`` (wall-clock s) only those not older."""
-    flush_audit()
+    flush_audit(FLUSH_S)
     records = _journal(_journal_key()).records()
     return [each for each in records if since is None or _time(each) >= since]
 
@@ -70,7 +70,7 @@ def verify_audit_integrity() -> dict[str, Any]:
     """Counts ``total``, ``signed``, ``verified``, ``bad``, ``missing``, ``gaps``, ``torn``, ``broken``, the list
     ``breaks`` that says where, ``head``, and ``ok``; see :func:`strands_robots.safety.integrity.verify`.
     """
-    flush_audit()
+    flush_audit(FLUSH_S)
     key = _journal_key()
     return integrity.verify(_journal(key), keyed=key[1] is not None)
 
