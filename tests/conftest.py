@@ -8,16 +8,21 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots import settings
+from strands_robots import audit, settings
 from strands_robots.audit import flush_audit
 
 # What is set in the shell that starts the tests would change what they say; how pictures are made stays as it is.
 for setting in settings.declared():
     if setting.name not in {"DISPLAY", "MUJOCO_GL"}:
         os.environ.pop(setting.name, None)
+
+# An example may take as long as a busy machine lets it; what is shown is what the code does, not how fast.
+hypothesis.settings.register_profile("patient", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+hypothesis.settings.load_profile("patient")
 
 # A shell starts background jobs with Ctrl-C ignored, and every process that a test starts would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -38,6 +43,8 @@ def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     directory = tmp_path_factory.mktemp("state")
     directory.chmod(0o700)
     monkeypatch.setenv("STRANDS_STATE_DIR", str(directory))
+    # Whoever reads the audit waits for a slow disk.
+    monkeypatch.setattr(audit, "FLUSH_S", 20.0)
     yield directory
     flush_audit(0.5)
 
@@ -54,4 +61,4 @@ def no_thread_of_ours_left(state_directory: Path) -> Iterator[None]:
     def left() -> list[str]:
         return [t.name for t in threading.enumerate() if t not in before and t.name.startswith(OURS)]
 
-    eventually(lambda: not left(), within=10, what=f"the end of {left()}")
+    eventually(lambda: not left(), what=f"the end of {left()}")

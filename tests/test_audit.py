@@ -36,7 +36,7 @@ def journal(tmp_path: Path) -> Journal:
 def test_an_event_is_recorded_with_its_fields_sorted_and_compact(state_directory: Path) -> None:
     before = time.time()
     log_safety_event("emergency_stop", "arm-1", {"reason": "smoke"})
-    assert flush_audit()
+    assert flush_audit(20)
     line = (state_directory / NAME).read_text().strip()
     record = json.loads(line)
     assert line == json.dumps(record, sort_keys=True, separators=(",", ":"))
@@ -49,7 +49,7 @@ def test_an_event_is_recorded_with_its_fields_sorted_and_compact(state_directory
 def test_the_directory_is_made_for_its_owner_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("STRANDS_MESH_AUDIT_DIR", str(tmp_path / "audit"))
     log_safety_event("emergency_stop", "arm-1", {})
-    assert flush_audit()
+    assert flush_audit(20)
     assert stat.S_IMODE((tmp_path / "audit").stat().st_mode) == 0o700
 
 
@@ -179,11 +179,10 @@ def test_a_link_in_place_of_the_log_is_not_followed_and_the_record_waits(
     (state_directory / NAME).symlink_to(target)
     log_safety_event("emergency_stop", "arm-1", {"reason": "smoke"})
     assert not flush_audit(0.2)
+    eventually(lambda: "smoke" in caplog.text and "CRITICAL" in caplog.text, what="the writer's complaint")
     assert target.read_text() == ""
-    assert "smoke" in caplog.text
-    assert "CRITICAL" in caplog.text
     (state_directory / NAME).unlink()
-    assert flush_audit(5)
+    assert flush_audit(20)
     assert read_audit_log()[0]["payload"] == {"reason": "smoke"}
 
 
@@ -192,7 +191,7 @@ def test_logging_does_not_wait_while_another_process_holds_the_lock(state_direct
         fcntl.flock(lock, fcntl.LOCK_EX)
         log_safety_event("emergency_stop", "arm-1", {})
         assert not flush_audit(0.1)
-    assert flush_audit(5)
+    assert flush_audit(20)
     assert len(read_audit_log()) == 1
 
 

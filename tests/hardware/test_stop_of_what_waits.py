@@ -13,6 +13,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot, tasks
+from strands_robots.safety.gate import Permit
 from strands_robots.teleop import ScriptedLeader
 
 WAVES = {"pan.pos": (0.0, 50.0, 1.0)}
@@ -39,7 +40,7 @@ def loading(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
 
     def slow(name: str, **options: Any) -> ScriptedPolicy:
         asked.set()
-        assert ready.wait(10)
+        assert ready.wait(60)
         return ScriptedPolicy([], always={"pan.pos": 90.0})
 
     ready.asked = asked  # type: ignore[attr-defined]
@@ -55,17 +56,30 @@ def on_a_thread(call: Callable[[], Any]) -> tuple[threading.Thread, list[Any]]:
     return thread, answers
 
 
+def line_of(robot: HardwareRobot) -> threading.Semaphore:
+    """Released each time that a motion is given leave: from then on it stands in line, and a halt reaches it."""
+    given, permit = threading.Semaphore(0), robot.gate.permit
+
+    def giving(verb: str) -> Permit:
+        leave = permit(verb)
+        given.release()
+        return leave
+
+    robot.gate.permit = giving  # type: ignore[method-assign]
+    return given
+
+
 STOPS = {"stop_task": lambda robot: robot.stop_task(), "halt": lambda robot: robot.halt("test").envelope()}
 
 
 @pytest.mark.parametrize("verb", STOPS)
 def test_a_stop_reaches_a_task_whose_policy_still_loads(robot: HardwareRobot, loading: Any, verb: str) -> None:
     thread, answers = on_a_thread(lambda: robot.start_task("wave"))
-    assert loading.asked.wait(5)
+    assert loading.asked.wait(20)
     assert STOPS[verb](robot)["stopped"] is True
     written = len(robot.device.writes)
     loading.set()
-    thread.join(5)
+    thread.join(20)
     assert "halted after it was asked for" in answers[0]["reason"]
     assert not robot.occupied("waiting")
     assert len(robot.device.writes) == written
@@ -84,16 +98,19 @@ def test_a_halt_reaches_what_stands_in_line_behind_a_loading_policy(
     robot: HardwareRobot, loading: Any, motion: Callable[[HardwareRobot], Any]
 ) -> None:
     robot.attach_teleop(ScriptedLeader(WAVES))
+    given = line_of(robot)
     first, _ = on_a_thread(lambda: robot.start_task("wave"))
-    assert loading.asked.wait(5)
+    assert loading.asked.wait(20)
+    assert given.acquire(timeout=20)
     second, answers = on_a_thread(lambda: motion(robot))
+    assert given.acquire(timeout=20), "it stands in line"
     second.join(0.1)
-    assert second.is_alive(), "it stands in line"
+    assert second.is_alive()
     assert robot.halt("test").stopped is True
     written = len(robot.device.writes)
     loading.set()
-    first.join(5)
-    second.join(5)
+    first.join(20)
+    second.join(20)
     assert answers[0]["status"] == "error"
     assert not robot.occupied("waiting")
     assert not robot.teleoperating()
@@ -103,14 +120,14 @@ def test_a_halt_reaches_what_stands_in_line_behind_a_loading_policy(
 def test_a_leader_that_stands_in_line_is_stopped_by_its_own_stop(robot: HardwareRobot, loading: Any) -> None:
     robot.attach_teleop(ScriptedLeader(WAVES))
     first, _ = on_a_thread(lambda: robot.start_task("wave"))
-    assert loading.asked.wait(5)
+    assert loading.asked.wait(20)
     second, answers = on_a_thread(lambda: robot.teleoperate("leader"))
-    second.join(0.1)
+    eventually(lambda: "leader" in list(robot._teleop_waiting._permits.values()), what="it stands in line")
     assert robot.stop_teleoperate()["stopped"] is True
     robot.stop_task()
     loading.set()
-    first.join(5)
-    second.join(5)
+    first.join(20)
+    second.join(20)
     assert "halted after it was asked for" in answers[0]["reason"]
     assert not robot.teleoperating()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import threading
-import time
+from collections.abc import Callable
 
 from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
@@ -13,21 +13,19 @@ from strands_robots.hardware import DeviceBody, HardwareRobot
 
 
 class SilentDevice(RecordingDevice):
-    """Gives no answer: each exchange is waited for and then lost."""
-
-    PATIENCE_S = 0.1
+    """Loses the answers to its next exchanges; each of them is waited for as ``wait`` does."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.silent = False
-        self.asked = threading.Event()
+        self.lost = 0
+        self.wait: Callable[[], object] = lambda: None
         self.began = 0
 
     def get_joints(self) -> dict[str, float]:
         self.began += 1
-        self.asked.set()
-        if self.silent:
-            time.sleep(self.PATIENCE_S)
+        if self.lost:
+            self.lost -= 1
+            self.wait()
             raise ConnectionError("no status packet")
         return dict(self.positions)
 
@@ -61,8 +59,13 @@ def test_a_robot_that_nobody_cleans_up_takes_the_thread_along() -> None:
 def test_a_read_that_lost_an_answer_gives_the_bus_to_a_stop_instead_of_asking_again() -> None:
     device = SilentDevice()
     body = DeviceBody("arm", device)
-    device.silent = True
-    failed: list[Exception] = []
+    asked, failed = threading.Event(), list[Exception]()
+
+    def wait() -> None:
+        asked.set()
+        eventually(lambda: body.stop_waits, what="the stop, while the exchange is under way")
+
+    device.lost, device.wait = 9, wait
 
     def read() -> None:
         try:
@@ -72,11 +75,10 @@ def test_a_read_that_lost_an_answer_gives_the_bus_to_a_stop_instead_of_asking_ag
 
     reader = threading.Thread(target=read)
     reader.start()
-    assert device.asked.wait(5)
+    assert asked.wait(20)
     with body.stopping():
         assert device.began == 1, "the exchange that was under way, and no other"
-        device.silent = False
-    reader.join(5)
+    reader.join(20)
     assert len(failed) == 1
 
 
@@ -84,8 +86,7 @@ def test_the_stop_itself_asks_again() -> None:
     device = SilentDevice()
     robot = HardwareRobot(device, "arm")
     robot.connect()
-    device.silent = True
-    threading.Timer(1.5 * SilentDevice.PATIENCE_S, lambda: setattr(device, "silent", False)).start()
+    device.lost = 2
     assert robot.halt("test").stopped is True
     assert device.writes
     robot.cleanup()

@@ -31,7 +31,7 @@ def test_the_first_frames_glide_from_where_the_follower_stands() -> None:
 
 
 def test_targets_are_clamped_and_keys_that_the_follower_has_not_are_counted_unusable() -> None:
-    leader = bounded(lambda: {"elbow.pos": 1.0})
+    leader = bounded(lambda: {"elbow.pos": 1.0}, now=lambda: 5.0)
     with pytest.raises(ValidationError, match=r"elbow\.pos"):
         leader.get_action()
     assert not leader.done.is_set()

@@ -91,10 +91,15 @@ def test_a_finished_recording_completes_the_teleoperation_and_the_follower_holds
     device = RecordingDevice()
     robot = HardwareRobot(device)
     robot.connect()
-    robot.attach_teleop(RecordedLeader([(0.0, {"pan.pos": 10.0}), (0.2, {"pan.pos": 20.0})]), "tape")
+    watch = Watch()
+    robot.attach_teleop(RecordedLeader([(0.0, {"pan.pos": 10.0}), (0.2, {"pan.pos": 20.0})], now=watch), "tape")
     assert robot.teleoperate("tape")["status"] == "success"
+    eventually(lambda: device.writes)
+    watch.seconds += 0.18
+    eventually(lambda: device.positions["pan.pos"] == pytest.approx(19))
+    watch.seconds += 0.1
     eventually(lambda: robot.teleop_status()["leaders"]["tape"]["state"] == "completed")
-    assert 15 < device.positions["pan.pos"] <= 20
+    assert device.positions["pan.pos"] == pytest.approx(19)
     robot.cleanup()
 
 

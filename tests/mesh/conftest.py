@@ -8,10 +8,16 @@ from pathlib import Path
 import pytest
 from tests.mesh.peers import Fleet, fleet
 
+from strands_robots.mesh import input as input_module
+from strands_robots.mesh import safety
+
 
 @pytest.fixture
 def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
     monkeypatch.setenv("STRANDS_MESH_AUDIT_DIR", str(tmp_path / "audit"))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path / "state"))
+    # Who is there answers when a busy machine lets it; a test with somebody who never does has less patience.
+    monkeypatch.setattr(safety, "COLLECT_S", 20.0)
+    monkeypatch.setattr(input_module, "_INPUT_JOIN_TIMEOUT_S", 20.0)
     with fleet(tmp_path) as joined:
         yield joined

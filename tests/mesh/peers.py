@@ -52,7 +52,7 @@ class Fleet:
     def parts(self, peer_id: str, *, identity: Identity | None = None, sessionless: bool = False) -> Parts:
         transport = MemoryTransport(self.bus, sessionless=sessionless)
         self.transports[peer_id] = transport
-        own = self.planes[peer_id] = SafetyPlane(LockoutStore(self._folder / peer_id))
+        own = self.planes[peer_id] = SafetyPlane(LockoutStore(self._folder / peer_id), deadline_s=20.0)
 
         def acquire() -> MemoryTransport:
             transport.connect()

@@ -31,19 +31,19 @@ def test_each_robot_of_a_world_is_announced_and_answers_for_itself(peers: Fleet)
     row = console.peers_by_id["sim-1__left"]
     assert (row["type"], row["tool_name"], row["sim_robots"]) == ("sim", "left", ["left"])
     assert console.peer_wire_zid("sim-1__left") == console.peer_wire_zid("sim-1")
-    assert console.ping("sim-1__right")["status"] == "ok"
-    assert console.send("sim-1__left", START, timeout=5)["result"]["status"] == "success"
+    assert console.ping("sim-1__right", timeout=20)["status"] == "ok"
+    assert console.send("sim-1__left", START, timeout=20)["result"]["status"] == "success"
     assert world.running == {"left": "wave"}
-    status = console.send("sim-1__right", {"action": "status"}, timeout=5)["result"]
+    status = console.send("sim-1__right", {"action": "status"}, timeout=20)["result"]
     assert (status["task_status"], status["robots"]) == ("idle", ["right"])
-    assert list(console.send("sim-1__left", {"action": "state"}, timeout=5)["result"]["robots"]) == ["left"]
+    assert list(console.send("sim-1__left", {"action": "state"}, timeout=20)["result"]["robots"]) == ["left"]
 
 
 def test_the_stop_of_a_child_stops_its_robot_alone(peers: Fleet) -> None:
     world, _, console = joined(peers)
     for name in ("left", "right"):
-        console.send(f"sim-1__{name}", START, timeout=5)
-    stopped = console.send("sim-1__left", {"action": "stop"}, timeout=5)["result"]
+        console.send(f"sim-1__{name}", START, timeout=20)
+    stopped = console.send("sim-1__left", {"action": "stop"}, timeout=20)["result"]
     assert (stopped["ok"], stopped["stopped"]) == (True, ["left"])
     assert world.running == {"right": "wave"}
 
@@ -59,14 +59,14 @@ class Led(World):
 
     def send_action(self, action: dict[str, float]) -> Envelope:
         self.asked.release()
-        self.free.wait(10)
+        self.free.wait(60)
         refusal = self.gate.refusal("send_action")
         self.sent.append(refusal is None)
         return refusal or success("sent")
 
     def step(self, n: int = 1) -> Envelope:
         self.asked.release()
-        self.free.wait(10)
+        self.free.wait(60)
         return super().step(n)
 
 
@@ -75,7 +75,7 @@ def test_the_stop_of_a_child_ends_the_streams_that_drive_its_world(peers: Fleet)
     _, console, lead = peers.join(world, "sim-1", "sim"), peers.join(None, "console"), peers.join(None, "lead")
     eventually(lambda: "sim-1__left" in console.peers_by_id)
     receive = {"action": "teleop_receive", "source_peer_id": "lead"}
-    assert console.send("sim-1", receive, timeout=5)["result"]["status"] == "success"
+    assert console.send("sim-1", receive, timeout=20)["result"]["status"] == "success"
 
     def lead_on(sequence: int) -> None:
         frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": sequence}
@@ -85,10 +85,10 @@ def test_the_stop_of_a_child_ends_the_streams_that_drive_its_world(peers: Fleet)
     eventually(lambda: world.sent == [True])
     world.free.clear()
     lead_on(2)
-    assert world.asked.acquire(timeout=2)
-    assert world.asked.acquire(timeout=2)
-    assert console.send("sim-1__left", {"action": "stop"}, timeout=5)["result"]["ok"] is True
-    assert console.send("sim-1", {"action": "teleop_status"}, timeout=5)["result"]["streams"] == []
+    assert world.asked.acquire(timeout=20)
+    assert world.asked.acquire(timeout=20)
+    assert console.send("sim-1__left", {"action": "stop"}, timeout=20)["result"]["ok"] is True
+    assert console.send("sim-1", {"action": "teleop_status"}, timeout=20)["result"]["streams"] == []
     lead_on(3)
     world.free.set()
     eventually(lambda: world.sent == [True, False], what="the frame that waited for the bus to be refused")
@@ -105,20 +105,20 @@ def test_the_stop_of_one_robot_reaches_its_starts_in_line_wherever_they_were_ask
     answers: dict[str, Any] = {}
 
     def ask(name: str, peer: str, command: dict[str, Any]) -> threading.Thread:
-        thread = threading.Thread(target=lambda: answers.update({name: console.send(peer, command, timeout=9)}))
+        thread = threading.Thread(target=lambda: answers.update({name: console.send(peer, command, timeout=20)}))
         thread.start()
         return thread
 
     threads = [ask(f"step-{n}", "sim-1", {"action": "step", "steps": 1}) for n in range(4)]
-    assert all(world.asked.acquire(timeout=5) for _ in threads)
+    assert all(world.asked.acquire(timeout=20) for _ in threads)
     threads += [ask(name, f"sim-1__{name}", START) for name in ("left", "right")]
     threads.append(ask("by name", "sim-1", {**START, "robot_name": "left"}))
     eventually(lambda: mesh._assembled.lanes.commands._queue.qsize() == 3)
     stop = {"action": "stop", **({"robot_name": "left"} if stopped == "sim-1" else {})}
-    assert console.send(stopped, stop, timeout=5)["result"]["ok"] is True
+    assert console.send(stopped, stop, timeout=20)["result"]["ok"] is True
     world.free.set()
     for thread in threads:
-        thread.join(9)
+        thread.join(20)
     assert [answers[name]["result"]["status"] for name in ("left", "by name", "right")] == ["error", "error", "success"]
     assert list(world.running) == ["right"]
 
@@ -129,13 +129,14 @@ def test_a_fleets_stop_of_one_name_leaves_the_robots_of_others_alone(peers: Flee
     console = peers.join(None, "console")
     eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id))
     for name in ("left", "right"):
-        console.send(f"sim-1__{name}", START, timeout=5)
-    answers = console.broadcast({"action": "stop", "robot_name": "right"}, 0.5)
-    assert {each["responder_id"]: each["result"]["ok"] for each in answers} == {
-        "sim-1": True,
-        "sim-1__left": False,
-        "sim-1__right": True,
-    }
+        console.send(f"sim-1__{name}", START, timeout=20)
+
+    def told() -> dict[str, bool]:
+        answers = console.broadcast({"action": "stop", "robot_name": "right"}, 0.5)
+        return {each["responder_id"]: each["result"]["ok"] for each in answers}
+
+    # Those that a busy machine lets answer later are asked again.
+    eventually(lambda: told() == {"sim-1": True, "sim-1__left": False, "sim-1__right": True})
     eventually(lambda: [row["robot"] for row in world.list_policies_running()] == ["left"])
     steps = world.rollouts["left"].steps
     eventually(lambda: world.rollouts["left"].steps > steps + 5)
@@ -145,20 +146,20 @@ def test_a_fleets_stop_of_one_name_leaves_the_robots_of_others_alone(peers: Flee
 @pytest.mark.parametrize("action", ["step", "reset", "teleop_status"])
 def test_what_concerns_the_world_is_refused_by_its_robots(peers: Fleet, action: str) -> None:
     world, _, console = joined(peers)
-    assert console.send("sim-1__left", {"action": action}, timeout=5)["result"]["status"] == "error"
+    assert console.send("sim-1__left", {"action": action}, timeout=20)["result"]["status"] == "error"
     assert world.steps == 0
 
 
 def test_an_emergency_stop_finds_no_child_silent_and_locks_them(peers: Fleet) -> None:
     world, mesh, console = joined(peers)
-    console.send("sim-1__left", START, timeout=5)
+    console.send("sim-1__left", START, timeout=20)
     answers = console.emergency_stop()
     assert {answer["responder_id"] for answer in answers} == {"sim-1", "sim-1__left", "sim-1__right"}
     recorded = peers.events("emergency_stop")[0]
     assert (recorded["not_stopped"], recorded["silent"]) == ([], [])
     assert world.running == {}
     eventually(lambda: mesh.lockout_epoch is not None)
-    assert console.send("sim-1__left", START, timeout=5)["error"] == "command rejected"
+    assert console.send("sim-1__left", START, timeout=20)["error"] == "command rejected"
 
 
 def test_robots_come_and_go_with_their_world(peers: Fleet) -> None:

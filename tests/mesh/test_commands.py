@@ -39,11 +39,11 @@ def ask(
 def test_a_ping_is_answered_by_the_mesh_alone(peers: Fleet) -> None:
     peers.join(Arm(), "arm-1")
     console = peers.join(None, "console")
-    answer = console.ping("arm-1")
+    answer = console.ping("arm-1", timeout=20)
     assert answer["status"] == "ok"
     assert answer["via"] == "publish"
     assert answer["confirmed"] is False
-    assert 0 <= answer["latency_ms"] < 2000
+    assert 0 <= answer["latency_ms"] < 20_000
 
 
 def test_a_peer_that_is_not_there_times_out(peers: Fleet) -> None:
@@ -55,10 +55,10 @@ def test_a_simulation_runs_what_it_is_told(peers: Fleet) -> None:
     world = World("left")
     peers.join(world, "sim-1", "sim")
     console = peers.join(None, "console")
-    reply = console.send("sim-1", {"action": "start", "instruction": "wave", "policy_provider": "mock"}, timeout=5)
+    reply = console.send("sim-1", {"action": "start", "instruction": "wave", "policy_provider": "mock"}, timeout=20)
     assert reply["result"]["status"] == "success"
     assert world.running == {"left": "wave"}
-    reply = console.send("sim-1", {"action": "stop"}, timeout=5)
+    reply = console.send("sim-1", {"action": "stop"}, timeout=20)
     assert reply["result"] == {"ok": True, "stopped": ["left"], "not_stopped": [], "results": {"left": "stopped"}}
 
 
@@ -67,8 +67,8 @@ def test_an_empty_robot_name_is_refused_by_a_world_of_several(peers: Fleet) -> N
     peers.join(world, "sim-1", "sim")
     console = peers.join(None, "console")
     command = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
-    assert console.send("sim-1", command, timeout=5)["result"]["status"] == "error"
-    assert console.send("sim-1", {**command, "robot_name": "right"}, timeout=5)["result"]["status"] == "success"
+    assert console.send("sim-1", command, timeout=20)["result"]["status"] == "error"
+    assert console.send("sim-1", {**command, "robot_name": "right"}, timeout=20)["result"]["status"] == "success"
     assert world.running == {"right": "wave"}
 
 
@@ -76,7 +76,7 @@ def test_an_empty_robot_name_is_refused_by_a_world_of_several(peers: Fleet) -> N
 def test_reads_are_answered_with_the_robots_own_envelope(peers: Fleet, action: str) -> None:
     peers.join(Arm(), "arm-1")
     console = peers.join(None, "console")
-    assert console.send("arm-1", {"action": action}, timeout=5)["result"]["status"] == "success"
+    assert console.send("arm-1", {"action": action}, timeout=20)["result"]["status"] == "success"
 
 
 def test_real_hardware_does_not_move_without_the_operators_approval(
@@ -86,13 +86,13 @@ def test_real_hardware_does_not_move_without_the_operators_approval(
     peers.join(arm, "arm-1")
     console = peers.join(None, "console")
     command = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 0.5}
-    reply = console.send("arm-1", command, timeout=5)
+    reply = console.send("arm-1", command, timeout=20)
     assert reply["type"] == "error"
     assert "operator approval" in reply["error"]
     assert peers.events("wire_motion_refused")
     assert not arm.started
     monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "start@arm-1")
-    assert console.send("arm-1", command, timeout=5)["result"]["status"] == "success"
+    assert console.send("arm-1", command, timeout=20)["result"]["status"] == "success"
     assert arm.started == ["wave"]
 
 
@@ -105,8 +105,8 @@ def test_a_grant_is_not_spent_by_a_sender_that_is_not_attributed(peers: Fleet, m
     forged = ask(peers, peers.stranger(), "arm-1", {"command": command})
     assert "operator approval" in forged[0]["error"]
     assert not arm.started
-    assert console.send("arm-1", command, timeout=5)["result"]["status"] == "success"
-    assert "operator approval" in console.send("arm-1", command, timeout=5)["error"]
+    assert console.send("arm-1", command, timeout=20)["result"]["status"] == "success"
+    assert "operator approval" in console.send("arm-1", command, timeout=20)["error"]
 
 
 def test_execute_waits_until_the_policy_has_ended(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +127,7 @@ def test_leaving_the_mesh_ends_an_execute_with_the_reason(peers: Fleet, monkeypa
     asking.start()
     eventually(lambda: arm.moving)
     left.set()
-    asking.join(5)
+    asking.join(20)
     assert answers[0]["status"] == "error"
     assert "left the mesh" in answers[0]["reason"]
 
@@ -189,7 +189,7 @@ def test_what_a_robot_raises_does_not_leave_the_process(peers: Fleet) -> None:
 
     peers.join(Broken(), "arm-1")
     console = peers.join(None, "console")
-    reply = console.send("arm-1", {"action": "status"}, timeout=5)
+    reply = console.send("arm-1", {"action": "status"}, timeout=20)
     assert reply["error"] == "dispatch error"
     assert "secret" not in json.dumps(reply)
 
@@ -199,7 +199,7 @@ def test_a_full_queue_answers_busy_and_stop_and_ping_still_work(peers: Fleet) ->
 
     class Slow(Arm):
         def get_features(self) -> dict[str, Any]:
-            release.wait(10)
+            release.wait(60)
             return super().get_features()
 
     arm = Slow()
@@ -214,8 +214,8 @@ def test_a_full_queue_answers_busy_and_stop_and_ping_still_work(peers: Fleet) ->
         body = {"sender_id": "flood", "turn_id": f"t{turn}", "command": {"action": "features"}}
         stranger.put("strands/arm-1/cmd", body)
     assert "busy" in errors
-    assert mesh.ping("arm-1")["status"] == "ok"
-    assert mesh.send("arm-1", {"action": "stop"}, timeout=2)["result"]["ok"] is True
+    assert mesh.ping("arm-1", timeout=20)["status"] == "ok"
+    assert mesh.send("arm-1", {"action": "stop"}, timeout=20)["result"]["ok"] is True
     release.set()
 
 
@@ -224,7 +224,7 @@ def test_a_stop_reaches_the_commands_that_still_wait_for_their_turn(peers: Fleet
 
     class Slow(World):
         def reset(self) -> dict[str, Any]:
-            release.wait(10)
+            release.wait(60)
             return super().reset()
 
     world = Slow("left")
@@ -242,7 +242,7 @@ def test_a_stop_reaches_the_commands_that_still_wait_for_their_turn(peers: Fleet
     for turn, command in enumerate([{"action": "reset"}] * 4 + [start]):
         body = {"sender_id": "agent", "turn_id": f"t{turn}", "timestamp": peers.clock(), "command": command}
         stranger.put("strands/sim-1/cmd", body)
-    assert console.send("sim-1", {"action": "stop"}, timeout=2)["result"]["ok"] is True
+    assert console.send("sim-1", {"action": "stop"}, timeout=20)["result"]["ok"] is True
     release.set()
     eventually(lambda: "t4" in results)
     assert "halted after it was asked for" in results["t4"]["reason"]
@@ -323,7 +323,7 @@ def test_a_second_reply_of_one_peer_is_dropped(peers: Fleet) -> None:
 def test_without_sessions_a_reply_is_the_brokers_word(peers: Fleet) -> None:
     peers.join(World("left"), "sim-1", "sim", sessionless=True)
     console = peers.join(None, "console", sessionless=True)
-    assert console.ping("sim-1")["status"] == "ok"
+    assert console.ping("sim-1", timeout=20)["status"] == "ok"
 
 
 @pytest.mark.parametrize("command", [{"action": "stop", "duration": -1}, {"action": "teleop_stop", "steps": 2.5}])
@@ -350,13 +350,13 @@ def test_a_plug_ins_policy_is_known_on_the_wire(peers: Fleet, monkeypatch: pytes
     peers.join(world, "sim-1", "sim")
     console = peers.join(None, "console")
     start = {"action": "start", "instruction": "wave", "policy_provider": "house_made"}
-    refused = console.send("sim-1", start, timeout=5)
+    refused = console.send("sim-1", start, timeout=20)
     assert refused["error"].startswith("validation: policy_provider must be one of")
     entry = EntryPoint("house_made", "house:Made", "strands_robots.policies")
     monkeypatch.setattr(policy_registry, "entry_points", lambda group: [entry])
     registered_providers.cache_clear()
     try:
-        assert console.send("sim-1", start, timeout=5)["result"]["status"] == "success"
+        assert console.send("sim-1", start, timeout=20)["result"]["status"] == "success"
     finally:
         registered_providers.cache_clear()
 

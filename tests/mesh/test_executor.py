@@ -14,7 +14,7 @@ def test_reads_and_resumes_wait_for_no_motion_that_lasts(peers: Fleet) -> None:
 
     class Slow(World):
         def reset(self) -> dict[str, Any]:
-            release.wait(10)
+            release.wait(60)
             return super().reset()
 
     console = peers.join(None, "console")
@@ -29,7 +29,7 @@ def test_reads_and_resumes_wait_for_no_motion_that_lasts(peers: Fleet) -> None:
         }
         stranger.put("strands/sim-1/cmd", reset)
     try:
-        assert console.send("sim-1", {"action": "status"}, timeout=5)["type"] == "response"
-        assert console.send("sim-1", {"action": "teleop_stop"}, timeout=5)["type"] == "response"
+        assert console.send("sim-1", {"action": "status"}, timeout=20)["type"] == "response"
+        assert console.send("sim-1", {"action": "teleop_stop"}, timeout=20)["type"] == "response"
     finally:
         release.set()

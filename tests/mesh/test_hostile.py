@@ -7,6 +7,7 @@ import gc
 import json
 import random
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -217,7 +218,7 @@ def test_a_hundred_thousand_mutated_messages_leave_nothing_behind(peers: Fleet, 
         for number in range(count):
             key, seed = messages[number % len(messages)]
             stranger.put(key, mutated(chance, seed))
-        eventually(lambda: console.ping("arm-1", timeout=2)["status"] == "ok", within=10)
+        eventually(lambda: console.ping("arm-1", timeout=2)["status"] == "ok")
 
     pour(10_000)
     peers.audit.clear()
@@ -228,19 +229,20 @@ def test_a_hundred_thousand_mutated_messages_leave_nothing_behind(peers: Fleet, 
     peers.audit.clear()
     gc.collect()
     assert sys.getallocatedblocks() - before < 60_000
-    assert console.send("arm-1", {"action": "status"}, timeout=5)["type"] == "response"
+    assert console.send("arm-1", {"action": "status"}, timeout=20)["type"] == "response"
 
 
 def test_a_flood_of_refusals_is_told_as_a_count(peers: Fleet) -> None:
     peers.join(Arm(), "arm-1")
-    stranger = peers.stranger()
+    stranger, began = peers.stranger(), time.monotonic()
     for _ in range(1000):
         stranger.put("strands/arm-1/cmd", {"sender_id": "*", "turn_id": "t", "command": {"action": "stop"}})
-    assert len(peers.events("command_rejected")) <= 5
-    peers.clock.pass_(2)
+    seconds = int(time.monotonic() - began) + 1
+    assert len(peers.events("command_rejected")) <= 5 * seconds
     peers.meshes[0].stop()
     told = peers.events("command_rejected")
-    assert sum(event.get("left_out", 0) for event in told) >= 990
+    counted = sum(event.get("left_out", 0) + event.get("left_out_before", 0) for event in told)
+    assert counted + sum("left_out" not in event for event in told) == 1000
 
 
 def test_invented_peers_do_not_fill_the_registry_beyond_its_bound(

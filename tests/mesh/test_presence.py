@@ -31,6 +31,9 @@ def heartbeat(peers: Fleet, peer: str, **fields: Any) -> dict[str, Any]:
 def test_peers_see_each_other_and_what_they_are(peers: Fleet) -> None:
     arm = peers.join(Arm("so100"), "arm-1")
     sim = peers.join(World("left", "right"), "sim-1", "sim")
+    # A robot that a busy machine has not read yet is announced by its name alone.
+    eventually(lambda: "world" in (arm.get_peer("sim-1") or {}))
+    eventually(lambda: "action_keys" in (sim.get_peer("arm-1") or {}))
     row = arm.get_peer("sim-1")
     assert row is not None
     assert (row["type"], row["world"], row["sim_robots"], row["reachable"]) == ("sim", True, ["left", "right"], True)
@@ -186,6 +189,7 @@ def test_a_token_that_went_with_our_own_link_says_nothing_until_the_link_is_back
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.2)
+    monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
     transport, herald, registry = watched(MemoryBus())
     key = topics.token("arm-1", "aa")
     transport.up, transport.lost_link_at = False, time.monotonic()
@@ -203,6 +207,7 @@ def test_a_token_that_went_with_our_own_link_says_nothing_until_the_link_is_back
 
 def test_who_does_not_come_back_with_the_link_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.05)
+    monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
     transport, herald, registry = watched(MemoryBus())
     transport.lost_link_at = time.monotonic()
     herald.on_token(topics.token("arm-1", "aa"), there=False)

@@ -124,7 +124,8 @@ def test_frames_are_jpeg_and_the_privacy_switch_is_read_before_one_is_built(
 
 
 def test_policy_steps_carry_numbers_and_are_thinned_out(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STRANDS_MESH_STREAM_HZ", "20")
+    monkeypatch.setenv("STRANDS_MESH_STREAM_HZ", "0.005")
+    # One in 200 s, and a second one after half of that at the soonest: no machine is slow enough for two.
     one, two = peers.join(Arm(), "arm-1"), peers.join(None, "console")
     steps: list[dict[str, Any]] = []
     two.on_stream("arm-1", lambda key, data: steps.append(data))
@@ -134,7 +135,7 @@ def test_policy_steps_carry_numbers_and_are_thinned_out(peers: Fleet, monkeypatc
     eventually(lambda: steps)
     assert steps[0]["observation"] == {"j": 1.5, "near": [0.0, 1.0, 2.0]}
     assert steps[0]["instruction"] == "wave"
-    assert len(steps) <= 3
+    assert len(steps) == 1
 
 
 def test_a_limiter_keeps_a_steady_source_whole() -> None:
@@ -166,11 +167,12 @@ def test_missed_deadlines_are_dropped_not_caught_up() -> None:
 def test_a_wedged_read_does_not_hold_up_presence_and_stop_names_it() -> None:
     release, beats = threading.Event(), []
     scheduler = Scheduler("wedged")
-    scheduler.every("bus", 100, lambda: release.wait(5) and None)
+    scheduler.every("bus", 100, lambda: release.wait(20) and None)
     scheduler.every("presence", 100, lambda: beats.append(1), quick=True)
     scheduler.start()
     eventually(lambda: len(beats) > 5)
-    assert scheduler.stop(0.05) == ["wedged-sampler"]
+    assert "wedged-sampler" in scheduler.stop(0.05)
+    eventually(lambda: "wedged-timer" not in [thread.name for thread in threading.enumerate()])
     release.set()
 
 
@@ -184,14 +186,17 @@ def test_a_failing_job_goes_on() -> None:
     scheduler.every("job", 200, fail)
     scheduler.start()
     eventually(lambda: len(runs) >= 3)
-    assert scheduler.stop(1) == []
+    assert scheduler.stop(20) == []
 
 
 def test_stopping_leaves_no_thread_of_ours(peers: Fleet) -> None:
-    mesh: Mesh = peers.join(World("left"), "sim-1", "sim")
+    mesh: Mesh = peers.join(World("left"), "leaver", "sim")
     console = peers.join(None, "console")
-    console.ping("sim-1")
+    console.ping("leaver")
+
+    def ours() -> list[str]:
+        return [each.name for each in threading.enumerate() if "leaver" in each.name and "halt" not in each.name]
+
+    assert ours()
     mesh.stop()
-    assert [
-        thread.name for thread in threading.enumerate() if "sim-1" in thread.name and "halt" not in thread.name
-    ] == []
+    eventually(lambda: not ours())

@@ -18,8 +18,10 @@ Answer = dict[str, Any]
 class Strict:
     """A peer as the field has it: one command of a turn, and an answer after a while."""
 
-    def __init__(self, peers: Fleet, name: str, seconds: float, first: Answer | None = None) -> None:
-        self.name, self.seconds, self.first = name, seconds, first
+    def __init__(
+        self, peers: Fleet, name: str, seconds: float, first: Answer | None = None, always: Answer | None = None
+    ) -> None:
+        self.name, self.seconds, self.first, self.always = name, seconds, first, always
         self.turns: list[str] = []
         self.threads: list[threading.Timer] = []
         self.wire = peers.stranger()
@@ -31,6 +33,7 @@ class Strict:
         body = json.loads(sample.payload)
         again = body["turn_id"] in self.turns
         first = self.first if not self.turns else None
+        first = self.always or first
         self.turns.append(body["turn_id"])
         head = {"responder_id": self.name, "turn_id": body["turn_id"], "timestamp": body["timestamp"]}
         key = f"strands/{body['sender_id']}/response/{self.name}/{body['turn_id']}"
@@ -44,11 +47,11 @@ class Strict:
 
     def join(self) -> None:
         for each in self.threads:
-            each.join(5)
+            each.join(20)
 
 
 def test_a_robot_that_stops_slowly_is_asked_again_under_another_turn_and_counts_as_stopped(peers: Fleet) -> None:
-    console, slow = peers.join(None, "console"), Strict(peers, "slow", 0.9)
+    console, slow = peers.join(None, "console"), Strict(peers, "slow", 2.5)
     console.emergency_stop()
     slow.join()
     recorded = peers.events("emergency_stop")[0]
@@ -67,9 +70,9 @@ def test_an_error_does_not_outvote_the_true_answer_after_it(peers: Fleet) -> Non
 
 
 def test_who_answers_with_errors_alone_did_not_stop(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safety, "COLLECT_S", 0.3)
+    monkeypatch.setattr(safety, "COLLECT_S", 2.0)
     console = peers.join(None, "console")
-    refusing = Strict(peers, "refusing", 0.0, first={"type": "error", "error": "dispatch error"})
+    refusing = Strict(peers, "refusing", 0.0, always={"type": "error", "error": "dispatch error"})
     console.emergency_stop()
     refusing.join()
     recorded = peers.events("emergency_stop")[0]

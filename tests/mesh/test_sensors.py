@@ -108,7 +108,7 @@ def test_a_sensor_that_waits_holds_up_neither_state_nor_the_others(peers: Fleet)
 
     class Waiting(Arm):
         def get_pose(self) -> Envelope:
-            release.wait(10)
+            release.wait(60)
             return error("Nothing arrived.")
 
         def get_imu(self) -> dict[str, Any]:

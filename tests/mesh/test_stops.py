@@ -15,6 +15,7 @@ from tests.mesh.peers import Fleet
 from strands_robots.envelope import Envelope, success
 from strands_robots.mesh import teleop
 from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.mesh.stops import EACH, MOST, Stops, Tell
 from strands_robots.safety.stopping import StopVerdict
 
@@ -30,7 +31,7 @@ class Hanging(Arm):
 
     def send_action(self, action: dict[str, float]) -> Envelope:
         self.inside.set()
-        self.let_go.wait(10)
+        self.let_go.wait(60)
         return success("sent")
 
 
@@ -39,17 +40,17 @@ def test_a_stop_does_not_wait_for_a_stream_whose_frame_hangs(peers: Fleet, monke
     arm = Hanging()
     peers.join(arm, "arm-1")
     console, leader = peers.join(None, "console"), peers.join(None, "lead")
-    opened = console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=5)
+    opened = console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=20)
     assert opened["result"]["status"] == "success"
     frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1}
     leader.publish("strands/lead/input/leader", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
-    assert arm.inside.wait(5)
+    assert arm.inside.wait(20)
     answers: list[Any] = []
-    asking = threading.Thread(target=lambda: answers.append(console.send("arm-1", {"action": "stop"}, timeout=8)))
+    asking = threading.Thread(target=lambda: answers.append(console.send("arm-1", {"action": "stop"}, timeout=20)))
     asking.start()
     eventually(lambda: arm.halts, what="the halt, while a frame hangs")
     arm.let_go.set()
-    asking.join(8)
+    asking.join(20)
     assert answers[0]["result"]["ok"] is True
 
 
@@ -58,21 +59,28 @@ def test_a_stop_is_answered_while_the_frames_of_every_stream_hang(
 ) -> None:
     monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
     monkeypatch.setattr(teleop, "JOIN_S", 0.1)
+    waited, join = list[str](), InputReceiver.join
+
+    def noting(receiver: InputReceiver, timeout: float) -> bool:
+        waited.append(threading.current_thread().name)
+        return join(receiver, timeout)
+
+    monkeypatch.setattr(InputReceiver, "join", noting)
     arm = Hanging()
     peers.join(arm, "arm-1")
     console, leader = peers.join(None, "console"), peers.join(None, "lead")
     for device in ("leader", "pedal"):
         receive = {"action": "teleop_receive", "source_peer_id": "lead", "device_name": device}
-        assert console.send("arm-1", receive, timeout=5)["result"]["status"] == "success"
+        assert console.send("arm-1", receive, timeout=20)["result"]["status"] == "success"
         frame = {"peer_id": "lead", "device": device, "method": "arm", "t": peers.clock(), "seq": 1}
         leader.publish(f"strands/lead/input/{device}", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
-        assert arm.inside.wait(5)
+        assert arm.inside.wait(20)
         arm.inside.clear()
-    # Waiting for a frame of one stream takes 2 s where it is done before the answer.
-    assert console.send("arm-1", {"action": "stop"}, timeout=1.5)["result"]["ok"] is True
-    assert console.send("arm-1", {"action": "teleop_status"}, timeout=5)["result"]["streams"] == []
-    assert console.send("arm-1", {"action": "stop"}, timeout=1.5)["result"]["ok"] is True
-    eventually(lambda: sum("still being applied" in each.getMessage() for each in caplog.records) == 2)
+    assert console.send("arm-1", {"action": "stop"}, timeout=20)["result"]["ok"] is True
+    assert console.send("arm-1", {"action": "teleop_status"}, timeout=20)["result"]["streams"] == []
+    assert console.send("arm-1", {"action": "stop"}, timeout=20)["result"]["ok"] is True
+    eventually(lambda: sum("still being applied" in each.getMessage() for each in list(caplog.records)) == 2)
+    assert all(name.startswith("arm-1-command") for name in waited), "no stop and no answer waits for a frame"
     arm.let_go.set()
 
 
@@ -87,7 +95,7 @@ class Slow(World):
     def halt(self, reason: str = "") -> StopVerdict:
         self.halts += 1
         self.halting.release()
-        self.let_go.wait(10)
+        self.let_go.wait(60)
         return super().halt(reason)
 
 
@@ -110,22 +118,24 @@ def test_no_stop_of_a_flood_is_refused_and_an_honest_one_gets_its_verdict(peers:
             flood.put("strands/sim-1/cmd", body)
 
     pour(0)
-    assert world.halting.acquire(timeout=5)
+    assert world.halting.acquire(timeout=20)
     answers: list[Any] = []
     commands = [{"action": "stop"}, {"action": "stop", "robot_name": "left"}]
     asking = [
-        threading.Thread(target=lambda command=command: answers.append(console.send("sim-1", command, timeout=9)))
+        threading.Thread(target=lambda command=command: answers.append(console.send("sim-1", command, timeout=20)))
         for command in commands
     ]
     for thread in asking:
         thread.start()
     server = peers.meshes[0]._assembled.server
-    eventually(lambda: any("console" in who for each in server._stops._waiting.values() for who in each))
+    waiting = server._stops._waiting
+    # Copies: the askers' threads put themselves in meanwhile.
+    eventually(lambda: any("console" in who for each in list(waiting.values()) for who in list(each)))
     pour(1000)
     assert len(server._stops) <= EACH + len(commands)
     world.let_go.set()
     for thread in asking:
-        thread.join(9)
+        thread.join(20)
     assert [answer["result"]["ok"] for answer in answers] == [True, True]
     eventually(lambda: len(server._stops) == 0)
     assert all(each["ok"] is True for each in said["flood"])
@@ -137,13 +147,13 @@ def test_a_flood_under_many_names_keeps_its_bound_and_the_fleet_stop() -> None:
 
     def halt(robot: str) -> Tell:
         begun.set()
-        let_go.wait(10)
+        let_go.wait(60)
         return lambda askers: halted.update({robot: len(askers)})
 
     answers = Lane("answers", 1, MOST * 2)
     stops = Stops(lane, answers, halt)
     stops.add("", "first", "t")
-    assert begun.wait(5)
+    assert begun.wait(20)
     stops.add("", "console", "t")
     for number in range(MOST + 500):
         stops.add(f"robot-{number}", f"sender-{number % 100}", "t")
@@ -152,9 +162,9 @@ def test_a_flood_under_many_names_keeps_its_bound_and_the_fleet_stop() -> None:
     eventually(lambda: len(stops) == 0)
     assert halted[""] == 2
     assert stops.unanswered >= 500
-    lane.stop(2)
+    assert lane.stop(20) == []
     assert stops.add("", "late", "t") is False
-    answers.stop(2)
+    answers.stop(20)
 
 
 def test_a_stop_that_lost_its_answer_to_a_flood_is_carried_out_all_the_same() -> None:
@@ -163,13 +173,13 @@ def test_a_stop_that_lost_its_answer_to_a_flood_is_carried_out_all_the_same() ->
 
     def halt(robot: str) -> Tell:
         begun.set()
-        let_go.wait(10)
+        let_go.wait(60)
         halted.append(robot)
         return lambda askers: None
 
     stops = Stops(lane, answers, halt)
     stops.add("", "first", "t")
-    assert begun.wait(5)
+    assert begun.wait(20)
     stops.add("left", "one", "t0")
     for turn in range(EACH):
         stops.add("right", "one", f"t{turn + 1}")
@@ -177,7 +187,7 @@ def test_a_stop_that_lost_its_answer_to_a_flood_is_carried_out_all_the_same() ->
     eventually(lambda: halted == ["", "left", "right"])
     eventually(lambda: len(stops) == 0)
     assert stops.unanswered == 1
-    assert (lane.stop(2), answers.stop(2)) == ([], [])
+    assert (lane.stop(20), answers.stop(20)) == ([], [])
 
 
 def test_the_next_halt_waits_for_no_answer_to_the_one_before() -> None:
@@ -187,7 +197,7 @@ def test_the_next_halt_waits_for_no_answer_to_the_one_before() -> None:
 
     def halt(robot: str) -> Tell:
         halted.append(robot)
-        return lambda askers: told.extend(askers if let_go.wait(10) else [])
+        return lambda askers: told.extend(askers if let_go.wait(60) else [])
 
     stops = Stops(lane, answers, halt)
     for robot in ("", "left", "right"):
@@ -198,7 +208,7 @@ def test_the_next_halt_waits_for_no_answer_to_the_one_before() -> None:
     let_go.set()
     eventually(lambda: len(stops) == 0)
     assert [turn for _, turn in told] == ["", "left", "right"]
-    assert (lane.stop(2), answers.stop(2)) == ([], [])
+    assert (lane.stop(20), answers.stop(20)) == ([], [])
 
 
 def test_names_that_nobody_bears_stand_in_no_line(peers: Fleet) -> None:
@@ -208,9 +218,9 @@ def test_names_that_nobody_bears_stand_in_no_line(peers: Fleet) -> None:
     console, flood = peers.join(None, "console"), peers.stranger()
     said: list[dict[str, Any]] = []
     flood.declare_subscriber("strands/flood/response/sim-1/*", lambda each: said.append(json.loads(each.payload)))
-    asking = threading.Thread(target=lambda: console.send("sim-1", {"action": "stop"}, timeout=9))
+    asking = threading.Thread(target=lambda: console.send("sim-1", {"action": "stop"}, timeout=20))
     asking.start()
-    assert world.halting.acquire(timeout=5)
+    assert world.halting.acquire(timeout=20)
     for turn in range(500):
         command = {"action": "stop", "robot_name": f"robot-{turn}"}
         for name in ("sim-1", "arm-1"):
@@ -221,9 +231,9 @@ def test_names_that_nobody_bears_stand_in_no_line(peers: Fleet) -> None:
     assert list(peers.meshes[0]._assembled.server._stops._waiting) == []
     assert set(peers.meshes[1]._assembled.server._stops._waiting) <= {""}
     world.let_go.set()
-    asking.join(9)
+    asking.join(20)
     assert world.halts == 1
-    assert console.send("arm-1", {"action": "stop", "robot_name": "whatever"}, timeout=5)["result"]["ok"] is True
+    assert console.send("arm-1", {"action": "stop", "robot_name": "whatever"}, timeout=20)["result"]["ok"] is True
 
 
 def test_a_stop_that_did_not_stop_is_refused_on_record_and_told_at_critical(
@@ -231,11 +241,11 @@ def test_a_stop_that_did_not_stop_is_refused_on_record_and_told_at_critical(
 ) -> None:
     peers.join(Arm("gripper", stops=False), "arm-1")
     console = peers.join(None, "console")
-    assert console.send("arm-1", {"action": "stop"}, timeout=5)["result"]["ok"] is False
+    assert console.send("arm-1", {"action": "stop"}, timeout=20)["result"]["ok"] is False
     eventually(lambda: peers.events("command_refused"))
     assert "gripper: the brake is stuck" in peers.events("command_refused")[0]["reason"]
     assert peers.events("command_executed") == []
-    loud = [record.getMessage() for record in caplog.records if record.levelname == "CRITICAL"]
+    loud = [record.getMessage() for record in list(caplog.records) if record.levelname == "CRITICAL"]
     assert len(loud) == 1
     assert "arm-1" in loud[0]
     assert "gripper: the brake is stuck" in loud[0]
@@ -248,7 +258,7 @@ def test_the_stop_of_one_robot_reaches_its_start_that_stands_in_line(peers: Flee
     class Busy(World):
         def step(self, n: int = 1) -> Envelope:
             begun.release()
-            let_go.wait(10)
+            let_go.wait(60)
             return success("stepped")
 
     world = Busy("left", "right")
@@ -257,20 +267,20 @@ def test_the_stop_of_one_robot_reaches_its_start_that_stands_in_line(peers: Flee
     answers: dict[str, Any] = {}
 
     def ask(name: str, command: dict[str, Any]) -> threading.Thread:
-        thread = threading.Thread(target=lambda: answers.update({name: console.send("sim-1", command, timeout=9)}))
+        thread = threading.Thread(target=lambda: answers.update({name: console.send("sim-1", command, timeout=20)}))
         thread.start()
         return thread
 
     threads = [ask(f"step-{n}", {"action": "step", "steps": 1}) for n in range(4)]
-    assert all(begun.acquire(timeout=5) for _ in threads)
+    assert all(begun.acquire(timeout=20) for _ in threads)
     server = peers.meshes[0]._assembled.lanes.commands._queue
     threads += [ask(name, {**START, "robot_name": name}) for name in ("left", "right")]
     eventually(lambda: server.qsize() == 2)
-    stopped = console.send("sim-1", {"action": "stop", "robot_name": "left"}, timeout=5)
+    stopped = console.send("sim-1", {"action": "stop", "robot_name": "left"}, timeout=20)
     assert stopped["result"]["ok"] is True
     let_go.set()
     for thread in threads:
-        thread.join(9)
+        thread.join(20)
     assert answers["left"]["result"]["status"] == "error"
     assert "halted after it was asked for" in answers["left"]["result"]["reason"]
     assert list(world.running) == ["right"]
@@ -289,13 +299,13 @@ def test_a_frame_that_waits_for_the_bus_is_refused_after_a_stop(peers: Fleet, mo
     arm = Late()
     peers.join(arm, "arm-1")
     console, leader = peers.join(None, "console"), peers.join(None, "lead")
-    console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=5)
+    console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=20)
     frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1}
     leader.publish("strands/lead/input/leader", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
-    assert arm.inside.wait(5)
-    asking = threading.Thread(target=lambda: console.send("arm-1", {"action": "stop"}, timeout=8))
+    assert arm.inside.wait(20)
+    asking = threading.Thread(target=lambda: console.send("arm-1", {"action": "stop"}, timeout=20))
     asking.start()
     eventually(lambda: arm.halts)
     arm.let_go.set()
-    asking.join(8)
+    asking.join(20)
     eventually(lambda: refused == [True])

@@ -197,7 +197,7 @@ def test_in_signed_mode_an_unsigned_peer_is_listed_but_bound_to_nothing(peers: F
     assert console.peer_cert("plain") is None
     assert console.peer_wire_zid("plain") is None
     assert console.get_peer("plain") is not None
-    assert console.ping("arm-2")["status"] == "ok"
+    assert console.ping("arm-2", timeout=20)["status"] == "ok"
     assert console.ping("plain", timeout=0.2)["status"] == "timeout"
     assert peers.events("presence_unverified")
     assert peers.events("response_hijack_rejected")

@@ -52,7 +52,8 @@ class Latch:
 
 
 @pytest.fixture
-def arm() -> Any:
+def arm(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     robot = HardwareRobot(SeeingDevice(), "arm", control_hz=50)
     robot.connect()
     yield robot
@@ -82,7 +83,7 @@ def test_a_task_its_halt_and_the_lock_are_told_in_their_order(arm: HardwareRobot
     path, latch = tmp_path / "run.mcap", Latch()
     arm.gate.attach(latch)
     with Recorder(path, joints_of_events=False) as recorder, RobotRecording(arm, recorder, "arm-1"):
-        arm.start_task("wave", duration=20)
+        arm.start_task("wave", duration=120)
         eventually(lambda: recorder.counts["/arm-1/streamStep"] > 5)
         latch.locked = True
         arm.halt("test")
@@ -146,16 +147,16 @@ def test_a_world_records_each_of_its_robots(tmp_path: Path) -> None:
     world.add_robot("right", "so100", position=(0.0, 0.5, 0.0))
     try:
         with Recorder(path, joints_of_events=False) as recorder, RobotRecording(world, recorder, "sim-1"):
-            world.start_policy("left", "wave", duration=20)
+            world.start_policy("left", "wave", duration=120)
             eventually(lambda: recorder.counts["/sim-1/streamStep"] > 5)
-            eventually(lambda: recorder.counts["/sim-1/right/joint_states"] > 5)
+            for name in ("left", "right"):
+                eventually(lambda name=name: recorder.counts[f"/sim-1/{name}/joint_states"] > 5)
             world.halt("test")
             eventually(lambda: recorder.counts["/sim-1/policyComplete"] == 1)
         with pytest.raises(ValidationError, match="overview"):
             chosen_frames(world, ["nobody"])
     finally:
         world.cleanup()
-    assert recorder.counts["/sim-1/left/joint_states"] > 5
 
 
 def test_beats_that_a_slow_camera_skips_are_counted_and_told(arm: HardwareRobot, tmp_path: Path) -> None:
@@ -168,7 +169,7 @@ def test_beats_that_a_slow_camera_skips_are_counted_and_told(arm: HardwareRobot,
 
     with Recorder(path, joints_of_events=False) as recorder:
         with RobotRecording(arm, recorder, "arm-1", frames=slow, cameras_hz=50) as sampling:
-            assert looked.wait(5)
+            assert looked.wait(20)
             eventually(lambda: sampling.skipped["cameras"] >= 8)
         skipped = sampling.skipped["cameras"]
     (told,) = [entry.payload for entry in read_entries(path) if entry.event == "samplesSkipped"]

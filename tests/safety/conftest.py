@@ -9,14 +9,22 @@ import pytest
 from fixtures.planes import own_plane
 from fixtures.recording_robot import RecordingRobot
 
+from strands_robots.safety import reporting
 from strands_robots.safety.plane import SafetyPlane
 
 Add = Callable[..., RecordingRobot]
 
 
+@pytest.fixture(autouse=True)
+def patient_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report waits for a slow disk: what is shown is whether a lockout was kept, not how fast."""
+    monkeypatch.setattr(reporting, "KEEP_S", 20.0)
+
+
 @pytest.fixture
-def plane() -> Iterator[SafetyPlane]:
-    with own_plane(0.5) as here:
+def plane(monkeypatch: pytest.MonkeyPatch) -> Iterator[SafetyPlane]:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
+    with own_plane(None) as here:
         yield here
 
 

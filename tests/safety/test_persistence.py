@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from strands_robots.safety import persistence
 from strands_robots.safety.lockout import OVERFLOW, Hold, LockoutState
 from strands_robots.safety.persistence import Kept, LockoutStore, hardware_key, simulation_key
 
@@ -97,7 +98,9 @@ def test_a_file_that_another_process_holds_is_an_error_in_time_and_not_a_wait(st
     store.save({KEY: Kept()})
 
 
-def test_writers_at_once_lose_no_record(store: LockoutStore) -> None:
+def test_writers_at_once_lose_no_record(store: LockoutStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Each waits for all before it, each of which waits for the disk.
+    monkeypatch.setattr(persistence, "LOCK_WAIT_S", 60.0)
     threads = [
         threading.Thread(target=lambda n=n: store.save({f"robot-{n}": Kept(LockoutState((HOLD,)))})) for n in range(12)
     ]

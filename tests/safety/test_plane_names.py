@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.planes import own_plane
 from fixtures.recording_robot import RecordingRobot
 from fixtures.waiting import eventually
 
@@ -66,6 +67,8 @@ def test_a_locked_robot_that_leaves_and_comes_again_is_still_locked(plane: Safet
     assert robot.refuses(), "off the network it is locked as well"
     again = plane.register("sim-2", robot)
     assert again.epochs == (epoch,)
+    # It is halted as it comes up locked, and what is asked for beside a halt is refused.
+    eventually(lambda: robot.reasons[-1:] == ["it comes up locked"])
     plane.clear_local("ann")
     assert not robot.refuses()
     again.close()
@@ -77,53 +80,45 @@ def test_a_lock_that_no_disk_took_outlives_the_device_in_its_process(robot: Reco
         def save(self, kept: Any) -> None:
             raise OSError(28, "No space left on device")
 
-    plane = SafetyPlane(Full(tmp_path), deadline_s=0.5)
-    entry = plane.register("arm-1", robot, key=KEY)
-    stop(plane)
-    entry.close()
-    again = plane.register("arm-1", robot, key=KEY)
-    assert again.locked
-    again.close()
+    with own_plane(20.0, Full(tmp_path)) as plane:
+        entry = plane.register("arm-1", robot, key=KEY)
+        stop(plane)
+        entry.close()
+        assert plane.register("arm-1", robot, key=KEY).locked
 
 
 def test_what_an_operator_cleared_on_the_disk_meanwhile_stays_cleared(robot: RecordingRobot, tmp_path: Path) -> None:
     store = LockoutStore(tmp_path)
-    plane = SafetyPlane(store, deadline_s=0.5)
-    entry = plane.register("arm-1", robot, key=KEY)
-    stop(plane)
-    entry.close()
-    store.save({KEY: Kept(seen=store.load(KEY).seen)})
-    again = plane.register("arm-1", robot, key=KEY)
-    assert not again.locked
-    assert not robot.refuses()
-    again.close()
+    with own_plane(20.0, store) as plane:
+        entry = plane.register("arm-1", robot, key=KEY)
+        stop(plane)
+        entry.close()
+        store.save({KEY: Kept(seen=store.load(KEY).seen)})
+        assert not plane.register("arm-1", robot, key=KEY).locked
+        assert not robot.refuses()
 
 
 def test_a_robot_that_moves_while_it_comes_up_locked_is_halted(robot: RecordingRobot, tmp_path: Path) -> None:
-    store = LockoutStore(tmp_path)
-    plane = SafetyPlane(store, deadline_s=0.5)
-    before = RecordingRobot()
-    plane.register("arm-1", before, key=KEY)
-    stop(plane)
-    plane.robots["arm-1"].close()
-    robot.start()
-    eventually(lambda: len(robot.device.times) > 3)
-    again = plane.register("arm-1", robot, key=KEY)
-    eventually(lambda: robot.halts)
-    eventually(lambda: not robot.moving)
-    written = len(robot.device.times)
-    time.sleep(0.02)
-    assert len(robot.device.times) == written
-    assert robot.refuses()
-    again.close()
+    with own_plane(20.0, LockoutStore(tmp_path)) as plane:
+        plane.register("arm-1", RecordingRobot(), key=KEY)
+        stop(plane)
+        plane.robots["arm-1"].close()
+        robot.start()
+        eventually(lambda: len(robot.device.times) > 3)
+        plane.register("arm-1", robot, key=KEY)
+        eventually(lambda: robot.halts)
+        eventually(lambda: not robot.moving)
+        written = len(robot.device.times)
+        time.sleep(0.02)
+        assert len(robot.device.times) == written
+        assert robot.refuses()
 
 
 def test_a_lock_that_a_second_network_gives_a_key_to_is_kept(robot: RecordingRobot, tmp_path: Path) -> None:
     store = LockoutStore(tmp_path)
-    plane = SafetyPlane(store, deadline_s=0.5)
-    one = plane.register("arm-1", robot)
-    epoch = stop(plane)
-    two = plane.register("arm-1", robot, key=KEY)
-    assert store.load(KEY).state.epochs == (epoch,)
-    one.close()
-    two.close()
+    with own_plane(20.0, store) as plane:
+        one = plane.register("arm-1", robot)
+        epoch = stop(plane)
+        plane.register("arm-1", robot, key=KEY)
+        assert store.load(KEY).state.epochs == (epoch,)
+        one.close()

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.mesh import init_mesh
+from strands_robots.mesh import init_mesh, safety
 from strands_robots.mesh.session import clear_peers
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.networks import DeviceConnect, NativeMesh, verdict_of
@@ -127,7 +128,9 @@ def test_with_device_connect_off_the_native_mesh_is_used(monkeypatch: pytest.Mon
 def on_the_mesh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
-    monkeypatch.setattr(networks, "HEAR_S", 0.7)
+    monkeypatch.setattr(networks, "HEAR_S", 0.1)
+    monkeypatch.setattr(networks, "STOP_S", 20.0)
+    monkeypatch.setattr(safety, "COLLECT_S", 20.0)
     clear_peers()
     yield
     clear_peers()
@@ -149,7 +152,10 @@ def test_robots_on_the_mesh_are_found_told_and_stopped_by_name(on_the_mesh: None
     left, stuck = World("left"), Arm("stuck", stops=False)
     meshes = [init_mesh(left, "sim-1", "sim"), init_mesh(stuck, "arm-1")]
     try:
-        assert {row["id"] for row in robot_mesh(action="peers")["peers"]} == {"sim-1", "arm-1"}
+        # They and the tool's peer share what they heard, so that whom one has seen the tool knows.
+        names = {"sim-1", "arm-1"}
+        eventually(lambda: {row["peer_id"] for mesh in meshes if mesh is not None for row in mesh.peers} == names)
+        assert {row["id"] for row in robot_mesh(action="peers")["peers"]} == names
         assert robot_mesh(action="tell", target="sim-1", instruction="wave")["status"] == "success"
         assert left.running == {"left": "wave"}
         assert robot_mesh(action="status", target="sim-1")["task_status"] == "running"

@@ -1,0 +1,11 @@
+"""Fixtures of the tests of real robots."""
+
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def patient_halts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A halt has as long as a busy machine takes; where one is to give up, the test says when."""
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
