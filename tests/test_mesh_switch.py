@@ -36,7 +36,7 @@ def test_any_other_word_is_ignored_with_one_warning(
     with caplog.at_level(logging.WARNING):
         assert _mesh_switch.mesh_env_request() is None
         assert _mesh_switch.mesh_env_request() is None
-    assert len([record for record in caplog.records if "flase" in record.message]) == 1
+    assert len([record for record in caplog.records if "flase" in record.getMessage()]) == 1
 
 
 def test_the_old_name_of_the_session_is_the_session() -> None:

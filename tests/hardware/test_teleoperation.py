@@ -203,4 +203,4 @@ def test_events_that_cannot_be_read_are_counted_told_once_and_shown(
     assert row["event_read_errors"] == row["frames"] == len(sink.frames)
     assert row["errors"] == 0
     assert {frame[3] for frame in sink.frames} == {None}
-    assert sum("cannot be read" in line.message for line in caplog.records) == 1
+    assert sum("cannot be read" in line.getMessage() for line in caplog.records) == 1

@@ -158,7 +158,7 @@ def test_a_bridge_that_is_closed_while_a_leg_is_down_leaves_no_thread(buses: tup
     mender = half._mender
     assert mender is not None and mender.is_alive()
     half.close()
-    assert not mender.is_alive()
+    eventually(lambda: not mender.is_alive())
 
 
 def test_an_unknown_topic_in_the_setting_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -341,7 +341,7 @@ def test_what_travels_of_an_action_is_floats(peers: Fleet, caplog: pytest.LogCap
     told = heard(peers, Odd())
     assert told["action"] == {"whole": 3.0, "scalar": 0.5, "lone": 2.0}
     assert all(type(value) is float for value in told["action"].values())
-    assert sum("flag, hot, list, several, word" in line.message for line in caplog.records) == 1
+    assert sum("flag, hot, list, several, word" in line.getMessage() for line in caplog.records) == 1
 
 
 @pytest.mark.parametrize("action", [{"a": "x"}, {"a": True}, {}, None, [1.0]])

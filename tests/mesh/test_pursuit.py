@@ -101,9 +101,9 @@ def test_a_peer_that_comes_back_and_does_not_stop_is_named_once_and_asked_until_
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
     eventually(lambda: len(arm.halts) > pursuit.TRIES, what="it is asked on and on")
-    named = [line for line in caplog.records if line.levelname == "CRITICAL" and "did NOT stop" in line.message]
+    named = [line for line in caplog.records if line.levelname == "CRITICAL" and "did NOT stop" in line.getMessage()]
     assert len(named) == 1
-    assert "the brake is stuck" in named[0].message
+    assert "the brake is stuck" in named[0].getMessage()
     assert "has answered emergency stop" not in caplog.text
     arm.stops = True
     eventually(lambda: "has answered emergency stop" in caplog.text)
@@ -126,4 +126,4 @@ def test_an_error_for_an_answer_is_no_stop(
     eventually(lambda: "faulty was out of reach and has answered" in caplog.text)
     faulty.join()
     assert len(faulty.turns) == 2
-    assert any(line.levelname == "CRITICAL" and "dispatch error" in line.message for line in caplog.records)
+    assert any(line.levelname == "CRITICAL" and "dispatch error" in line.getMessage() for line in caplog.records)

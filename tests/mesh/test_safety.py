@@ -90,7 +90,7 @@ def test_who_did_not_stop_and_who_was_silent_is_named(
     recorded = peers.events("emergency_stop")[0]
     assert recorded["not_stopped"] == ["stuck"]
     assert recorded["silent"] == ["ghost"]
-    critical = [record.message for record in caplog.records if record.levelname == "CRITICAL"]
+    critical = [record.getMessage() for record in caplog.records if record.levelname == "CRITICAL"]
     assert any("stuck" in message for message in critical)
     assert any("ghost" in message for message in critical)
 

@@ -143,7 +143,7 @@ def test_any_unknown_word_demands_signatures_on_every_road_and_is_warned_of_once
     wire_identity._taken_as_one.cache_clear()
     broker = MemoryTransport(MemoryBus(), sessionless=True)
     assert [identity_of(broker).required for _ in range(3)] == [required] * 3
-    assert len([each for each in caplog.records if "taken as 1" in each.message]) == (word not in "01")
+    assert len([each for each in caplog.records if "taken as 1" in each.getMessage()]) == (word not in "01")
 
 
 @pytest.mark.parametrize("kind", ["rsa", "ed25519", "ecdsa"])
