@@ -6,9 +6,9 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
-import hypothesis
 import pytest
 from fixtures.waiting import eventually
 
@@ -20,9 +20,13 @@ for setting in settings.declared():
     if setting.name not in {"DISPLAY", "MUJOCO_GL"}:
         os.environ.pop(setting.name, None)
 
-# An example may take as long as a busy machine lets it; what is shown is what the code does, not how fast.
-hypothesis.settings.register_profile("patient", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
-hypothesis.settings.load_profile("patient")
+# An example may take as long as a busy machine lets it; the environments of real arms and DDS Security have no examples.
+if find_spec("hypothesis"):
+    import hypothesis
+
+    slow = [hypothesis.HealthCheck.too_slow]
+    hypothesis.settings.register_profile("patient", deadline=None, suppress_health_check=slow)
+    hypothesis.settings.load_profile("patient")
 
 # A shell starts background jobs with Ctrl-C ignored, and every process that a test starts would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -25,7 +25,7 @@ async def test_stop_ends_the_task_for_every_caller(robot: ToyRobot) -> None:
 
 async def test_a_stop_that_did_not_happen_is_an_error_that_says_so(robot: ToyRobot) -> None:
     async with DriverBench(drive(robot)) as bench:
-        await bench.call("execute", instruction="wave", duration=20)
+        await bench.call("execute", instruction="wave", duration=300)
         robot.stubborn = True
         answer = await bench.call("stop")
         assert answer["status"] == "error"
@@ -44,12 +44,14 @@ async def test_a_stop_is_answered_while_motion_and_reads_block(robot: ToyRobot) 
     async with DriverBench(drive(robot)) as bench:
         blocked = [asyncio.create_task(bench.call("execute", instruction="wave")) for _ in range(5)]
         blocked += [asyncio.create_task(bench.call("getState")) for _ in range(9)]
-        await asyncio.sleep(0.05)
+        # The watch of its state may hold one of the places for reads.
+        beyond = len(blocked) - base_driver.MOVES_AT_ONCE - live_driver.READS_AT_ONCE
+        await bench.until(lambda: sum(task.done() for task in blocked) >= beyond)
         assert (await bench.call("stop"))["stopped"] is True
         let_go.set()
         answers = await asyncio.gather(*blocked)
     refused = [answer for answer in answers if "has not yet answered" in answer.get("reason", "")]
-    assert len(refused) == 14 - base_driver.MOVES_AT_ONCE - live_driver.READS_AT_ONCE + 1 or len(refused) >= 8
+    assert len(refused) in (beyond, beyond + 1)
 
 
 async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +85,7 @@ async def test_a_stop_reaches_the_motion_that_has_not_begun_yet(robot: ToyRobot)
 
     def wait() -> None:
         entered.set()
-        let_go.wait(10)
+        let_go.wait(60)
 
     robot.before["start_task"] = wait
     async with DriverBench(drive(robot)) as bench:
@@ -114,11 +116,11 @@ async def test_a_halt_without_an_answer_is_reported_as_not_stopped(
 
 async def test_an_emergency_stop_of_an_allowed_source_halts(robot: ToyRobot) -> None:
     async with DriverBench(drive(robot, DEVICE_CONNECT_ESTOP_ALLOW=("safety-*",))) as bench:
-        await bench.call("execute", instruction="wave")
+        await bench.call("execute", instruction="wave", duration=300)
         for source in ("stranger", "Safety-1", "", "bench-1"):
             await bench.driver.onEmergencyStop(source, "emergencyStop", {"reason": "test"})
         await asyncio.sleep(0.1)
-        assert robot.rollouts["toy"].running
+        assert robot.rollouts["toy"].running, "the task lasts 300 s"
         await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {"reason": "test"})
         await bench.until(lambda: not robot.rollouts["toy"].running)
 
@@ -132,7 +134,7 @@ async def test_without_a_list_every_named_source_stops_whatever_the_rpc_list_say
 
 def test_a_robot_that_did_not_stop_is_named_at_critical(robot: ToyRobot, caplog: pytest.LogCaptureFixture) -> None:
     driver = drive(robot)
-    robot.start_task("wave", duration=20)
+    robot.start_task("wave", duration=300)
     robot.stubborn = True
     with caplog.at_level(logging.CRITICAL):
         verdict = driver.handle_estop("safety-1", {"reason": "smoke"})

@@ -17,7 +17,7 @@ def test_a_signal_ends_the_wait_and_the_handlers_are_as_before(number: signal.Si
     with StopSignal() as asked:
         assert asked.wait(0.01) is None
         threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
-        assert asked.wait(5) == number
+        assert asked.wait(20) == number
         assert [signal.getsignal(each) for each in StopSignal.SIGNALS] == before
 
 

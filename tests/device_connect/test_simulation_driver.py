@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any
 
 import pytest
 from fixtures.driver_bench import DriverBench
 from fixtures.toy_robots import ToyWorld
 
+from strands_robots.device_connect import simulation_driver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.device_connect.telemetry import paced
 from strands_robots.envelope import error
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError
@@ -154,12 +156,22 @@ async def test_policies_are_told_from_their_start_to_their_end(world: ToyWorld) 
         assert [e["step"] for e in bench.of("streamStep")] == list(range(1, ended["steps"] + 1))
 
 
-async def test_every_robot_is_observed_ten_times_a_second(world: ToyWorld) -> None:
+async def test_every_robot_is_observed_ten_times_a_second(world: ToyWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    rates: list[float] = []
+
+    def noted(hz: Callable[[], float], *more: Any) -> Coroutine[Any, Any, None]:
+        rates.append(hz())
+        return paced(hz, *more)
+
+    monkeypatch.setattr(simulation_driver, "paced", noted)
+    began = time.monotonic()
     async with DriverBench(SimulationDeviceDriver(world)) as bench:
-        await asyncio.sleep(1.05)
+        assert rates == [10.0]
         for name in ("left", "right"):
+            await bench.until(lambda: len(bench.of("observationUpdate")) >= 16)
             seen = [e for e in bench.of("observationUpdate") if e["robot_name"] == name]
-            assert 9 <= len(seen) <= 12
+            assert len(seen) >= 8
+            assert len(seen) <= (time.monotonic() - began) * 10.0 + 2
             assert set(seen[0]["joints"]) == {"pan", "lift", "elbow"}
 
 

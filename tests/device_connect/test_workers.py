@@ -15,18 +15,24 @@ from strands_robots.device_connect.workers import Lane, LaneFullError, WorkerPoo
 def test_calls_run_side_by_side_and_idle_threads_end() -> None:
     pool = WorkerPool(idle_s=0.05)
     lane = Lane("read", 16, pool)
-    before = threading.active_count()
+    threads: list[threading.Thread] = []
     together = threading.Barrier(8)
-    done = [lane.start(lambda: together.wait(5)) for _ in range(8)]
-    assert sorted(each.result(5) for each in done) == list(range(8))
-    eventually(lambda: threading.active_count() <= before)
+
+    def meet() -> int:
+        threads.append(threading.current_thread())
+        return together.wait(20)
+
+    done = [lane.start(meet) for _ in range(8)]
+    assert sorted(each.result(20) for each in done) == list(range(8))
+    assert len(set(threads)) == 8
+    eventually(lambda: not any(thread.is_alive() for thread in threads))
 
 
 def test_an_idle_thread_is_used_again() -> None:
     lane = Lane("read", 4, WorkerPool(idle_s=5))
     names = set()
     for _ in range(20):
-        names.add(lane.start(lambda: threading.current_thread().ident).result(5))
+        names.add(lane.start(lambda: threading.current_thread().ident).result(20))
         time.sleep(0.002)
     assert len(names) <= 3
 
@@ -35,7 +41,7 @@ def test_no_job_is_lost_when_threads_end_and_start() -> None:
     pool = WorkerPool(idle_s=0.001)
     lane = Lane("read", 64, pool)
     for _ in range(200):
-        assert [each.result(5) for each in [lane.start(lambda: 1) for _ in range(4)]] == [1] * 4
+        assert [each.result(20) for each in [lane.start(lambda: 1) for _ in range(4)]] == [1] * 4
         time.sleep(0.001)
 
 
@@ -46,10 +52,10 @@ def test_a_full_lane_refuses_and_another_one_does_not() -> None:
     blocked = [lane.start(let_go.wait) for _ in range(2)]
     with pytest.raises(LaneFullError):
         lane.start(lambda: None)
-    assert other.start(lambda: "stopped").result(5) == "stopped"
+    assert other.start(lambda: "stopped").result(20) == "stopped"
     let_go.set()
-    assert all(each.result(5) for each in blocked)
-    assert lane.start(lambda: "again").result(5) == "again"
+    assert all(each.result(20) for each in blocked)
+    assert lane.start(lambda: "again").result(20) == "again"
 
 
 async def test_a_call_that_does_not_return_keeps_its_slot_and_not_the_caller() -> None:
@@ -58,10 +64,10 @@ async def test_a_call_that_does_not_return_keeps_its_slot_and_not_the_caller() -
     with pytest.raises(TimeoutError):
         await lane.run(let_go.wait, 0.05)
     with pytest.raises(LaneFullError):
-        await lane.run(lambda: None, 1)
+        await lane.run(lambda: None, 20)
     let_go.set()
-    await asyncio.sleep(0.05)
-    assert await lane.run(lambda: 5, 1) == 5
+    await asyncio.to_thread(eventually, lambda: free(lane))
+    assert await lane.run(lambda: 5, 20) == 5
 
 
 async def test_an_exception_reaches_the_caller() -> None:
@@ -69,7 +75,7 @@ async def test_an_exception_reaches_the_caller() -> None:
         raise OSError("no")
 
     with pytest.raises(OSError, match="no"):
-        await Lane("read", 1, WorkerPool(idle_s=0.05)).run(fail, 1)
+        await Lane("read", 1, WorkerPool(idle_s=0.05)).run(fail, 20)
 
 
 def test_a_call_that_outlives_its_loop_hurts_nobody() -> None:
@@ -87,6 +93,6 @@ def test_a_call_that_outlives_its_loop_hurts_nobody() -> None:
 
 def free(lane: Lane) -> bool:
     try:
-        return lane.start(lambda: True).result(5)
+        return lane.start(lambda: True).result(20)
     except LaneFullError:
         return False
