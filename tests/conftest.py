@@ -53,6 +53,12 @@ def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     flush_audit(0.5)
 
 
+@pytest.fixture
+def patient_halts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A halt that comes late on a busy machine is a halt; a test of the deadline sets its own."""
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
+
+
 OURS = ("rollout-", "simulation", "device-connect", "fleet-client", "rosbridge", "rtps-bridge", "dds-", "mesh-")
 
 

@@ -9,9 +9,8 @@ from fixtures.toy_robots import ToyRobot
 
 
 @pytest.fixture(autouse=True)
-def patient_halts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A halt that comes late on a busy machine is a halt; a test of the deadline sets its own."""
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
+def patient(patient_halts: None) -> None:
+    """No test here fails because the machine was busy when something halted."""
 
 
 @pytest.fixture

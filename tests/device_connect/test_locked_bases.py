@@ -74,7 +74,7 @@ MAKERS: dict[str, Callable[[Far, pytest.MonkeyPatch], MobileBaseRobot]] = {
 
 @pytest.fixture
 def plane() -> Iterator[SafetyPlane]:
-    with own_plane(2.0) as here:
+    with own_plane(20.0) as here:
         yield here
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -40,10 +41,13 @@ def sent(base: MobileBaseRobot) -> list[float]:
 
 
 async def test_drive_starts_and_returns_and_its_end_is_told(base: MobileBaseRobot) -> None:
+    seen = threading.Event()
+    base.link.watch("/cmd_vel", None, lambda _: seen.wait(60) and None)
     async with DriverBench(driver(base)) as bench:
         answer = await bench.call("drive", linear=0.5, angular=0.0, duration=0.2)
         assert answer["status"] == "success"
         assert (await bench.call("getStatus"))["task_status"] == "running"
+        seen.set()
         await bench.until(lambda: bench.of("taskComplete"))
         assert bench.of("taskComplete")[0]["steps"] == 20
         assert sent(base) == [0.5] * 20 + [0.0]

@@ -29,12 +29,13 @@ def test_calls_run_side_by_side_and_idle_threads_end() -> None:
 
 
 def test_an_idle_thread_is_used_again() -> None:
-    lane = Lane("read", 4, WorkerPool(idle_s=5))
-    names = set()
+    pool = WorkerPool(idle_s=60)
+    lane = Lane("read", 4, pool)
+    threads = set()
     for _ in range(20):
-        names.add(lane.start(lambda: threading.current_thread().ident).result(20))
-        time.sleep(0.002)
-    assert len(names) <= 3
+        threads.add(lane.start(threading.current_thread).result(20))
+        eventually(lambda: pool._free == 1)
+    assert len(threads) == 1
 
 
 def test_no_job_is_lost_when_threads_end_and_start() -> None:

@@ -1,4 +1,4 @@
-"""Bases over links in memory, disconnected when a test has ended."""
+"""Bases over links in memory, disconnected when a test has ended, and patience for their halts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from fixtures.ros_bases import OPEN, TOPIC, Made
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.drivers.ros.posed_base import PosedBaseRobot
 from strands_robots.ros.link import MemoryLink
+
+
+@pytest.fixture(autouse=True)
+def patient(patient_halts: None) -> None:
+    """No test here fails because the machine was busy when something halted."""
 
 
 @pytest.fixture

@@ -57,6 +57,7 @@ class Odometry:
         self._lock = threading.Lock()
         self._unwatch: Unwatch | None = None
         self._starting = threading.Lock()
+        self._telling = threading.Lock()
         self._closings = 0
         self._tried_at = -math.inf
         self._problem = ""
@@ -115,15 +116,17 @@ class Odometry:
 
     def expect_stillness(self) -> None:
         """Forget the samples so far: only what arrives from now on says that the base stands."""
-        self._still_in_a_row = 0
-        self._at = -math.inf
+        with self._telling:
+            self._still_in_a_row = 0
+            self._at = -math.inf
 
     @property
     def still(self) -> bool | None:
         """True: it stands. False: it moves. None: nothing fresh is known."""
-        if time.monotonic() - self._at > FRESH_S or self._speeds is None:
-            return None
-        return self._still_in_a_row >= STILL_SAMPLES
+        with self._telling:
+            if time.monotonic() - self._at > FRESH_S or self._speeds is None:
+                return None
+            return self._still_in_a_row >= STILL_SAMPLES
 
     @property
     def last_speeds(self) -> tuple[float, float] | None:
@@ -135,9 +138,11 @@ class Odometry:
         if found is None:
             return
         still = found[0] <= STILL_LINEAR and found[1] <= STILL_ANGULAR
-        self._still_in_a_row = self._still_in_a_row + 1 if still else 0
-        self._speeds = found
-        self._at = time.monotonic()
+        # A stop forgets the samples so far: one that is being counted must not bring their number back.
+        with self._telling:
+            self._still_in_a_row = self._still_in_a_row + 1 if still else 0
+            self._speeds = found
+            self._at = time.monotonic()
 
 
 def _norm(part: object) -> float | None:
