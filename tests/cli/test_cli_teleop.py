@@ -11,7 +11,7 @@ from strands_robots.leaders import write_csv
 
 
 def test_a_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) -> None:
-    frames = [(0.02 * step, {"shoulder_pan": 0.004 * step}) for step in range(25)]
+    frames = [(0.02 * step, {"shoulder_pan": 0.004 * step}) for step in range(100)]
     write_csv(tmp_path / "run.csv", frames)
     result = run("teleop", str(tmp_path / "run.csv"), "so100", "--json")
     assert result.exit_code == 0, result.output

@@ -44,7 +44,7 @@ class Server:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.wait(5)
+        self._process.wait(20)
         if self._process.stdout is not None:
             self._process.stdout.close()
 
@@ -74,12 +74,12 @@ def answering(answer: Callable[[dict[str, Any]], Any]) -> Iterator[int]:
             yield running.socket.getsockname()[1]
         finally:
             running.shutdown()
-            thread.join(5)
+            thread.join(20)
 
 
 @contextmanager
 def policy(port: int, **options: Any) -> Iterator[RemotePolicy]:
-    made = RemotePolicy(policy_port=port, **options)
+    made = RemotePolicy(policy_port=port, **{"deadline_s": 20.0, **options})
     try:
         made.reset("wave", ARM)
         yield made
@@ -99,7 +99,7 @@ def test_the_reference_server_answers_in_both_kinds_of_frames(server: Server, fr
 def test_a_robot_runs_a_task_of_a_policy_server(server: Server) -> None:
     robot = HardwareRobot(RecordingDevice(), "arm", control_hz=100)
     robot.connect()
-    answer = robot.run_task("wave", policy_provider="remote", policy_port=server.port, duration=0.5)
+    answer = robot.run_task("wave", policy_provider="remote", policy_port=server.port, duration=3.0, deadline_s=20.0)
     assert answer["task_status"] == "completed", answer
     assert answer["step_count"] > 20
     assert robot.device.positions["pan.pos"] != 10.0
@@ -109,7 +109,7 @@ def test_a_robot_runs_a_task_of_a_policy_server(server: Server) -> None:
 def test_a_server_that_was_restarted_is_found_again_within_the_step() -> None:
     port = free_port()
     first = Server(port)
-    with policy(port, deadline_s=3.0) as remote:
+    with policy(port) as remote:
         assert remote.act({"pan": 0.0})
         first.kill()
         second = Server(port)
@@ -122,7 +122,7 @@ def test_a_server_that_was_restarted_is_found_again_within_the_step() -> None:
 def test_a_server_that_is_lost_ends_the_task_in_error_and_a_hold(server: Server) -> None:
     robot = HardwareRobot(RecordingDevice(), "arm", control_hz=100)
     robot.connect()
-    robot.start_task("wave", policy_provider="remote", policy_port=server.port)
+    robot.start_task("wave", policy_provider="remote", policy_port=server.port, duration=300.0)
     eventually(lambda: len(robot.device.writes) > 10)
     server.kill()
     eventually(lambda: robot.get_task_status()["task_status"] == "error")
@@ -142,7 +142,7 @@ def test_a_server_that_does_not_answer_in_time_is_an_error() -> None:
         began = time.monotonic()
         with pytest.raises(PolicyServerError, match="in time"):
             remote.act({"pan": 0.0})
-        assert time.monotonic() - began < 5
+        assert time.monotonic() - began < 20
 
 
 def test_a_stop_does_not_wait_for_a_server_that_thinks() -> None:
@@ -150,8 +150,8 @@ def test_a_stop_does_not_wait_for_a_server_that_thinks() -> None:
     with answering(lambda message: asked.set()) as port:
         robot = HardwareRobot(RecordingDevice(), "arm")
         robot.connect()
-        robot.start_task("think", policy_provider="remote", policy_port=port, deadline_s=30.0)
-        assert asked.wait(5)
+        robot.start_task("think", policy_provider="remote", policy_port=port, duration=300.0, deadline_s=60.0)
+        assert asked.wait(20)
         assert robot.stop_task()["stopped"] is True
         assert robot.get_task_status()["task_status"] == "stopped"
         robot.cleanup()
@@ -214,7 +214,7 @@ def test_images_travel_in_msgpack_frames() -> None:
         with policy(running.socket.getsockname()[1], frames="msgpack", uses_cameras=True) as remote:
             assert remote.act({"pan": 0.1, "front": image}) == []
         running.shutdown()
-        thread.join(5)
+        thread.join(20)
     front = seen[1]["observation"]["front"]
     assert np.array_equal(np.frombuffer(front["data"], front["dtype"]).reshape(front["shape"]), image)
 

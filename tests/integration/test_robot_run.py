@@ -24,7 +24,7 @@ import logging, threading
 from strands_robots import Robot
 logging.basicConfig(level=logging.INFO, format="%(message)s")
 robot = Robot("so100", peer_id="served-arm")
-robot.start_policy("so100", "wave", duration=60)
+robot.start_policy("so100", "wave", duration=600)
 verdict = robot.run()
 print("halted", verdict.stopped, list(verdict.halted), flush=True)
 robot.cleanup()
@@ -52,7 +52,7 @@ def status_of(port: int, device: str) -> dict[str, object] | None:
     return asyncio.run(ask())
 
 
-def test_a_robot_is_served_until_its_event_and_is_halted_first() -> None:
+def test_a_robot_is_served_until_its_event_and_is_halted_first(patient_halts: None) -> None:
     robot = HardwareRobot(RecordingDevice(), "arm", control_hz=100)
     robot.connect()
     port, until = free_port(), threading.Event()
@@ -63,11 +63,11 @@ def test_a_robot_is_served_until_its_event_and_is_halted_first() -> None:
     thread.start()
     try:
         assert eventually(lambda: status_of(port, "run-arm"))
-        robot.start_task("wave", duration=30)
+        robot.start_task("wave", duration=300)
         eventually(lambda: robot.device.writes)
     finally:
         until.set()
-        thread.join(15)
+        thread.join(60)
     assert not thread.is_alive()
     assert verdicts[0].stopped is True
     assert verdicts[0].halted == ("task",)
@@ -77,6 +77,7 @@ def test_a_robot_is_served_until_its_event_and_is_halted_first() -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_halts_the_robot_and_then_departs(number: signal.Signals, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     process = subprocess.Popen([sys.executable, "-c", SERVE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
@@ -86,10 +87,10 @@ def test_a_signal_halts_the_robot_and_then_departs(number: signal.Signals, monke
         else:
             pytest.fail("it never served")
         process.send_signal(number)
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=60)
     finally:
         process.kill()
-        process.wait(5)
+        process.wait(20)
     assert "halted True ['so100']" in out, err
     assert "threads []" in out
     assert process.returncode == 0

@@ -11,8 +11,11 @@ from fixtures.bodies import ScriptedPolicy
 from fixtures.waiting import eventually
 
 from strands_robots.envelope import error
+from strands_robots.safety.gate import Permit
 from strands_robots.simulation import Simulation, motion
 from strands_robots.teleop import ScriptedLeader
+
+pytestmark = pytest.mark.usefixtures("patient_halts")
 
 
 @pytest.fixture
@@ -47,7 +50,7 @@ def test_stopping_one_robot_reaches_its_policy_that_still_loads_and_no_other(
 
     def slow(provider: str, **options: Any) -> ScriptedPolicy:
         loading.release()
-        assert ready.wait(10)
+        assert ready.wait(60)
         return ScriptedPolicy([], always={"shoulder_pan": 0.5})
 
     monkeypatch.setattr(motion, "create_policy", slow)
@@ -58,28 +61,42 @@ def test_stopping_one_robot_reaches_its_policy_that_still_loads_and_no_other(
     ]
     for thread in threads:
         thread.start()
-    assert all(loading.acquire(timeout=5) for _ in threads)
+    assert all(loading.acquire(timeout=20) for _ in threads)
     assert world.stop_policy("left")["stopped"] is True
     ready.set()
     for thread in threads:
-        thread.join(5)
+        thread.join(20)
+        assert not thread.is_alive()
     assert answers["left"]["status"] == "error"
     assert answers["right"]["status"] == "success"
     assert [row["robot"] for row in world.list_policies_running()] == ["right"]
 
 
-def test_a_reset_that_waited_for_its_turn_does_not_move_what_was_stopped_meanwhile(world: Simulation) -> None:
+def test_a_reset_that_waited_for_its_turn_does_not_move_what_was_stopped_meanwhile(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.step(1)  # by hand from here on
     world.send_action({"shoulder_pan": 0.5}, "left")
     world.step(500)
     before = world.get_observation("left")
     answers: list[Any] = []
+    asked: list[str] = []
+    permit = world.gate.permit
+
+    def noted(verb: str) -> Permit:
+        given = permit(verb)
+        asked.append(verb)
+        return given
+
+    monkeypatch.setattr(world.gate, "permit", noted)
     with world.starting:
         thread = threading.Thread(target=lambda: answers.append(world.reset()))
         thread.start()
+        eventually(lambda: "reset" in asked)
         thread.join(0.1)
         assert thread.is_alive(), "it waits for whoever builds the world"
         assert world.halt("test").stopped is True
-    thread.join(5)
+    thread.join(20)
     assert answers[0]["status"] == "error"
     assert world.get_observation("left")["shoulder_pan"] == pytest.approx(before["shoulder_pan"], abs=0.05)
 
@@ -113,6 +130,7 @@ def test_a_locked_world_is_not_started_over(world: Simulation) -> None:
 
 
 def test_stopping_a_robot_on_its_way_to_a_single_target_freezes_it_and_no_other(world: Simulation) -> None:
+    world.step(1)  # by hand from here on, so that nobody is there before the stop
     for name in ("left", "right"):
         world.send_action({"shoulder_pan": 1.0}, name)
     world.step(50)

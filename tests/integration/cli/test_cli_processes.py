@@ -18,7 +18,8 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots import settings
 
-WITHIN_S = 30.0
+WITHIN_S = 100.0
+pytestmark = pytest.mark.timeout(600)
 
 
 class Shell:
@@ -28,6 +29,7 @@ class Shell:
         ours = {setting.name for setting in settings.declared()}
         self.environment = {name: value for name, value in os.environ.items() if name not in ours}
         self.environment |= {"STRANDS_DC_PORT": str(free_port()), "STRANDS_STATE_DIR": str(state)}
+        self.environment["STRANDS_HALT_DEADLINE_S"] = "20"
 
     def start(self, *words: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
@@ -79,19 +81,19 @@ def test_serve_says_who_it_is_and_what_it_can_do(arm: dict[str, Any]) -> None:
 
 
 def test_peers_lists_the_arm_and_what_it_can_do(shell: Shell, arm: dict[str, Any]) -> None:
-    code, said = shell.json("peers")
+    code, said = shell.json("peers", "--timeout", "20")
     assert code == 0
     assert [peer["id"] for peer in said["peers"]] == ["arm-1"]
-    shown = shell.run("peers", "arm-1")
+    shown = shell.run("peers", "arm-1", "--timeout", "20")
     assert "instruction" in shown.stdout
     assert shell.json("peers", "arm-2")[0] == 3
 
 
 def test_a_motion_is_called_watched_and_stopped(shell: Shell, arm: dict[str, Any]) -> None:
-    code, said = shell.json("call", "arm-1", "execute", "instruction=wave hello", "duration=30")
+    code, said = shell.json("call", "arm-1", "execute", "instruction=wave hello", "duration=600")
     assert (code, said["status"]) == (0, "success")
     assert eventually(lambda: running(shell))
-    watched = shell.run("watch", "arm-1", "--for", "1")
+    watched = shell.run("watch", "arm-1", "--for", "4")
     assert watched.returncode == 0
     assert "wave hello" in watched.stdout
     code, said = shell.json("stop", "arm-1")
@@ -116,7 +118,7 @@ def test_a_second_robot_of_the_same_id_is_refused(shell: Shell, arm: dict[str, A
 
 
 def test_events_are_told_one_json_value_a_line(shell: Shell, arm: dict[str, Any]) -> None:
-    result = shell.run("watch", "arm-1", "--for", "0.5", "--json")
+    result = shell.run("watch", "arm-1", "--for", "4", "--json")
     events = [json.loads(line) for line in result.stdout.splitlines()]
     assert result.returncode == 0
     assert {"observationUpdate"} <= {event["event"] for event in events}
@@ -138,7 +140,7 @@ def test_a_signal_stops_the_robot_first_and_leaves_no_ghost(shell: Shell, number
     try:
         assert served.stdout is not None
         assert json.loads(served.stdout.readline())["event"] == "serving"
-        assert shell.json("call", "arm-2", "execute", "instruction=wave", "duration=60")[0] == 0
+        assert shell.json("call", "arm-2", "execute", "instruction=wave", "duration=600")[0] == 0
         served.send_signal(number)
         told, _ = served.communicate(timeout=WITHIN_S)
     finally:
@@ -216,7 +218,7 @@ def test_an_arm_is_served_and_stopped_over_a_broker(shell: Shell) -> None:
         try:
             assert served.stdout is not None
             assert json.loads(served.stdout.readline())["event"] == "serving"
-            assert [peer["id"] for peer in shell.json("peers", *there)[1]["peers"]] == ["arm-5"]
+            assert [peer["id"] for peer in shell.json("peers", "--timeout", "20", *there)[1]["peers"]] == ["arm-5"]
             assert shell.json("call", "arm-5", "execute", "instruction=wave", *there)[0] == 0
             assert shell.json("stop", "--all", *there)[0] == 0
         finally:

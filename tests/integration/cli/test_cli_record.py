@@ -18,6 +18,7 @@ from strands_robots.recording import Entry, read_entries, read_items, recorded_a
 from strands_robots.simulation import Simulation
 
 pytest.importorskip("mcap")
+pytestmark = pytest.mark.timeout(300)
 
 COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
@@ -29,8 +30,8 @@ def test_what_an_arm_did_is_recorded_and_done_again(tmp_path: Path, monkeypatch:
     world.add_robot("arm", "so100")
     runtime = init_device_connect_sync(world, peer_id="sim-1", link=loopback_config(port))
     try:
-        assert world.start_policy("arm", "wave", duration=20)["status"] == "success"
-        line = ["record", "sim-1", "--out", str(run), "--for", "2", "--port", str(port), "--json"]
+        assert world.start_policy("arm", "wave", duration=600)["status"] == "success"
+        line = ["record", "sim-1", "--out", str(run), "--for", "4", "--port", str(port), "--json"]
         done = CliRunner().invoke(build(), line)
     finally:
         stop_device_connect(runtime)
@@ -54,12 +55,12 @@ def test_who_serves_an_arm_records_it_also_while_it_stands(tmp_path: Path) -> No
         assert serving.stdout is not None
         assert json.loads(serving.stdout.readline())["event"] == "serving"
         moved = CliRunner().invoke(
-            build(), ["call", "sim-1", "execute", "instruction=wave", "duration=20", "--port", port, "--json"]
+            build(), ["call", "sim-1", "execute", "instruction=wave", "duration=600", "--port", port, "--json"]
         )
         assert moved.exit_code == 0, moved.output
-        eventually(lambda: run.stat().st_size > 30_000, within=20)
+        eventually(lambda: run.stat().st_size > 30_000, within=60)
         serving.send_signal(signal.SIGINT)
-        rest = [json.loads(text) for text in serving.communicate(timeout=20)[0].splitlines()]
+        rest = [json.loads(text) for text in serving.communicate(timeout=60)[0].splitlines()]
     finally:
         serving.kill()
         serving.wait()

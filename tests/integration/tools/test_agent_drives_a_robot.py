@@ -22,6 +22,7 @@ def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ToyWorld]
     """One toy world, served on a loopback port that the tool uses too."""
     monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     toy = ToyWorld("toys", robots=("left",))
     runtime = init_device_connect_sync(toy, peer_id="toys", link=loopback_config())
     try:
@@ -44,7 +45,7 @@ def results(*asked: dict[str, Any]) -> list[dict[str, Any]]:
 def test_an_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
     told = results(
         {"action": "peers"},
-        {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20},
+        {"action": "tell", "target": "toys", "instruction": "wave", "duration": 300},
         {"action": "status", "target": "toys"},
         {"action": "stop", "target": "toys"},
     )
@@ -56,7 +57,7 @@ def test_an_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
 
 
 def test_an_emergency_stop_halts_and_locks_every_robot_and_names_it(world: ToyWorld) -> None:
-    wave = {"action": "tell", "target": "toys", "instruction": "wave", "duration": 20}
+    wave = {"action": "tell", "target": "toys", "instruction": "wave", "duration": 300}
     told = results(wave, {"action": "emergency_stop", "instruction": "smoke"}, wave)
     assert told[1]["status"] == "success"
     assert "toys" in str(told[1]["content"])
@@ -66,7 +67,7 @@ def test_an_emergency_stop_halts_and_locks_every_robot_and_names_it(world: ToyWo
 
 
 def test_a_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None:
-    world.start_policy("left", "wave", duration=20)
+    world.start_policy("left", "wave", duration=300)
     world.stubborn = True
     (told,) = results({"action": "stop"})
     assert told["status"] == "error"
@@ -74,7 +75,7 @@ def test_a_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None
 
 
 def test_an_emergency_stop_that_did_not_stop_a_robot_is_an_error_by_name(world: ToyWorld) -> None:
-    world.start_policy("left", "wave", duration=20)
+    world.start_policy("left", "wave", duration=300)
     world.stubborn = True
     (told,) = results({"action": "emergency_stop"})
     assert told["status"] == "error"
