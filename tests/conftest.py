@@ -20,7 +20,7 @@ for setting in settings.declared():
     if setting.name not in {"DISPLAY", "MUJOCO_GL"}:
         os.environ.pop(setting.name, None)
 
-# An example may take as long as a busy machine lets it; the environments of real arms and DDS Security have no examples.
+# An example takes as long as a busy machine lets it; the environments of real arms and DDS Security have no examples.
 if find_spec("hypothesis"):
     import hypothesis
 

@@ -16,7 +16,7 @@ def record(count: int = 3) -> None:
     for number in range(count):
         log_safety_event("emergency_stop", "arm-1", {"epoch": EPOCH, "number": number})
     log_safety_event("resume_local", "arm-2", {"who": "ada\x1b[2J", "epochs": [EPOCH]})
-    assert flush_audit()
+    assert flush_audit(20)
 
 
 def test_the_tail_is_the_last_records_and_no_control_sequence(run: Run) -> None:

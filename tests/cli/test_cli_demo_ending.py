@@ -64,7 +64,7 @@ class Scene:
 def tell(scene: Scene) -> None:
     for number in range(scene.records):
         log_safety_event("emergency_stop", "arm-1", {"number": number})
-    assert flush_audit()
+    assert flush_audit(20)
     spot: Any = scene
     ending = Ending(
         Show(Screen(machine=True)), spot, spot, peer_id="arm-1", controller=spot, key=Ed25519PrivateKey.generate()

@@ -124,7 +124,7 @@ def test_a_robot_that_does_not_run_is_cleared_here_and_recorded(run: Run, fleet:
     shown = run("lockout", "--local")
     assert "arm-1 (kept here)" in shown.stdout and "by desk: a hand" in shown.stdout and A in shown.stdout
     assert run("resume", "--local").exit_code == 0
-    flush_audit()
+    assert flush_audit(20)
     (record,) = [each for each in read_audit_log() if each["event"] == "resume_local"]
     assert (record["peer_id"], record["payload"]["who"]) == ("arm-1", resume.operator())
     assert "No lockout is known" in run("lockout", "--local").stdout

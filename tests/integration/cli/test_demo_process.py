@@ -23,7 +23,7 @@ pytestmark = pytest.mark.timeout(600)
 def environment(state: Path, **more: str) -> dict[str, str]:
     ours = {setting.name for setting in settings.declared()}
     kept = {name: value for name, value in os.environ.items() if name not in ours}
-    return {**kept, "STRANDS_STATE_DIR": str(state), **more}
+    return {**kept, "STRANDS_STATE_DIR": str(state), "STRANDS_HALT_DEADLINE_S": "20", **more}
 
 
 def start(folder: Path, *words: str, **more: str) -> subprocess.Popen[str]:
