@@ -182,6 +182,17 @@ def test_a_lockout_survives_the_process_and_so_does_the_memory_of_its_id(plane: 
     assert robot.reasons == ["it comes up locked"]
 
 
+def test_a_robot_that_leaves_while_its_halt_is_under_way_comes_back_locked(plane: SafetyPlane) -> None:
+    key, epoch, halted = hardware_key("so101", "usb-1"), new_epoch(), threading.Event()
+    entry = plane.register("arm-1", RecordingRobot(before_halt=lambda: halted.wait(20)), key=key)
+    plane.begin(order(epoch))
+    threading.Timer(0.2, halted.set).start()
+    entry.close()
+    again = plane.register("arm-1", RecordingRobot(), key=key)
+    assert again.epochs == (epoch,)
+    again.close()
+
+
 def test_a_simulation_without_a_name_is_not_kept(plane: SafetyPlane, add: Add) -> None:
     add()
     assert plane.emergency_stop(order())["arm-1"].persisted is None

@@ -182,6 +182,9 @@ class SafetyPlane:
                 return
             self._robots = {name: each for name, each in self._robots.items() if each is not entry}
             self._bequeath(entry)
+            if entry.locked:
+                # Its last stop may still be on the way to the disk, and whoever registers next reads it there.
+                self._kept([entry])
             # Decided here: a robot that registers meanwhile has a reporter of its own, and this one ends all the same.
             last = None
             if not self._robots:

@@ -23,8 +23,8 @@ COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
 @pytest.fixture
 def wave(tmp_path: Path) -> Path:
-    """Twenty seconds of a joint that the followers here have."""
-    frames = [(0.1 * step, {"shoulder.pos": 0.1 * step}) for step in range(200)]
+    """Twenty seconds of a joint that the followers here have; it moves for ten of them."""
+    frames = [(0.1 * step, {"shoulder.pos": min(0.1 * step, 10.0)}) for step in range(200)]
     write_csv(tmp_path / "wave.csv", frames)
     return tmp_path / "wave.csv"
 
@@ -43,7 +43,7 @@ def replay(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def ended(replaying: subprocess.Popen[str]) -> tuple[int, list[dict[str, Any]]]:
-    out, problems = replaying.communicate(timeout=30)
+    out, problems = replaying.communicate(timeout=90)
     assert "Traceback" not in problems, problems
     return replaying.returncode, [json.loads(line) for line in out.splitlines()]
 
@@ -58,7 +58,7 @@ def test_an_approved_arm_is_led_to_the_end_and_stopped(join: Join, replay: Any, 
     assert (code, told["stopped"], told["errors"]) == (0, True, 0), told
     actions = [action["shoulder.pos"] for action in arm.ask("actions")]
     assert actions == sorted(actions)
-    assert actions[-1] == pytest.approx(19.9, abs=1.5)
+    assert actions[-1] == pytest.approx(10.0)
     assert len(arm.ask("halts")[0]) == 1
 
 
@@ -118,20 +118,20 @@ def test_a_follower_that_is_not_there_is_one_sentence(replay: Any, wave: Path) -
 
 
 def test_a_leader_that_is_published_drives_a_robot_of_this_machine(replay: Any, wave: Path, tmp_path: Path) -> None:
-    write_csv(tmp_path / "pan.csv", [(0.1 * step, {"shoulder_pan": 0.01 * step}) for step in range(100)])
+    write_csv(tmp_path / "pan.csv", [(0.1 * step, {"shoulder_pan": 0.01 * step}) for step in range(1200)])
     leading = subprocess.Popen(
         [*COMMAND, "teleop", str(tmp_path / "pan.csv"), "so100", "--publish", "lead-1", "--json"],
         stdout=subprocess.PIPE,
         text=True,
     )
     try:
-        line = ["teleop", "mesh:lead-1", "so100", "--for", "1", "--json"]
+        line = ["teleop", "mesh:lead-1", "so100", "--for", "3", "--json"]
 
         def following() -> list[dict[str, Any]]:
-            done = subprocess.run([*COMMAND, *line], stdout=subprocess.PIPE, text=True, check=False, timeout=30)
+            done = subprocess.run([*COMMAND, *line], stdout=subprocess.PIPE, text=True, check=False, timeout=90)
             return [json.loads(each) for each in done.stdout.splitlines()] if done.returncode == 0 else []
 
-        [told] = eventually(following, within=20, what="the leader is on the mesh")
+        [told] = eventually(following, what="the leader is on the mesh")
     finally:
         leading.kill()
         leading.communicate()
@@ -141,11 +141,11 @@ def test_a_leader_that_is_published_drives_a_robot_of_this_machine(replay: Any, 
 
 
 def test_a_leader_is_published_alone_where_nobody_follows_here(replay: Any, wave: Path) -> None:
-    line = [*COMMAND, "teleop", str(wave), "none", "--for", "0.5", "--json"]
-    done = subprocess.run([*line, "--publish", "lead-1"], stdout=subprocess.PIPE, text=True, check=True, timeout=30)
+    line = [*COMMAND, "teleop", str(wave), "none", "--for", "2", "--json"]
+    done = subprocess.run([*line, "--publish", "lead-1"], stdout=subprocess.PIPE, text=True, check=True, timeout=90)
     told = json.loads(done.stdout)
     assert told["frames"] > 10
     assert told["errors"] == 0
-    refused = subprocess.run(line, stdout=subprocess.PIPE, text=True, check=False, timeout=30)
+    refused = subprocess.run(line, stdout=subprocess.PIPE, text=True, check=False, timeout=90)
     assert refused.returncode == 2
     assert "--publish" in json.loads(refused.stdout)["reason"]

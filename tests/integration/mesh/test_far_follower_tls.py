@@ -39,7 +39,7 @@ def side(tmp_path: Path) -> Callable[..., Mapping[str, str]]:
 
 @pytest.mark.parametrize("hub", ["console", "arm-1"])
 def test_an_operator_leads_a_certified_peer(hub: str, side: Callable[..., Mapping[str, str]], tmp_path: Path) -> None:
-    write_csv(tmp_path / "pan.csv", [(0.1 * step, {"shoulder_pan": 0.01 * step}) for step in range(6)])
+    write_csv(tmp_path / "pan.csv", [(0.1 * step, {"shoulder_pan": 0.01 * step}) for step in range(31)])
     endpoint = f"tls/127.0.0.1:{free_port()}"
     way = {True: {"ZENOH_LISTEN": endpoint}, False: {"ZENOH_CONNECT": endpoint}}
     serving = subprocess.Popen(
@@ -53,7 +53,7 @@ def test_an_operator_leads_a_certified_peer(hub: str, side: Callable[..., Mappin
         assert json.loads(serving.stdout.readline())["peer_id"] == "arm-1"
         line = [*COMMAND, "replay", str(tmp_path / "pan.csv"), "--to", "mesh:arm-1", "--json"]
         environment = side("console", hub, **way[hub == "console"])
-        done = subprocess.run(line, stdout=subprocess.PIPE, text=True, env=environment, check=False, timeout=40)
+        done = subprocess.run(line, stdout=subprocess.PIPE, text=True, env=environment, check=False, timeout=90)
     finally:
         serving.kill()
         serving.communicate()

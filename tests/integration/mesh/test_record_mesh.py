@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from strands_robots.recording import Entry, Joints, Picture, read_items
 pytest.importorskip("mcap")
 
 COMMAND = [sys.executable, "-m", "strands_robots.cli"]
+CAMERAS = {"overview", "front", "side", "top", "so100.wrist"}
 
 
 @pytest.fixture
@@ -25,6 +27,11 @@ def settings(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     for name, value in (("PORT", str(port)), ("CAMERA_HZ", "10")):
         monkeypatch.setenv(f"STRANDS_MESH_{name}", value)
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
+
+
+def seen(run: Path) -> set[str]:
+    """The cameras whose pictures are in the recording so far."""
+    return {item.camera for item in read_items(run) if isinstance(item, Picture)}
 
 
 def started(*words: str) -> Any:
@@ -41,10 +48,16 @@ def test_states_pictures_and_stops_of_a_served_world_are_recorded(
     try:
         assert json.loads(serving.stdout.readline())["peer_id"] == "arm-1"
         console.sees("arm-1")
-        recording = started("record", "arm-1", "--out", str(run), "--mesh", "--for", "6")
-        eventually(lambda: run.exists() and run.stat().st_size > 20_000, within=20)
-        console.ask("estop")
-        out = recording.communicate(timeout=30)[0]
+        recording = started("record", "arm-1", "--out", str(run), "--mesh")
+        try:
+            eventually(lambda: run.exists() and run.stat().st_size > 20_000 and seen(run) >= CAMERAS)
+            console.ask("estop")
+            eventually(lambda: "emergencyStop" in {item.event for item in read_items(run) if isinstance(item, Entry)})
+            recording.send_signal(signal.SIGINT)
+            out = recording.communicate(timeout=60)[0]
+        finally:
+            recording.kill()
+            recording.wait()
     finally:
         serving.kill()
         serving.communicate()
@@ -55,6 +68,6 @@ def test_states_pictures_and_stops_of_a_served_world_are_recorded(
     assert joints.device == "arm-1"
     assert "shoulder_pan" in joints.joints
     pictures = [item for item in items if isinstance(item, Picture)]
-    assert {item.camera for item in pictures} == {"overview", "front", "side", "top", "so100.wrist"}
+    assert seen(run) == CAMERAS
     assert all(item.jpeg[:2] == b"\xff\xd8" for item in pictures)
     assert "emergencyStop" in {item.event for item in items if isinstance(item, Entry)}

@@ -17,6 +17,12 @@ from fixtures.waiting import eventually, free_port
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
 
 
+@pytest.fixture(autouse=True)
+def patient_halts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may keep a thread that halts from running for a while; no test here is about how long."""
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "10")
+
+
 class Stage:
     """Starts processes on one link and ends them; all robots of a stage keep their state in one folder.
 
@@ -46,12 +52,12 @@ class Stage:
         """A controller whose link is up."""
         made = controller(self.far, controller_id, seed=seed, within=self._there)
         child = self._stack.enter_context(made)
-        assert child.ask("up", 15.0)
+        assert child.ask("up", 30.0)
         return child
 
     def meet(self, hand: Child, *ids: str) -> None:
         """Wait until a stop of ``hand`` comes through to each robot and back: from then on nobody is unknown."""
-        eventually(lambda: hand.ask("stop", ids, 0.5)["ok"], 20, "the first stop")
+        eventually(lambda: hand.ask("stop", ids, 0.5)["ok"], what="the first stop")
 
     def close(self) -> None:
         """End every process."""

@@ -31,7 +31,7 @@ from strands_robots.audit import flush_audit, log_safety_event
 resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900))
 for number in range(8):
     log_safety_event("e", "arm-1", {"n": number})
-    print(flush_audit(0.2), flush=True)
+    print(flush_audit(0.2 if number else 20.0), flush=True)
 """
 
 

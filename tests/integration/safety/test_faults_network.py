@@ -108,7 +108,7 @@ def test_stops_come_through_delay_jitter_and_loss_one_after_another(far: Stage, 
 
 
 def test_a_robot_that_needs_a_controller_stops_by_itself_when_it_is_cut_off(far: Stage, lab: NetworkLab) -> None:
-    robots, _ = moving(far, STRANDS_CHECKIN_TIMEOUT_S="1.0")
+    robots, _ = moving(far, STRANDS_CHECKIN_TIMEOUT_S="3.0")
     assert facts(robots)["moving"]
     lab.weather.parted = True
     eventually(lambda: facts(robots)["locked"], what="the robot locked by itself")

@@ -79,12 +79,12 @@ def open_site(network: tuple[LinkConfig, Broker | None]) -> Iterator[Callable[..
 
 
 def probe(site: Site, listener: Listener) -> None:
-    """Wait until a stop of the listener reaches the site and its verdict comes back, then clear it."""
+    """Wait until a stop of the listener reaches the site and the verdict of each robot comes back, then clear it."""
     epoch = new_epoch()
 
     def answered() -> bool:
         listener.send("probe-1", estop_id=epoch)
-        return bool(listener.verdicts(epoch))
+        return {each["device_id"] for each in listener.verdicts(epoch)} == set(site.robots)
 
     eventually(answered)
     site.plane.clear_local("test")
@@ -158,6 +158,10 @@ def test_a_flood_of_forged_stops_delays_no_true_one_and_stops_nothing(
     site, listener = open_site("arm-1", decide=lambda: Decision(allow=("safety-*",), keys=(ed25519.public_half(key),)))
     robot, done = site.robots["arm-1"], threading.Event()
 
+    def refused() -> list[str]:
+        """The sources of what the audit holds as refused."""
+        return [each["payload"]["source"] for each in read_audit_log() if each["event"] == "estop_refused"]
+
     def forge() -> None:
         sig = ed25519.encode(bytes(64))
         while not done.is_set():
@@ -168,7 +172,7 @@ def test_a_flood_of_forged_stops_delays_no_true_one_and_stops_nothing(
     thread = threading.Thread(target=forge)
     thread.start()
     try:
-        time.sleep(0.3)
+        eventually(lambda: {"forger", "safety-9", "safety-1"} <= set(refused()))
         assert robot.halts == []
         fields = {"estop_id": new_epoch(), "t": time.time(), "nonce": new_epoch()}
         message = signed_fields(fields["estop_id"], "safety-1", fields["t"], fields["nonce"])
@@ -183,9 +187,7 @@ def test_a_flood_of_forged_stops_delays_no_true_one_and_stops_nothing(
         done.set()
         thread.join()
     assert len(robot.halts) == 1
-    refused = [each["payload"] for each in read_audit_log() if each["event"] == "estop_refused"]
-    assert {"forger", "safety-9"} <= {each["source"] for each in refused}
-    assert len(refused) < 10
+    assert len(refused()) < 10
 
 
 def test_a_broker_that_was_killed_is_noticed_and_the_next_stop_comes_through(
@@ -224,11 +226,11 @@ def test_a_check_in_reaches_the_plane_from_who_may(open_site: Callable[..., tupl
 def test_the_lane_leaves_no_thread_and_no_connection_behind() -> None:
     with NatsServer() as server:
         for link in (LinkConfig(transport="nats", connect=(server.url,)), loopback_config(free_port())):
-            before = threading.active_count()
+            before = set(threading.enumerate())
             site = Site(link, "arm-1", "arm-2")
             assert len({id(seat.link) for seat in site.seats}) == 1
             site.close()
-            assert threading.active_count() == before
+            eventually(lambda before=before: set(threading.enumerate()) <= before)  # type: ignore[misc]
 
 
 def test_a_link_that_never_comes_up_closes_at_once() -> None:
