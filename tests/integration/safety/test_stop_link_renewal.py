@@ -35,7 +35,8 @@ def test_a_link_carries_stops_while_it_is_made_anew_and_leaves_no_thread() -> No
         hand.open((), lambda event, source, data: None, told.append)
         eventually(lambda: hand.up and all(seat.link.up for seat in lane().seats))
         assert isinstance(hand, RenewableLink)
-        before = seen_by(lane().seats[0].link)
+        # The device's own session, which holds the meeting port, and the hand's.
+        before = eventually(lambda: len(there := seen_by(lane().seats[0].link)) == 2 and there)
         hand.renew()
         hand.renew()
         for number in range(1, 4):
