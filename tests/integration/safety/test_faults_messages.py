@@ -38,6 +38,12 @@ def held(robots: Child, name: str = "arm-1") -> list[str]:
     return epochs
 
 
+def halts(robots: Child) -> int:
+    """How often the robot was halted: a moment after it was locked, on a thread of its own."""
+    count: int = robots.ask("facts")["arm-1"]["halts"]
+    return count
+
+
 def events(robots: Child, name: str) -> list[dict[str, Any]]:
     """What the audit, which verifies, holds under this name."""
     records, verifies = robots.ask("audit")
@@ -46,14 +52,15 @@ def events(robots: Child, name: str) -> list[dict[str, Any]]:
 
 
 def stop_as(link: StopLink, robots: Child, source: str) -> str:
-    """Send stops of ``source`` until one holds the robot; its epoch."""
-    epoch = new_epoch()
+    """Send stops of ``source`` until one holds the robot and has halted it; its epoch."""
+    epoch, before = new_epoch(), halts(robots)
 
     def holds() -> bool:
         link.publish(source, ESTOP, notification(ESTOP, {"estop_id": epoch, "t": time.time()}))
         return epoch in held(robots)
 
     eventually(holds, what=f"a stop of {source}")
+    eventually(lambda: halts(robots) > before, what=f"the halt of {source}")
     return epoch
 
 
@@ -95,6 +102,7 @@ def test_a_recorded_stop_played_again_after_its_resume_holds_nobody(stage: Stage
         return bool(held(robots))
 
     eventually(holds, what="the first time")
+    eventually(lambda: halts(robots))
     robots.ask("clear")
     robots.ask("move")
     for _ in range(20):

@@ -186,6 +186,8 @@ def test_a_flood_of_forged_stops_delays_no_true_one_and_stops_nothing(
     finally:
         done.set()
         thread.join()
+    # It is locked at once and halted on a thread of its own.
+    eventually(lambda: robot.halts)
     assert len(robot.halts) == 1
     assert len(refused()) < 10
 
