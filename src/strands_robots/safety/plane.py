@@ -53,6 +53,7 @@ class Registered:
         self.gates: tuple[MotionGate, ...] = (robot.gate,)
         self.latch = LockoutLatch(wire_id, kept.state, kept.seen)
         self.worker = HaltWorker(robot, robot_id)
+        self.on_disk = kept.state
         self.verifier = ResumeVerifier([wire_id])
         self.reports: dict[str, RobotReport] = {}
         self._plane = plane
@@ -182,7 +183,7 @@ class SafetyPlane:
                 return
             self._robots = {name: each for name, each in self._robots.items() if each is not entry}
             self._bequeath(entry)
-            if entry.locked:
+            if entry.locked and entry.latch.state is not entry.on_disk:
                 # Its last stop may still be on the way to the disk, and whoever registers next reads it there.
                 self._kept([entry])
             # Decided here: a robot that registers meanwhile has a reporter of its own, and this one ends all the same.
@@ -324,11 +325,11 @@ class SafetyPlane:
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.
         with self._keeping:
-            records = {
-                entry.key: Kept(entry.latch.state, entry.latch.seen, entry.wire_id) for entry in entries if entry.key
-            }
-            if records:
-                self.store.save(records)
+            kept = {each: Kept(each.latch.state, each.latch.seen, each.wire_id) for each in entries if each.key}
+            if kept:
+                self.store.save({entry.key: record for entry, record in kept.items() if entry.key})
+            for entry, record in kept.items():
+                entry.on_disk = record.state
 
     def _kept(self, entries: Iterable[Registered]) -> bool:
         try:
