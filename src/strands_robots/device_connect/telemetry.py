@@ -17,8 +17,9 @@ logger = logging.getLogger(__name__)
 PENDING_MAX = 2000
 """Steps that may wait for the event loop (40 s of one robot at 50 Hz); starts and ends always wait."""
 
-BURST = 25.0
-"""Steps that may follow one another at once after a pause: a steady loop that was held up loses none by catching up."""
+BURST = 50.0
+"""Steps that may follow one another at once after a pause: a loop at 50 Hz that was held up for a second, the longest
+that a simulation makes up for, loses none by catching up."""
 
 FIRST = 2.0
 """Of these, what a loop has when it starts."""

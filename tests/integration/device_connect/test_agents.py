@@ -6,7 +6,6 @@ import asyncio
 import json
 import os
 import sys
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,7 +15,7 @@ from device_connect_agent_tools.adapters import strands as strands_tools
 from fixtures.nats_server import NatsServer
 from fixtures.scripted_model import ScriptedModel
 from fixtures.toy_robots import ToyRobot, ToyWorld
-from fixtures.waiting import eventually, free_port
+from fixtures.waiting import eventually, eventually_async, free_port
 from strands import Agent
 
 from strands_robots.device_connect import LinkConfig, init_device_connect_sync, loopback_config, stop_device_connect
@@ -113,15 +112,33 @@ def test_hardware_moves_for_the_unnamed_when_the_operator_says_so(
 
 
 def test_agents_hear_events(connected: Lab) -> None:
+    world = connected.worlds["arm-2"]
     steps = agent_tools.subscribe("device(arm-2).event(streamStep)")
     ends = agent_tools.subscribe("device(arm-2).event(policyComplete)")
-    time.sleep(0.2)
-    agent_tools.invoke_device("arm-2", "execute", {"instruction": "wave", "duration": 0.5})
     heard: list[Any] = []
-    eventually(lambda: heard.extend(ends.read()) or heard)
+
+    def both_heard() -> bool:
+        # A new subscription takes a moment to reach everybody.
+        agent_tools.invoke_device("arm-2", "execute", {"instruction": "wave", "duration": 0.2})
+        eventually(lambda: not world.rollouts["left"].running)
+        heard.extend(ends.read())
+        return bool(heard and steps.read())
+
+    eventually(both_heard)
     assert "wave" in json.dumps(heard)
-    got = steps.read()
-    assert len(got) >= connected.worlds["arm-2"].rollouts["left"].steps - 1
+    agent_tools.invoke_device("arm-2", "execute", {"instruction": "wave", "duration": 0.5})
+    wave = world.rollouts["left"]
+    eventually(lambda: not wave.running)
+    told: list[int] = []
+
+    def to_its_end() -> bool:
+        told.extend(each["params"]["step"] for each in steps.read())
+        return bool(told and told[-1] >= wave.steps - 1)
+
+    eventually(to_its_end)
+    # What came late of the waves before is left out.
+    of_this = told[len(told) - 1 - told[::-1].index(1) :]
+    assert len(of_this) >= wave.steps - 1
 
 
 def test_a_broadcast_stops_the_fleet(connected: Lab) -> None:
@@ -129,7 +146,13 @@ def test_a_broadcast_stops_the_fleet(connected: Lab) -> None:
         agent_tools.invoke_device(name, "execute", {"instruction": "wave"})
     conn = agent_tools.get_connection()
     conn.subscribe_buffered(f"device-connect.{conn.zone}.*.event.async_reply.>", name="replies")
-    time.sleep(0.2)
+
+    def heard_of_both() -> bool:
+        # A new subscription takes a moment to reach everybody.
+        agent_tools.broadcast("device(*).function(getFeatures)")
+        return all(name in json.dumps(conn.get_inbox("replies")) for name in connected.worlds)
+
+    eventually(heard_of_both)
     agent_tools.broadcast("device(*).function(stop)")
     eventually(lambda: not any(w.rollouts["left"].running for w in connected.worlds.values()))
     eventually(lambda: json.dumps(conn.get_inbox("replies")).count('"text": "Stopped left.') == 2)
@@ -184,10 +207,11 @@ def test_the_mcp_bridge_lists_calls_and_hears(lab: Lab) -> None:
         bridge = StdioTransport(sys.executable, ["-m", "device_connect_agent_tools.mcp"], env=environment)
         async with Client(bridge) as client:
             assert {tool.name for tool in await client.list_tools()} >= {"describe_fleet", "invoke_device"}
-            deadline = time.monotonic() + 10
-            while "arm-1" not in str((await client.call_tool("list_devices", {})).content):
-                assert time.monotonic() < deadline
-                await asyncio.sleep(0.2)
+
+            async def listed() -> bool:
+                return "arm-1" in str((await client.call_tool("list_devices", {})).content)
+
+            await eventually_async(listed, within=40)
             functions = await client.call_tool("get_device_functions", {"device_id": "arm-1"})
             assert "instruction" in str(functions.content)
             call = {
@@ -196,7 +220,7 @@ def test_the_mcp_bridge_lists_calls_and_hears(lab: Lab) -> None:
                 "arguments": '{"instruction": "wave", "duration": 1.0}',
             }
             assert "success" in str((await client.call_tool("invoke_device", call)).content)
-            end = {"device_id": "arm-1", "event_name": "policyComplete", "timeout_seconds": 10}
+            end = {"device_id": "arm-1", "event_name": "policyComplete", "timeout_seconds": 30}
             assert "wave" in str((await client.call_tool("wait_for_event", end)).content)
             call["arguments"] = '{"instruction": "wave again"}'
             assert "success" in str((await client.call_tool("invoke_device", call)).content)

@@ -41,7 +41,7 @@ def test_a_bare_agent_finds_and_calls_every_process_at_the_meeting_port(port):
             "DEVICE_CONNECT_DISCOVERY_MODE": "d2d",
         }
         done = subprocess.run(
-            [sys.executable, "-c", AGENT], env=environment, capture_output=True, text=True, timeout=40, check=False
+            [sys.executable, "-c", AGENT], env=environment, capture_output=True, text=True, timeout=90, check=False
         )
     assert "agent saw all" in done.stdout, done.stderr[-3000:]
 
@@ -77,10 +77,12 @@ async def test_a_stopped_peer_does_not_hold_up_the_others(port):
             heard = await caller.hears("arm-1", "tick")
             stopped.send_signal(signal.SIGSTOP)
             try:
-                await caller.call("arm-1", "burst", {"count": 2000, "hz": 4000, "size": 4000})
-                for _ in range(20):
-                    assert (await caller.call("arm-1", "getStatus", wait_s=1.0))["result"]
-                await until(lambda: len(heard) == 2000, what="every event at a peer that runs")
+                for told in range(200, 2001, 200):
+                    # No more at once than a link holds for a peer that gets no turn to take them.
+                    await caller.call("arm-1", "burst", {"count": 200, "hz": 4000, "size": 4000})
+                    for _ in range(2):
+                        assert (await caller.call("arm-1", "getStatus", wait_s=5.0))["result"]
+                    await until(lambda told=told: len(heard) == told, what="every event at a peer that runs")
             finally:
                 stopped.send_signal(signal.SIGCONT)
 

@@ -49,11 +49,12 @@ async def test_a_quick_call_is_answered_while_a_slow_one_runs_on_nats(server):
     with EchoDevice("arm-1", link_to(server)):
         async with Caller("nats", servers=(server.url,)) as bare:
             await bare.sees("arm-1")
-            slow = asyncio.ensure_future(bare.call("arm-1", "move", {"seconds": 1.0}))
-            await asyncio.sleep(0.1)
+            slow = asyncio.ensure_future(bare.call("arm-1", "hold", wait_s=60))
+            await bare.holds("arm-1", 1)
             assert (await bare.call("arm-1", "stop"))["result"] == {"stopped": True}
             assert not slow.done()
-            assert (await slow)["result"] == {"moved": True}
+            await bare.call("arm-1", "release")
+            assert (await slow)["result"] == {"held": True}
 
 
 async def test_an_event_the_server_would_refuse_is_dropped_and_the_next_ones_flow():
@@ -75,7 +76,7 @@ async def test_a_result_the_server_would_refuse_is_answered_with_the_limit():
     assert "20000" in answer["error"]["message"]
 
 
-async def test_a_device_answers_within_five_seconds_of_a_killed_server_coming_back(server):
+async def test_a_device_answers_when_a_killed_server_has_come_back(server):
     with EchoDevice("arm-1", link_to(server)):
         async with Caller("nats", servers=(server.url,)) as bare:
             await bare.sees("arm-1")
@@ -95,14 +96,14 @@ async def test_nobody_at_a_subject_is_told_at_once_on_nats(server):
     async with Caller(client=await open_client(link_to(server))) as caller:
         started = asyncio.get_running_loop().time()
         with pytest.raises(MessagingError, match="nobody answers"):
-            await caller.call("nobody", "getStatus", wait_s=30)
-        assert asyncio.get_running_loop().time() - started < 5
+            await caller.call("nobody", "getStatus", wait_s=60)
+        assert asyncio.get_running_loop().time() - started < 30
 
 
 async def test_connecting_to_an_absent_server_ends():
     link = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=1.0)
     with pytest.raises(MessagingError, match="no NATS connection"):
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             await open_client(link)
 
 

@@ -26,7 +26,7 @@ def link():
 async def runtime(link):
     made = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
     task = asyncio.create_task(made.run())
-    await made.wait_ready(10)
+    await made.wait_ready(30)
     yield made
     await made.shutdown()
     assert task.done()
@@ -79,7 +79,7 @@ async def test_a_driver_that_cannot_connect_is_reported_and_leaves_nothing_open(
     runtime = Runtime(driver=Broken(), device_id="arm-1", link=link, allow_insecure=True)
     task = asyncio.create_task(runtime.run())
     with pytest.raises(OSError, match="no motor answers"):
-        await runtime.wait_ready(10)
+        await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
     assert not sessions.open_links()
 
@@ -102,7 +102,7 @@ async def test_a_router_that_comes_late_is_found_soon():
     with pytest.raises(TimeoutError):
         await runtime.wait_ready(1.5)
     with ZenohRouter(port=int(absent.connect[0].rpartition(":")[2])):
-        await runtime.wait_ready(5)
+        await runtime.wait_ready(30)
         async with Caller(client=await open_client(absent)) as caller:
             await caller.sees("arm-1")
             assert (await caller.call("arm-1", "getStatus"))["result"]
@@ -116,7 +116,7 @@ async def test_credentials_that_a_server_refuses_end_the_start_with_its_reason()
         runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
         task = asyncio.create_task(runtime.run())
         with pytest.raises(AuthenticationError):
-            await runtime.wait_ready(15)
+            await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
 
 
@@ -124,7 +124,7 @@ async def test_a_link_on_which_nobody_proves_who_he_is_needs_the_opt_in(link):
     runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link)
     task = asyncio.create_task(runtime.run())
     with pytest.raises(ValueError, match="allow_insecure"):
-        await runtime.wait_ready(5)
+        await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
     assert not sessions.open_links()
 
@@ -134,7 +134,7 @@ async def test_certificates_in_the_environment_do_not_change_an_explicit_link(li
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:1")
     runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
     task = asyncio.create_task(runtime.run())
-    await runtime.wait_ready(5)
+    await runtime.wait_ready(30)
     assert runtime.messaging.link == link
     await runtime.shutdown()
     assert task.done()
@@ -158,7 +158,7 @@ async def test_a_stock_runtime_may_use_the_backend_by_name(link):
 async def test_the_departure_is_told(link):
     first = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
     task = asyncio.create_task(first.run())
-    await first.wait_ready(5)
+    await first.wait_ready(30)
     async with Caller(client=await open_client(link)) as caller:
         farewells = []
 

@@ -35,7 +35,7 @@ class Host(threading.Thread):
         self.loop, self.quit = asyncio.get_running_loop(), asyncio.Event()
         runtime = Runtime(driver=EchoDriver(), device_id=self.name, link=link, allow_insecure=True)
         task = asyncio.create_task(runtime.run())
-        await runtime.wait_ready(20)
+        await runtime.wait_ready(60)
         self.up.set()
         await self.quit.wait()
         await runtime.shutdown()
@@ -44,16 +44,16 @@ hosts = [Host(number) for number in range(COUNT)]
 for host in hosts:
     host.start()
 for host in hosts:
-    assert host.up.wait(20), host.name
+    assert host.up.wait(60), host.name
 
 async def ask_all():
     async with Caller(client=await open_client(link)) as caller:
         names = [host.name for host in hosts]
-        await caller.sees(*names, within=20)
+        await caller.sees(*names, within=40)
         for name in names:
             assert (await caller.call(name, "getStatus", {"value": name}))["result"]["value"] == name
     async with Caller(servers=(f"tcp/127.0.0.1:{PORT}",)) as bare:
-        await bare.sees(*names, within=20)
+        await bare.sees(*names, within=40)
 
 asyncio.run(ask_all())
 # Each host has a thread of its own here; those are the test's, not the backend's.
@@ -65,7 +65,7 @@ print(json.dumps({
 for host in hosts:
     host.loop.call_soon_threadsafe(host.quit.set)
 for host in hosts:
-    host.join(20)
+    host.join(60)
     assert not host.is_alive()
 """
 
@@ -73,6 +73,7 @@ CYCLES = """
 import asyncio, json, sys
 import psutil
 from fixtures.echo_device import EchoDriver
+from fixtures.waiting import eventually
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig, sessions
 
@@ -83,20 +84,25 @@ me = psutil.Process()
 async def once():
     runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
     task = asyncio.create_task(runtime.run())
-    await runtime.wait_ready(20)
+    await runtime.wait_ready(60)
     await runtime.shutdown()
     assert task.done()
 
 def cycle():
     asyncio.run(once())
     assert not sessions.open_links()
+
+def used():
     return me.num_threads(), me.num_fds()
 
 for _ in range(3):
-    settled = cycle()
+    cycle()
+settled = used()
 for _ in range(20):
-    after = cycle()
-print(json.dumps({"settled": settled, "after": after}))
+    cycle()
+# Zenoh keeps a pool of native threads, which comes and goes by one or two whatever the cycles.
+eventually(lambda: all(now <= then + 2 for now, then in zip(used(), settled)), what=f"back to {settled}: {used()}")
+print("nothing grew")
 """
 
 FORGETFUL = """
@@ -109,7 +115,7 @@ async def main():
     link = LinkConfig(mode="peer", listen=("tcp/127.0.0.1:0",), multicast=False)
     runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
     runtime.kept = asyncio.create_task(runtime.run())
-    await runtime.wait_ready(20)
+    await runtime.wait_ready(60)
 
 loop = asyncio.new_event_loop()
 loop.run_until_complete(main())
@@ -119,16 +125,10 @@ print("leaves without a word", flush=True)
 
 def run(program, *arguments):
     done = subprocess.run(
-        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=90, check=False
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=110, check=False
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
-
-
-def nothing_grew(seen):
-    """Zenoh keeps a pool of native threads, which comes and goes by one or two whatever the cycles."""
-    assert seen["after"][0] <= seen["settled"][0] + 2
-    assert seen["after"][1] <= seen["settled"][1] + 2
 
 
 def test_thirty_two_runtimes_on_their_own_loops_share_one_session():
@@ -143,8 +143,7 @@ def test_thirty_two_runtimes_on_their_own_loops_share_one_session():
 def test_twenty_cycles_leave_no_thread_and_no_descriptor(mode):
     link = {"mode": "peer", "multicast": False}
     link |= {"listen": ["tcp/127.0.0.1:0"]} if mode == "peer" else {"meet_port": free_port()}
-    seen = json.loads(run(CYCLES, json.dumps(link)).splitlines()[-1])
-    nothing_grew(seen)
+    assert "nothing grew" in run(CYCLES, json.dumps(link))
 
 
 def test_a_process_that_forgets_to_shut_down_still_ends():
@@ -153,7 +152,7 @@ def test_a_process_that_forgets_to_shut_down_still_ends():
 
 def test_a_start_that_is_given_up_never_comes_online_later():
     absent = free_port()
-    program = CYCLES.replace("await runtime.wait_ready(20)", "await give_up(runtime)").replace(
+    program = CYCLES.replace("await runtime.wait_ready(60)", "await give_up(runtime)").replace(
         "def cycle",
         "async def give_up(runtime):\n"
         "    try:\n"
@@ -166,10 +165,9 @@ def test_a_start_that_is_given_up_never_comes_online_later():
     link = {"connect": [f"tcp/127.0.0.1:{absent}"], "connect_timeout_s": 0.3}
     program = program.replace("range(20)", "range(8)").replace(
         "    assert not sessions.open_links()\n",
-        "    import time; time.sleep(0.3)\n    assert not sessions.open_links()\n",
+        "    eventually(lambda: not sessions.open_links())\n",
     )
-    seen = json.loads(run(program, json.dumps(link)).splitlines()[-1])
-    nothing_grew(seen)
+    assert "nothing grew" in run(program, json.dumps(link))
 
 
 def test_two_links_that_differ_do_not_share():

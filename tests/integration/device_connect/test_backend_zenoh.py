@@ -117,7 +117,7 @@ async def test_the_loss_and_the_return_of_a_router_are_told(router):
 async def test_an_absent_router_is_reported_within_the_deadline():
     link = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=1.0)
     with pytest.raises(MessagingError, match="no Zenoh link"):
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(30):
             await open_client(link)
 
 
@@ -169,7 +169,7 @@ async def test_peers_over_mutual_tls_admit_only_their_own_authority(tmp_path):
         for link in intruders:
             async with Caller(client=await open_client(link)) as caller:
                 with pytest.raises(MessagingError, match="nobody answers"):
-                    await caller.call("arm-1", "getStatus", wait_s=1.5)
+                    await caller.call("arm-1", "getStatus", wait_s=20)
 
 
 async def test_two_tenants_do_not_see_each_other():
@@ -218,7 +218,7 @@ def test_peers_find_each_other_by_multicast_with_nothing_configured():
         ["unshare", "-n", "sh", "-c", f'{prepare} && exec "$0" -c "$1"', sys.executable, MULTICAST],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=110,
         env=environment,
         check=False,
     )

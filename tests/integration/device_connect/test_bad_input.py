@@ -56,7 +56,7 @@ class Site:
         ]
         self.fleet = FleetClient(link, "tester").__enter__()
 
-    def raw(self, device: str, data: bytes, within: float = 5.0) -> dict[str, Any]:
+    def raw(self, device: str, data: bytes, within: float = 20.0) -> dict[str, Any]:
         """Send ``data`` as it is on a device's command topic; the decoded reply."""
         return json.loads(self.fleet.request(device, data, within))  # type: ignore[no-any-return]
 

@@ -79,11 +79,11 @@ class Head(DeviceDriver):  # type: ignore[misc]
 def test_the_first_look_is_complete(link: LinkConfig, worlds: dict[str, ToyWorld]) -> None:
     for _ in range(3):
         with FleetClient(link) as fresh:
-            assert [peer.id for peer in fresh.peers()] == ["arm-1", "arm-2", "arm-3"]
+            assert [peer.id for peer in fresh.peers(20)] == ["arm-1", "arm-2", "arm-3"]
 
 
 def test_a_peer_says_what_it_is_and_what_it_can(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
-    peer = fleet.peers()[0]
+    peer = fleet.peers(20)[0]
     assert (peer.id, peer.type, peer.model) == ("arm-1", "strands_sim", "arm-1")
     assert peer.status["availability"] == "idle"
     assert "execute" in {function["name"] for function in peer.functions}
@@ -136,7 +136,7 @@ def test_events_come_as_they_happen(fleet: FleetClient, worlds: dict[str, ToyWor
 def test_events_of_the_fleet_can_be_walked_through(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
     seen: set[str] = set()
     ready = threading.Event()
-    for event in fleet.events("*", timeout=3, ready=ready):
+    for event in fleet.events("*", timeout=20, ready=ready):
         assert ready.is_set()
         seen.add(event.device)
         if len(seen) == 3:
@@ -172,7 +172,7 @@ def test_no_network_is_an_error_within_its_deadline() -> None:
     began = time.monotonic()
     with pytest.raises(Exception, match=r"127\.0\.0\.1"), FleetClient(nobody):
         pass
-    assert time.monotonic() - began < 10
+    assert time.monotonic() - began < 30
     eventually(lambda: not any(t.name == "fleet-client" for t in threading.enumerate()))
 
 
@@ -182,7 +182,7 @@ def test_the_same_over_nats() -> None:
         world = ToyWorld()
         runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
         with FleetClient(link) as fleet:
-            assert [peer.id for peer in fleet.peers()] == ["arm-1"]
+            assert [peer.id for peer in fleet.peers(20)] == ["arm-1"]
             assert fleet.call("arm-1", "execute", {"instruction": "wave"})["status"] == "success"
             assert fleet.stop("arm-1")["stopped"] == ["left"]
             with pytest.raises(NoSuchDeviceError):
@@ -196,6 +196,6 @@ def test_the_same_over_nats() -> None:
 
 def answers(fleet: FleetClient) -> bool:
     try:
-        return fleet.call("arm-1", "getStatus", timeout=1)["status"] == "success"
+        return fleet.call("arm-1", "getStatus", timeout=5)["status"] == "success"
     except Exception:  # noqa: BLE001 - any failure means not yet
         return False

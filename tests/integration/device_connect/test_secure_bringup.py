@@ -35,7 +35,7 @@ def proven(identity: Identity, **where: object) -> LinkConfig:
 
 def drives(link: LinkConfig) -> None:
     with FleetClient(link, "operator") as fleet:
-        assert [peer.id for peer in fleet.peers()] == ["arm-1"]
+        assert [peer.id for peer in fleet.peers(20)] == ["arm-1"]
         assert fleet.call("arm-1", "execute", {"instruction": "wave"})["status"] == "success"
         assert fleet.stop("arm-1")["stopped"] == ["left"]
 

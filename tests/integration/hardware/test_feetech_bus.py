@@ -28,7 +28,7 @@ class Line:
     def send(self, data: bytes) -> None:
         os.write(self._fd, data)
 
-    def ask(self, packet: Packet, count: int = 1, within: float = 2.0) -> list[Packet]:
+    def ask(self, packet: Packet, count: int = 1, within: float = 20.0) -> list[Packet]:
         """Send and wait for ``count`` answers; fewer when the time is over."""
         self.send(packet.encoded())
         answers: list[Packet] = []
@@ -156,7 +156,7 @@ def test_a_wedged_bus_is_deaf_and_comes_back(line: Line, bus: FeetechBus) -> Non
 
 def test_dropped_replies_are_some_of_them(line: Line, bus: FeetechBus) -> None:
     bus.drop_share = 0.5
-    answers = [bool(line.ask(Packet(1, PING), within=0.02)) for _ in range(20)]
+    answers = [bool(line.ask(Packet(1, PING), within=0.1)) for _ in range(20)]
     assert True in answers
     assert False in answers
 
@@ -175,12 +175,12 @@ def test_an_arm_without_torque_falls_and_one_with_it_is_held() -> None:
         try:
             for servo in bus.servos:
                 line.write(servo, "torque_enable", 1)
-            eventually(lambda: abs(line.read(2, "present_position") - 2048) <= 10, within=10, what="the middle")
+            eventually(lambda: abs(line.read(2, "present_position") - 2048) <= 10, what="the middle")
             time.sleep(0.3)
             assert abs(line.read(2, "present_position") - 2048) <= 10
             for servo in bus.servos:
                 line.write(servo, "torque_enable", 0)
-            eventually(lambda: line.read(2, "present_position") > 2148, within=10, what="its fall")
+            eventually(lambda: line.read(2, "present_position") > 2148, what="its fall")
         finally:
             line.close()
             twin.close()

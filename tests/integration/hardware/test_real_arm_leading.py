@@ -40,7 +40,7 @@ def test_a_follower_goes_where_the_leader_is_moved(bus: FeetechBus, calibration:
         by_hand = threading.Thread(target=wave)
         by_hand.start()
         files = ["--calibration", str(calibration), "--leader-calibration", str(calibration)]
-        line = ["teleop", f"so101@{leader.port}", f"so101@{bus.port}", *files, "--for", "3", "--json"]
+        line = ["teleop", f"so101@{leader.port}", f"so101@{bus.port}", *files, "--for", "6", "--json"]
         result = CliRunner().invoke(build(), line)
         by_hand.join()
         assert result.exit_code == 0, result.output
@@ -48,7 +48,7 @@ def test_a_follower_goes_where_the_leader_is_moved(bus: FeetechBus, calibration:
         assert told["state"] == "completed"
         assert told["stopped"] is True
         assert told["errors"] == 0
-        assert told["frames"] > 50
+        assert told["frames"] > 20
         assert abs(bus.shafts()[1] - pan.shaft) < 20
         assert not any(servo.torque for servo in leader.servos.values()), "a leader is moved by hand"
         goals = [int.from_bytes(each.data, "little") for each in bus.writes if each.servo == 1 and each.address == 42]
@@ -157,7 +157,7 @@ def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) ->
             for servo in fresh.servos.values():
                 servo.shaft -= move
         terminal.press("\r")
-        assert terminal.process.wait(20) == 0, terminal.drawn
+        assert terminal.process.wait(60) == 0, terminal.drawn
         eventually(lambda: f"{name}.json" in terminal.drawn, what="where it is kept")
     (path,) = Path(os.environ["HF_LEROBOT_HOME"]).rglob(f"{name}.json")
     kept = json.loads(path.read_text(encoding="utf-8"))

@@ -28,10 +28,10 @@ from strands_robots.safety.lane import lane
 
 pytestmark = pytest.mark.system
 
-STOPPED_S = 0.25
-"""From the controller's call to an arm's last byte, on a machine that does other things; benchmarks/ measures it."""
+STOPPED_S = 0.8
+"""From the controller's call to an arm's last byte: less than a deaf arm is waited for; benchmarks/ measures it."""
 
-MOVE = {"instruction": "wave", "duration": 20.0}
+MOVE = {"instruction": "wave", "duration": 100.0}
 
 
 class Bench:
@@ -59,7 +59,7 @@ class Bench:
             robot = Robot("so101", mode="real", tool_name=f"arm-{number}", stop_level=self.stop_level, **options)
             self.robots.append(robot)
             self.runtimes.append(init_device_connect_sync(robot, peer_id=f"arm-{number}", link=link))
-        assert self.controller.wait_link(10)
+        assert self.controller.wait_link(40)
         eventually(lambda: all(seat.link.up for seat in lane().seats))
 
     def move(self) -> None:
@@ -177,7 +177,7 @@ def test_serve_puts_a_real_arm_on_the_network(tmp_path: Path) -> None:
                 eventually(lambda: fleet.call("arm-7", "getStatus")["step_count"] > 10)
                 assert fleet.stop("arm-7")["status"] == "success"
             process.stdin.close()
-            assert process.wait(20) == 0
+            assert process.wait(60) == 0
         finally:
             process.kill()
             process.wait()

@@ -41,7 +41,7 @@ def daemon(shared: Daemon) -> Daemon:
     if shared.request("GET", "/api/daemon/status").json()["state"] != "running":
         shared.request("POST", "/api/daemon/restart")
         eventually(
-            lambda: shared.request("GET", "/api/daemon/status").json()["state"] == "running", 20, "running again"
+            lambda: shared.request("GET", "/api/daemon/status").json()["state"] == "running", what="running again"
         )
     for move in shared.request("GET", "/api/move/running").json():
         shared.request("POST", "/api/move/stop", json=move)
@@ -58,7 +58,7 @@ def connect(daemon: Daemon) -> Iterator[Connect]:
         ports = {"api_port": daemon.port, "zenoh_port": daemon.zenoh_port}
         driver = ReachyDriver("127.0.0.1", **{**ports, **options})  # type: ignore[arg-type]
         drivers.append(driver)
-        driver.connect()
+        driver.connect(within_s=40)
         return driver
 
     yield make

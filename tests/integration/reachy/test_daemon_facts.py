@@ -46,7 +46,7 @@ def frames(ws: ClientConnection, seconds: float) -> list[dict[str, Any]]:
 
 def antennas(ws: ClientConnection) -> list[Any]:
     while True:
-        frame = json.loads(ws.recv(2.0))
+        frame = json.loads(ws.recv(20.0))
         if frame["type"] == "joint_positions":
             return list(frame["antennas_joint_positions"])
 
@@ -68,12 +68,16 @@ def test_the_status_tells_the_era(daemon: Daemon, rest: RestClient) -> None:
 
 
 def test_the_socket_streams_joints_poses_and_status_without_being_asked(daemon: Daemon) -> None:
+    kinds: list[str] = []
     with socket(daemon) as ws:
-        kinds = [frame["type"] for frame in frames(ws, 2.0)]
-    assert 40 <= kinds.count("joint_positions") <= 110
-    assert abs(kinds.count("joint_positions") - kinds.count("head_pose")) <= 3
-    assert kinds.count("daemon_status") >= 1
-    assert ("imu_data" in kinds) is daemon.kind.wireless
+        while kinds.count("daemon_status") < 4:
+            kinds.append(json.loads(ws.recv(20.0))["type"])
+    first = kinds.index("daemon_status")
+    # The status comes once a second by the daemon's own clock, whatever the machine makes of that.
+    whole = kinds[first : len(kinds) - 1 - kinds[::-1].index("daemon_status")]
+    assert 60 <= whole.count("joint_positions") <= 165, "of three seconds"
+    assert abs(whole.count("joint_positions") - whole.count("head_pose")) <= 3
+    assert ("imu_data" in whole) is daemon.kind.wireless
 
 
 @pytest.mark.parametrize("frame", ["{bad", "", "[1]", '{"type":"nobody"}', '{"head_pose":[[1]]}', '{"a":1}'])
@@ -89,7 +93,7 @@ def test_some_frames_end_the_connection_without_a_close_frame(daemon: Daemon, fr
     with socket(daemon) as ws:
         ws.send(frame)
         with pytest.raises(ConnectionClosed) as closed:
-            frames(ws, 3.0)
+            frames(ws, 20.0)
         assert closed.value.rcvd is None
 
 
@@ -143,7 +147,7 @@ def test_only_local_names_are_answered_since_1_12(daemon: Daemon) -> None:
 
 
 def test_two_moves_run_at_the_same_time_and_nobody_objects(daemon: Daemon, rest: RestClient) -> None:
-    moves = [rest.post("/api/move/goto", {"antennas": [a, a], "duration": 2.0})["uuid"] for a in (1.0, -1.0)]
+    moves = [rest.post("/api/move/goto", {"antennas": [a, a], "duration": 60.0})["uuid"] for a in (1.0, -1.0)]
     assert {move["uuid"] for move in rest.get("/api/move/running")} == set(moves)
     for uuid in moves:
         assert uuid in rest.post("/api/move/stop", {"uuid": uuid})["message"]

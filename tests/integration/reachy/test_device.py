@@ -129,7 +129,7 @@ def test_wake_up_and_a_recorded_move_and_sleep(call: Call, device: ReachyMiniDri
     def ended() -> dict[str, str]:
         motion = device.reachy.motions.current
         assert motion is not None
-        eventually(motion.done.is_set, 15.0, motion.name)
+        eventually(motion.done.is_set, what=motion.name)
         return motion.facts()
 
     assert call("disableMotors")["motor_mode"] == "disabled"
@@ -219,7 +219,7 @@ def test_a_daemon_that_is_away_does_not_kill_the_device(fleet: FleetClient) -> N
         assert fleet.call("head-2", "getJoints", {})["status"] == "error"
         assert "did not answer" in fleet.call("head-2", "getDaemonStatus", {})["reason"]
         assert fleet.call("head-2", "stopMotion", {})["stopped"] is True
-        peer = next(peer for peer in fleet.peers(1.0) if peer.id == "head-2")
+        peer = next(peer for peer in fleet.peers(20) if peer.id == "head-2")
         assert peer.status["availability"] == "unavailable"
     finally:
         stop_device_connect(runtime)

@@ -64,7 +64,7 @@ def test_nan_in_the_stream_is_stale_joints_and_not_a_dead_link(daemon: Daemon, r
     daemon.control(nan=True)
     eventually(lambda: reachy.get_joints()["status"] == "error", what="no usable numbers")
     assert reachy.is_connected
-    assert reachy.facts()["unusable_frames"] > 10
+    eventually(lambda: reachy.facts()["unusable_frames"] > 10, what="what is not usable, counted")
     with pytest.raises(DaemonUnreachable, match="unusable numbers"):
         reachy.get_observation()
     reachy.go(Target(antennas=(0.0, 0.0)))
@@ -107,7 +107,9 @@ def test_no_frame_that_reaches_the_daemon_jumps_or_comes_faster_than_50_a_second
 
 
 def test_a_thousand_bad_values_never_reach_the_wire(daemon: Daemon, reachy: ReachyDriver) -> None:
-    reachy.go(Target(body_yaw=0.0))
+    sent = reachy.send_action({"antenna_left": 0.1})["antenna_left"]
+    # Frames reach the daemon by another connection than the question for them.
+    eventually(lambda: daemon.frames()[-1].get("antennas", [0, 0])[1] == sent, what="the frame")
     before = len(daemon.frames())
     bad = (math.nan, math.inf, -math.inf, True, "0", None, [0], 10**400, 4.0)
     for key in reachy.action_features:
@@ -119,29 +121,30 @@ def test_a_thousand_bad_values_never_reach_the_wire(daemon: Daemon, reachy: Reac
 
 def test_a_whole_life_leaves_no_thread_behind(daemon: Daemon, connect: Callable[..., ReachyDriver]) -> None:
     connect().disconnect()
-    mine = ("reachy-", "Thread-")
-    count = lambda: sum(thread.name.startswith(mine) for thread in threading.enumerate())  # noqa: E731
-    eventually(lambda: count() == 0, what="quiet before")
+    before, mine = set(threading.enumerate()), ("reachy-", "Thread-")
+
+    def left() -> list[str]:
+        return [each.name for each in threading.enumerate() if each not in before and each.name.startswith(mine)]
+
     for _ in range(5):
         reachy = connect()
         reachy.gesture("nod")
         reachy.wake_up()
         reachy.disconnect()
-    eventually(lambda: count() == 0, what="quiet after")
+    eventually(lambda: not left(), what="the end of every thread of those lives")
 
 
 def test_connect_eagerly_never_raises_and_connects_later(daemon: Daemon) -> None:
     reachy = ReachyDriver("127.0.0.1", api_port=free_port())
     try:
-        answer = reachy.connect_eagerly(0.3)
-        assert answer["status"] == "error"
-        assert "Connection refused" in answer["reason"]
+        assert reachy.connect_eagerly(0.1)["status"] == "error"
+        eventually(lambda: "Connection refused" in reachy.connect_eagerly(0.1)["reason"], what="the reason")
         with pytest.raises(MotionRefused, match="Connection refused"):
             reachy.go(Target(HeadPose()))
     finally:
         reachy.disconnect()
     with pytest.raises(DaemonUnreachable, match="Connection refused"):
-        ReachyDriver("127.0.0.1", api_port=free_port()).connect(within_s=0.5)
+        ReachyDriver("127.0.0.1", api_port=free_port()).connect(within_s=3.0)
 
 
 def test_a_robot_that_announces_itself_is_found(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:

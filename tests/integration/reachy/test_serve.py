@@ -51,7 +51,8 @@ def test_serve_puts_it_on_the_network_and_interrupt_stops_it_first(daemon: Daemo
             assert fleet.call("head", "shake", {})["status"] == "success"
             eventually(lambda: len(daemon.frames()) > 5, what="frames")
             serving.send_signal(signal.SIGINT)
-            serving.wait(15)
+            serving.wait(60)
+        eventually(lambda: daemon.control()["sockets"] == 0, what="all that was sent, taken")
         sent = len(daemon.frames())
         time.sleep(0.2)
         assert len(daemon.frames()) == sent

@@ -3,6 +3,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 from fixtures.base_process import base_process
 from fixtures.waiting import eventually
+from tests.integration.ros.conftest import obeyed
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.ros.dds import DdsLink
@@ -37,22 +39,29 @@ def rover() -> Iterator[RtpsRobot]:
 
 
 def x_of(robot: RtpsRobot) -> float:
-    message = robot.get_pose(3.0)["message"]
+    message = robot.get_pose(20.0)["message"]
     return float(message["pose"]["pose"]["position"]["x"])
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_base_in_another_process_is_driven_and_stopped(base: None, rover: RtpsRobot) -> None:
-    began = x_of(rover)
+    obeyed(rover, lambda: x_of(rover))
+    began, called = x_of(rover), time.monotonic()
     answer = rover.drive(0.3, 0.0, duration=1.0)
+    took_s = time.monotonic() - called
     assert (answer["status"], answer["messages"], answer["trailing_zero"]) == ("success", 20, True)
     assert rover.stop()["stopped"] is True
-    assert x_of(rover) - began == pytest.approx(0.3, abs=0.06)
+    # 0.3 m on a machine that keeps the time; a burst that is held up holds its velocity for up to as long.
+    assert 0.24 <= x_of(rover) - began <= 0.3 * max(1.0, took_s) + 0.06
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: None, rover: RtpsRobot) -> None:
     assert rover.advertise()["status"] == "success"
+    obeyed(rover, lambda: x_of(rover))
+    began = x_of(rover)
     assert rover.start_drive(1.0, 0.0, 30.0)["status"] == "success"
-    eventually(lambda: x_of(rover) > 0.1)
+    eventually(lambda: x_of(rover) > began + 0.1)
     verdict = rover.halt("test")
     assert (verdict.stopped, verdict.halted) == (True, ("drive",))
     stood = x_of(rover)
@@ -60,12 +69,15 @@ def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: None, rover: Rtp
     assert x_of(rover) == stood
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(
     base: subprocess.Popen[str], rover: RtpsRobot
 ) -> None:
+    obeyed(rover, lambda: x_of(rover))
+    began = x_of(rover)
     assert rover.start_drive(0.5, 0.0, 30.0)["status"] == "success"
-    eventually(lambda: x_of(rover) > 0.05)
-    base.communicate(timeout=10)
+    eventually(lambda: x_of(rover) > began + 0.05)
+    base.communicate(timeout=40)
     eventually(lambda: rover.get_task_status()["task_status"] == "error")
     verdict = rover.halt()
     assert verdict.stopped is False
@@ -73,12 +85,11 @@ def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(
 
 
 def test_a_type_that_is_not_given_is_asked_of_the_graph(base: None) -> None:
-    link = DdsLink(DOMAIN, match_s=5.0)
+    link = DdsLink(DOMAIN, match_s=20.0)
+    ends = {("/cmd_vel", TWIST, "subscription"), ("/odom", "nav_msgs/msg/Odometry", "publisher")}
     try:
-        assert "twist" in link.read("/odom", None, 3.0)
-        seen = {(each["topic"], each["type"], each["role"]) for each in link.endpoints()}
-        assert ("/cmd_vel", TWIST, "subscription") in seen
-        assert ("/odom", "nav_msgs/msg/Odometry", "publisher") in seen
+        assert "twist" in link.read("/odom", None, 20.0)
+        eventually(lambda: ends <= {(each["topic"], each["type"], each["role"]) for each in link.endpoints()})
         with pytest.raises(RosError, match="its type is not known"):
             DdsLink(DOMAIN, match_s=0.1).read("/nothing", None, 0.1)
     finally:
@@ -114,8 +125,8 @@ def test_a_read_leaves_no_thread_behind(base: None) -> None:
     link = DdsLink(DOMAIN)
     try:
         for _ in range(3):
-            link.read("/odom", "nav_msgs/Odometry", 5.0)
-            assert not [t for t in threading.enumerate() if t.name.startswith("dds-")]
+            link.read("/odom", "nav_msgs/Odometry", 20.0)
+            eventually(lambda: not [t for t in threading.enumerate() if t.name.startswith("dds-")])
     finally:
         link.close()
 
@@ -132,7 +143,7 @@ def test_a_message_that_cannot_be_read_takes_no_other_with_it(caplog: pytest.Log
         assert "cannot be read" in caplog.text
         assert {each["data"] for each in heard} == {"good"}
     finally:
-        garbler.communicate(timeout=10)
+        garbler.communicate(timeout=40)
         link.close()
 
 

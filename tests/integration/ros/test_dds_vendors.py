@@ -83,7 +83,7 @@ def test_it_hears_our_velocities_and_the_zero_after_them(peer: DdsPeer) -> None:
     try:
         robot.advertise()
         eventually(lambda: robot.drive(0.25, -0.5, duration=0.2)["status"] == "success")
-        eventually(lambda: peer.heard[-1] == "twist 0 0")
+        eventually(lambda: peer.heard and peer.heard[-1] == "twist 0 0")
         assert "twist 0.25 -0.5" in peer.heard
     finally:
         robot.disconnect()
@@ -142,13 +142,15 @@ def test_a_picture_goes_both_ways_and_nobody_crashes(peer: DdsPeer, link: DdsLin
 
 
 def x_of(robot: RtpsRobot) -> float:
-    return float(robot.get_pose(5.0)["message"]["pose"]["pose"]["position"]["x"])
+    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
 def test_a_fast_dds_base_is_driven_stopped_and_seen_standing(built: Built) -> None:
     robot = RtpsRobot("base", "/cmd_vel", odom_topic="/odom", domain_id=DOMAIN, publish_rate=20, command_gate=OPEN)
     with DdsPeer(built(FAST_DDS), DOMAIN) as peer:
         try:
+            x_of(robot)
+            eventually(lambda: robot.drive(0.0, 0.0, duration=0.1)["status"] == "success")
             began = x_of(robot)
             answer = robot.drive(0.4, 0.0, duration=1.0)
             assert (answer["status"], answer["messages"]) == ("success", 20)

@@ -40,7 +40,7 @@ def sourced() -> Iterator[None]:
 
 @pytest.fixture
 def peer() -> Iterator[DdsLink]:
-    link = DdsLink(DOMAIN, match_s=5.0)
+    link = DdsLink(DOMAIN, match_s=20.0)
     yield link
     link.close()
 
@@ -71,7 +71,8 @@ def test_a_joint_command_of_a_dds_peer_drives_the_arm_whole_or_not_at_all(
     finally:
         bridge.shutdown()
         bridge.shutdown()
-    assert not [t for t in threading.enumerate() if t.name.startswith(("strands_hardware", "rclpy-strands_hardware"))]
+    ours = ("strands_hardware", "rclpy-strands_hardware")
+    eventually(lambda: not [t for t in threading.enumerate() if t.name.startswith(ours)])
 
 
 def test_a_bridge_without_a_robot_tells_joints_and_images_to_a_dds_peer(sourced: None, peer: DdsLink) -> None:
@@ -119,10 +120,11 @@ def test_a_bridge_that_cannot_be_is_refused_before_ros_2_is_looked_for(
     options: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(INSECURE, "1")
-    before, threads = dict(os.environ), threading.active_count()
+    before, threads = dict(os.environ), set(threading.enumerate())
     with pytest.raises(ValidationError, match=named):
         HardwareRosBridge(TakingArm(), **{"domain_id": DOMAIN, **options})
-    assert (dict(os.environ), threading.active_count()) == (before, threads)
+    assert dict(os.environ) == before
+    assert set(threading.enumerate()) <= threads
 
 
 def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists_or_secures_it(
@@ -160,7 +162,7 @@ def test_a_simulation_tells_its_joints_and_a_camera_to_a_dds_peer(sourced: None,
         bridge.start(20.0, ["overview"])
         with pytest.raises(ValidationError, match="called before"):
             bridge.start()
-        eventually(lambda: len(heard) == 2, within=20.0)
+        eventually(lambda: len(heard) == 2)
         observed = world.get_observation("arm")
         told = dict(zip(heard["joints"]["name"], heard["joints"]["position"], strict=True))
         assert told == pytest.approx({name: observed[name] for name in told}, abs=0.05)

@@ -32,7 +32,7 @@ def ends(request: pytest.FixtureRequest) -> Iterator[tuple[RosLink, RosLink]]:
     with rclpy_stand_in.installed():
         kind: Any = RclpyLink if request.param == "rclpy" else DdsLink
         # The far end is bare DDS, so that no link is only ever tried against itself.
-        links = kind(DOMAIN, match_s=5.0), DdsLink(DOMAIN, match_s=5.0)
+        links = kind(DOMAIN, match_s=20.0), DdsLink(DOMAIN, match_s=20.0)
         yield links
         for each in links:
             each.close()
@@ -57,7 +57,7 @@ def stacked(request: pytest.FixtureRequest) -> Iterator[RosLink]:
     with rclpy_stand_in.installed(), nav2(DOMAIN, "reach"):
         over = RclpyLink(DOMAIN)
         # Discovery is over once the service answers, so that the short times below are the goals' own.
-        over.call("/arm", ARM_KIND, {"data": True}, 10.0)
+        over.call("/arm", ARM_KIND, {"data": True}, 40.0)
         eventually(lambda: NAV in over.actions())
         yield over
         over.close()
@@ -112,7 +112,7 @@ def test_a_read_gets_the_next_message_and_silence_is_named(ends: tuple[RosLink, 
     talker = threading.Thread(target=talk)
     talker.start()
     try:
-        assert near.read("/chatter", "std_msgs/msg/String", 5.0)["data"] == "hi"
+        assert near.read("/chatter", "std_msgs/msg/String", 20.0)["data"] == "hi"
     finally:
         done.set()
         talker.join()
@@ -130,21 +130,21 @@ def test_a_closed_link_opens_anew_when_it_is_used(ends: tuple[RosLink, RosLink])
 
 
 def test_a_service_answers_and_one_that_nobody_offers_is_named(stacked: RosLink) -> None:
-    assert stacked.call("/arm", ARM_KIND, {"data": True}, 5.0) == {"success": True, "message": "armed"}
+    assert stacked.call("/arm", ARM_KIND, {"data": True}, 20.0) == {"success": True, "message": "armed"}
     with pytest.raises(RosError, match="Nobody offers the service /disarm"):
         stacked.call("/disarm", ARM_KIND, {"data": True}, 0.1)
 
 
 def test_a_goal_that_is_reached_tells_its_feedback_and_its_end(stacked: RosLink) -> None:
     felt: list[Message] = []
-    report = run_goal(stacked, NAV, NAV_KIND, place(0.05), 10.0, feedback=felt.append)
+    report = run_goal(stacked, NAV, NAV_KIND, place(0.05), 40.0, feedback=felt.append)
     assert (report.state, report.over, report.status, report.values["error_code"]) == ("succeeded", True, 4, 0)
-    eventually(lambda: "distance_remaining" in felt[-1])
+    eventually(lambda: felt and "distance_remaining" in felt[-1])
 
 
 def test_a_goal_is_cancelled_when_its_time_is_over_or_when_it_is_given_up(stacked: RosLink) -> None:
-    report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 1.5)
-    assert (report.state, report.over, report.cut) == ("canceled", True, "its time of 1.5 s")
+    report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 4.0)
+    assert (report.state, report.over, report.cut) == ("canceled", True, "its time of 4 s")
     felt: list[Message] = []
     report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 30.0, feedback=felt.append, given_up=lambda: bool(felt))
     assert (report.state, report.over, report.cut) == ("canceled", True, "a stop")

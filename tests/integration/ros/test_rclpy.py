@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def rover(sourced: None) -> Iterator[Rover]:
         options = {"domain_id": DOMAIN, "publish_rate": 20.0, "command_gate": OPEN, **options}
         robots.append(RosBridgedRobot("rover", "/cmd_vel", "/odom", **options))
         # The odometry's type is the graph's to tell, so that this waits for the far end as well.
-        eventually(lambda: robots[-1].get_pose(1.0)["status"] == "success")
+        eventually(lambda: robots[-1].get_pose(2.0)["status"] == "success")
         return robots[-1]
 
     yield make
@@ -69,17 +70,19 @@ def rover(sourced: None) -> Iterator[Rover]:
 
 
 def x_of(robot: RosBridgedRobot) -> float:
-    return float(robot.get_pose(3.0)["message"]["pose"]["pose"]["position"]["x"])
+    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_base_in_another_process_is_driven_and_stopped(base: None, rover: Rover) -> None:
     robot = rover()
-    began = x_of(robot)
+    began, called = x_of(robot), time.monotonic()
     answer = robot.drive(0.3, 0.0, duration=1.0)
+    took_s = time.monotonic() - called
     assert (answer["status"], answer["messages"], answer["trailing_zero"]) == ("success", 20, True)
     assert robot.stop()["stopped"] is True
-    # A far end that is starved of its processor moves less, and none moves more.
-    assert 0.05 < x_of(robot) - began < 0.36
+    # 0.3 m; less where a far end misses the first messages, more where the burst is held up and holds its velocity.
+    assert 0.05 < x_of(robot) - began < 0.3 * max(1.0, took_s) + 0.06
     assert robot.start_drive(1.0, 0.0, 30.0)["status"] == "success"
     eventually(lambda: x_of(robot) > began + 0.5)
     verdict = robot.halt("test")
@@ -89,11 +92,13 @@ def test_a_base_in_another_process_is_driven_and_stopped(base: None, rover: Rove
 def test_a_stack_in_another_process_reaches_a_goal(rover: Rover) -> None:
     with nav2(DOMAIN, "reach") as process:
         robot = rover(nav_action="/navigate_to_pose")
-        answer = robot.navigate_to(0.3, 0.4, yaw=1.0, timeout=20.0)
+        answer = robot.navigate_to(0.3, 0.4, yaw=1.0, timeout=60.0)
         assert answer["goal_state"] == "succeeded", answer
         assert (answer["status"], answer["result"]["error_code"]) == ("success", 0)
         assert answer["feedback_count"] > 5
-        assert answer["feedback"][-1]["distance_remaining"] < 0.1
+        left = [each["distance_remaining"] for each in answer["feedback"]]
+        assert 0.5 > left[0] > left[-1]
+        assert left == sorted(left, reverse=True)
         pose = robot.get_pose()["message"]["pose"]["pose"]
         assert (pose["position"]["x"], pose["position"]["y"]) == (pytest.approx(0.3), pytest.approx(0.4))
         assert robot.halt("test").stopped is True
@@ -103,17 +108,17 @@ def test_a_stack_in_another_process_reaches_a_goal(rover: Rover) -> None:
 @pytest.mark.parametrize(
     ("manner", "timeout", "state", "said"),
     [
-        ("abort", 10.0, "aborted", ["goal"]),
-        ("reject", 10.0, "not sent", ["goal"]),
-        ("stuck", 2.0, "canceled", ["goal", "cancel"]),
-        ("deaf", 2.0, "lost", ["goal", "cancel"]),
+        ("abort", 40.0, "aborted", ["goal"]),
+        ("reject", 40.0, "not sent", ["goal"]),
+        ("stuck", 4.0, "canceled", ["goal", "cancel"]),
+        ("deaf", 4.0, "lost", ["goal", "cancel"]),
     ],
 )
 def test_a_goal_that_is_not_reached_says_why(
     rover: Rover, manner: str, timeout: float, state: str, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if manner == "deaf":
-        monkeypatch.setattr(goals, "CANCEL_S", 0.3)
+        monkeypatch.setattr(goals, "CANCEL_S", 1.0)
     with nav2(DOMAIN, manner) as process:
         robot = rover(nav_action="/navigate_to_pose")
         eventually(lambda: ros_action("list_actions", domain_id=DOMAIN)["actions"])
@@ -125,10 +130,11 @@ def test_a_goal_that_is_not_reached_says_why(
 def test_an_end_that_was_lost_on_its_way_is_asked_for_again(rover: Rover) -> None:
     with nav2(DOMAIN, "forgetful"):
         robot = rover(nav_action="/navigate_to_pose")
-        answer = robot.navigate_to(0.05, 0.0, timeout=2.0)
-        assert (answer["goal_state"], answer["ended_by"]) == ("succeeded", "its time of 2 s"), answer
+        answer = robot.navigate_to(0.05, 0.0, timeout=4.0)
+        assert (answer["goal_state"], answer["ended_by"]) == ("succeeded", "its time of 4 s"), answer
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_stop_cancels_the_goal_of_a_stack_in_another_process(rover: Rover) -> None:
     with nav2(DOMAIN, "stuck") as process:
         robot = rover(nav_action="/navigate_to_pose")
@@ -137,7 +143,7 @@ def test_a_stop_cancels_the_goal_of_a_stack_in_another_process(rover: Rover) -> 
         thread.start()
         eventually(lambda: robot.get_task_status().get("step_count", 0) > 3)
         verdict = robot.halt("test")
-        thread.join(5)
+        thread.join(40)
         assert (verdict.stopped, verdict.halted) == (True, ("navigation",))
         assert (answers[0]["goal_state"], answers[0]["ended_by"]) == ("canceled", "a stop")
         speed = robot.get_pose()["message"]["twist"]["twist"]["linear"]["x"]
@@ -151,8 +157,8 @@ def test_a_graph_is_looked_at_read_and_asked_through_ros_action(sourced: None, m
         eventually(lambda: ros_action("list_actions", **at)["actions"] == ["/navigate_to_pose"])
         assert ros_action("status", **at)["backend"] == "RclpyLink"
         assert ros_action("list_nodes", **at)["nodes"] == ["/strands_robots"]
-        assert ros_action("list_services", **at)["services"] == ["/arm"]
-        assert ros_action("info", name="/odom", **at)["type"] == "nav_msgs/msg/Odometry"
+        eventually(lambda: ros_action("list_services", **at)["services"] == ["/arm"])
+        eventually(lambda: ros_action("info", name="/odom", **at).get("type") == "nav_msgs/msg/Odometry")
         assert len(ros_action("echo", name="/odom", count=2, **at)["messages"]) == 2
         asked = ros_action("service_call", name="/arm", type="std_srvs/srv/SetBool", fields={"data": True}, **at)
         assert asked["response"] == {"success": True, "message": "armed"}

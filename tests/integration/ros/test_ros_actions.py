@@ -134,13 +134,13 @@ def test_an_argument_outside_its_domain_is_refused_by_name(action: str, options:
 
 def test_a_graph_over_dds_is_looked_at_and_read(tmp_path: Path) -> None:
     with base_process(DOMAIN):
-        found = eventually(lambda: ros_action("list_topics", domain_id=DOMAIN)["topics"])
-        odom = next(each for each in found if each["topic"] == "/odom")
-        assert odom == {"topic": "/odom", "type": "nav_msgs/msg/Odometry", "publishers": 1, "subscriptions": 0}
+        odom = {"topic": "/odom", "type": "nav_msgs/msg/Odometry", "publishers": 1, "subscriptions": 0}
+        eventually(lambda: odom in ros_action("list_topics", domain_id=DOMAIN)["topics"])
         sample = ros_action("echo", name="/odom", domain_id=DOMAIN)["messages"][0]
         assert sample["twist"]["twist"]["linear"] == {"x": 0.0, "y": 0.0, "z": 0.0}
         told = {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "fields": {"linear": {"x": 0.1}}}
-        assert ros_action("publish", domain_id=DOMAIN, tool_context=Operator(True), **told)["status"] == "success"
+        at: dict[str, Any] = {"domain_id": DOMAIN, "tool_context": Operator(True)}
+        eventually(lambda: ros_action("publish", **at, **told)["status"] == "success")
     for action, options in (
         ("service_call", {"name": "/add", "type": "p/Add"}),
         ("action_goal", {"name": "/go", "type": "p/Go"}),

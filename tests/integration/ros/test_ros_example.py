@@ -15,11 +15,11 @@ def run(name: str, tmp_path: Path) -> str:
     kept = {name: value for name, value in os.environ.items() if name not in ours}
     done = subprocess.run(
         [sys.executable, "-m", f"examples.{name}"],
-        env={**kept, "STRANDS_STATE_DIR": str(tmp_path)},
+        env={**kept, "STRANDS_STATE_DIR": str(tmp_path), "STRANDS_HALT_DEADLINE_S": "4"},
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=110,
         check=False,
     )
     assert done.returncode == 0, done.stderr

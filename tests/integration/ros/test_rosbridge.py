@@ -63,18 +63,18 @@ def test_a_topic_is_advertised_once_and_then_published_on(server: RosbridgeServe
 
 
 def test_a_service_answers_and_its_failure_is_an_error(link: RosbridgeLink) -> None:
-    assert link.call("/add", "pkg/Add", {"a": 2, "b": 3}, 2.0) == {"sum": 5}
+    assert link.call("/add", "pkg/Add", {"a": 2, "b": 3}, 20.0) == {"sum": 5}
     with pytest.raises(RosError, match="will not jump"):
-        link.call("/refuse", "pkg/Refuse", {"verb": "jump"}, 2.0)
+        link.call("/refuse", "pkg/Refuse", {"verb": "jump"}, 20.0)
 
 
 def test_a_status_error_ends_the_request_it_names_at_once(link: RosbridgeLink) -> None:
     began = time.monotonic()
     with pytest.raises(RosError, match="no service /nobody"):
-        link.call("/nobody", "pkg/Nobody", {}, 10.0)
+        link.call("/nobody", "pkg/Nobody", {}, 60.0)
     with pytest.raises(RosError, match="unknown topic type"):
-        link.read("/unknown", None, 10.0)
-    assert time.monotonic() - began < 5
+        link.read("/unknown", None, 60.0)
+    assert time.monotonic() - began < 30
 
 
 def test_a_status_error_of_a_publish_fails_the_next_one(server: RosbridgeServer, link: RosbridgeLink) -> None:
@@ -100,7 +100,7 @@ def test_a_message_is_read_with_its_bytes_decoded(server: RosbridgeServer, link:
     talker = threading.Thread(target=talk)
     talker.start()
     try:
-        assert link.read("/image", "sensor_msgs/msg/Image", 5.0) == {"width": 2, "data": b"\x00\xff"}
+        assert link.read("/image", "sensor_msgs/msg/Image", 20.0) == {"width": 2, "data": b"\x00\xff"}
     finally:
         done.set()
         talker.join()
@@ -166,7 +166,7 @@ def test_a_lost_server_refuses_at_once_and_is_found_again_with_its_subscriptions
 
 def test_a_server_that_is_not_there_is_told_and_can_be_dialled_later() -> None:
     port = free_port()
-    link = RosbridgeLink("127.0.0.1", port, connect_s=1.0)
+    link = RosbridgeLink("127.0.0.1", port, connect_s=20.0)
     with pytest.raises(RosError, match=f"127.0.0.1:{port}"):
         link.publish("/cmd_vel", TWIST, {})
     server = RosbridgeServer()
@@ -178,7 +178,7 @@ def test_a_server_that_is_not_there_is_told_and_can_be_dialled_later() -> None:
     finally:
         link.close()
         server.stop()
-    assert not [t for t in threading.enumerate() if t.name == "rosbridge"]
+    eventually(lambda: not [t for t in threading.enumerate() if t.name == "rosbridge"])
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_an_action_goal_reports_feedback_and_its_end(server: RosbridgeServer, li
         {"op": "action_result", "values": {"ok": 1}, "status": 4, "result": True},
     ]
     told: list[Mapping[str, Any]] = []
-    report = run_goal(link, "/go", "pkg/action/Go", {"metres": 2}, 2.0, feedback=told.append)
+    report = run_goal(link, "/go", "pkg/action/Go", {"metres": 2}, 20.0, feedback=told.append)
     assert (report.state, report.over, report.values) == ("succeeded", True, {"ok": 1})
     assert told == [{"left": 2}]
 
@@ -204,14 +204,15 @@ def test_an_action_goal_that_does_not_end_is_cancelled(
     server: RosbridgeServer, link: RosbridgeLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(goals, "CANCEL_S", 0.1)
-    report = run_goal(link, "/go", "pkg/action/Go", {}, 0.2)
-    assert (report.state, report.over, report.cut) == ("lost", False, "its time of 0.2 s")
+    assert link.call("/add", "pkg/Add", {"a": 2, "b": 3}, 20.0), "connected, so that the short time is the goal's own"
+    report = run_goal(link, "/go", "pkg/action/Go", {}, 0.5)
+    assert (report.state, report.over, report.cut) == ("lost", False, "its time of 0.5 s")
     cancelled = eventually(lambda: server.seen("cancel_action_goal"))
     assert cancelled[0]["id"] == server.seen("send_action_goal")[0]["id"]
 
 
 def test_a_goal_whose_server_dies_is_lost_and_not_reached(server: RosbridgeServer, link: RosbridgeLink) -> None:
-    sent = link.begin_goal("/go", "pkg/action/Go", {}, 1.0)
+    sent = link.begin_goal("/go", "pkg/action/Go", {}, 20.0)
     eventually(lambda: server.seen("send_action_goal"))
     server.stop()
     eventually(sent.done.is_set)
@@ -239,7 +240,8 @@ def test_a_rover_is_driven_stopped_and_known_to_stand(server: RosbridgeServer, r
     eventually(lambda: server.published[-1][1]["linear"]["x"] == 0.5)
     verdict = rover.stop()
     assert (verdict["stopped"], verdict["halted"]) == (True, ["drive"])
-    assert server.published[-1][1]["linear"]["x"] == 0.0
+    # The zero behind the commands may come later than the urgent one.
+    eventually(lambda: server.published[-1][1]["linear"]["x"] == 0.0)
 
 
 def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still_move(
@@ -250,7 +252,7 @@ def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still
     driving.start()
     eventually(lambda: server.published)
     server.stop()
-    driving.join(5)
+    driving.join(40)
     assert "may still move" in answers[0]["reason"]
     assert rover.halt().stopped is False
     server.published.clear()
@@ -262,7 +264,7 @@ def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still
 def test_a_server_that_returns_under_the_lockout_brings_zeros_for_their_whole_time_and_nothing_else(
     server: RosbridgeServer, rover: RosbridgeRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(wire, "BLIND_HOLD_S", 0.4)
+    monkeypatch.setattr(wire, "BLIND_HOLD_S", 1.0)
     plane = SafetyPlane(deadline_s=1.0)
     entry = plane.register("rover-1", rover)
     try:
@@ -275,9 +277,11 @@ def test_a_server_that_returns_under_the_lockout_brings_zeros_for_their_whole_ti
         eventually(lambda: time.monotonic() > down + 3 * wire.BLIND_HOLD_S, what="longer than a blind hold")
         assert rover.holding
         server.published.clear()
+        taken: list[float] = []
+        server.on_publish = lambda topic, message: taken.append(time.monotonic())
         server.start()
         eventually(lambda: not rover.holding, what="the end of the hold on the new connection")
-        assert len(server.published) >= 10
+        assert taken[-1] - taken[0] > 0.5 * wire.BLIND_HOLD_S
         assert {message["linear"]["x"] for _, message in server.published} == {0.0}
         assert "e" * 32 in rover.drive(0.5)["reason"]
         assert "rover-1" in plane.clear_local("test")
@@ -311,7 +315,7 @@ def test_a_clogged_connection_holds_up_neither_a_stop_nor_its_verdict(server: Ro
         assert not any(first["msg"]["linear"].values())
         # The name of the topic is in the ids of the first connection only.
         assert "cmd_vel" not in first["id"]
-        stuffing.join(10)
+        stuffing.join(40)
         assert not stuffing.is_alive()
         assert not any(each["msg"]["linear"]["x"] for each in server.ops[before:] if each["op"] == "publish")
         eventually(lambda: robot.halt("again").stopped)
@@ -327,7 +331,7 @@ def test_a_clogged_link_is_closed_all_the_same(server: RosbridgeServer, link: Ro
     server.clog()
     eventually(lambda: stuck_in(chatter))
     link.close()
-    chatter.join(10)
+    chatter.join(40)
     assert not chatter.is_alive()
 
 
@@ -338,7 +342,8 @@ def stuck_in(thread: threading.Thread) -> bool:
 
 def stuck(robot: RosbridgeRobot) -> bool:
     sent = robot.get_task_status()["step_count"]
-    time.sleep(0.3)
+    # Longer than a picture keeps the processor from the drive.
+    time.sleep(1.5)
     return bool(robot.get_task_status()["step_count"] == sent)
 
 

@@ -55,7 +55,7 @@ def link(graph: Ros1Graph) -> Iterator[RosbridgeLink]:
 
 
 def x_of(robot: RosbridgeRobot) -> float:
-    return float(robot.get_pose(5.0)["message"]["pose"]["pose"]["position"]["x"])
+    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
 def test_a_rospy_base_is_driven_and_stands_afterwards(base: RosbridgeRobot) -> None:
@@ -79,25 +79,25 @@ def test_a_stop_ends_the_drive_of_a_rospy_base(base: RosbridgeRobot) -> None:
 
 
 def test_its_scan_is_read_with_what_json_makes_of_infinity(base: RosbridgeRobot) -> None:
-    scan = base.get_scan(5.0)["message"]
+    scan = base.get_scan(20.0)["message"]
     assert scan["range_max"] == 8
     assert scan["ranges"] == [1, 2, None]
 
 
 def test_its_services_answer_and_one_that_is_not_there_is_said(link: RosbridgeLink, base: RosbridgeRobot) -> None:
-    told = link.call("/stand", "std_srvs/Trigger", {}, 5.0)
+    told = link.call("/stand", "std_srvs/Trigger", {}, 20.0)
     assert told == {"success": True, "message": f"{x_of(base):.3f}"}
-    assert link.call("/power", "std_srvs/SetBool", {"data": True}, 5.0)["message"] == "on"
+    assert link.call("/power", "std_srvs/SetBool", {"data": True}, 20.0)["message"] == "on"
     with pytest.raises(RosError, match="/nowhere did not answer within"):
         link.call("/nowhere", "std_srvs/Trigger", {}, 0.5)
 
 
 def test_what_the_server_refuses_is_told_in_its_words(link: RosbridgeLink) -> None:
     with pytest.raises(RosError, match="rosbridge says"):
-        link.call("/odd", "no_srvs/Odd", {}, 5.0)
+        link.call("/odd", "no_srvs/Odd", {}, 20.0)
     # This server resolves no types, and says so of a subscription that has none.
     with pytest.raises(RosError, match="rosbridge says"):
-        link.read("/odom", None, 5.0)
+        link.read("/odom", None, 20.0)
 
 
 def test_a_killed_server_is_noticed_and_its_successor_is_given_the_subscriptions(
