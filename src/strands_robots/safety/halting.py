@@ -10,6 +10,7 @@ from strands_robots.contract import Haltable
 from strands_robots.safety.stopping import StopVerdict, explain, grade
 
 Answered = Callable[[StopVerdict], None]
+_Jobs = queue.SimpleQueue[tuple[str, Answered] | None]
 
 
 def halt_of(robot: Haltable, robot_id: str, reason: str) -> StopVerdict:
@@ -39,31 +40,38 @@ class HaltWorker:
     def __init__(self, robot: Haltable, robot_id: str) -> None:
         self._robot = robot
         self._robot_id = robot_id
-        self._jobs: queue.SimpleQueue[tuple[str, Answered] | None] = queue.SimpleQueue()
-        self._thread = self._start()
+        # Taken for an assignment or a put alone: a halt ordered while the thread is renewed must not fall between.
+        self._changing = threading.Lock()
+        self._jobs: _Jobs = queue.SimpleQueue()
+        self._thread = self._start(self._jobs)
 
     def halt(self, reason: str, answered: Answered) -> None:
         """Halt on the ready thread; ``answered`` is called there with the verdict. Returns at once."""
-        self._jobs.put((reason, answered))
+        with self._changing:
+            self._jobs.put((reason, answered))
 
     def renew(self) -> None:
         """Put a fresh thread beside one whose halt has not answered; that one ends when its halt returns."""
-        self._jobs.put(None)
-        self._jobs = queue.SimpleQueue()
-        self._thread = self._start()
+        jobs: _Jobs = queue.SimpleQueue()
+        thread = self._start(jobs)
+        with self._changing:
+            self._jobs.put(None)
+            self._jobs, self._thread = jobs, thread
 
     def close(self, wait: float = 1.0) -> None:
         """End the thread; one that is stuck in a halt is left behind as a daemon."""
-        self._jobs.put(None)
-        if self._thread is not threading.current_thread():
-            self._thread.join(wait)
+        with self._changing:
+            self._jobs.put(None)
+            thread = self._thread
+        if thread is not threading.current_thread():
+            thread.join(wait)
 
-    def _start(self) -> threading.Thread:
-        thread = threading.Thread(target=self._run, args=(self._jobs,), name=f"halt-{self._robot_id}", daemon=True)
+    def _start(self, jobs: _Jobs) -> threading.Thread:
+        thread = threading.Thread(target=self._run, args=(jobs,), name=f"halt-{self._robot_id}", daemon=True)
         thread.start()
         return thread
 
-    def _run(self, jobs: queue.SimpleQueue[tuple[str, Answered] | None]) -> None:
+    def _run(self, jobs: _Jobs) -> None:
         while (job := jobs.get()) is not None:
             reason, answered = job
             answered(halt_of(self._robot, self._robot_id, reason))
