@@ -152,7 +152,10 @@ class Children:
             self._end(self._children.pop(peer))
         for peer, name in wanted.items():
             if peer not in self._children and self._open:
-                self._children[peer] = self._begin(peer, name)
+                child = self._begin(peer, name)
+                # Described before the timer's thread announces it.
+                child.herald.refresh()
+                self._children[peer] = child
         for child in list(self._children.values()):
             child.herald.refresh()
 
