@@ -109,7 +109,7 @@ def test_the_moment_of_asking_belongs_to_one_thread() -> None:
     with gate.asked_at(asked):
         other = threading.Thread(target=lambda: seen.append(gate.refusal("start")))
         other.start()
-        other.join(5)
+        other.join(20)
     assert seen == [None]
 
 

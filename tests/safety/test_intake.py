@@ -62,5 +62,5 @@ def test_taking_waits_for_an_offer_and_ends_with_the_intake() -> None:
     for number in range(100):
         intake.offer("emergencyStop", f"s{number}", str(number).encode())
     intake.close()
-    thread.join(5)
+    thread.join(20)
     assert sorted(map(int, found)) == list(range(100))
