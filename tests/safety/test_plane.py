@@ -210,6 +210,17 @@ def test_a_lockout_that_cannot_be_written_is_still_reported(
     assert "not on the disk" in caplog.text
 
 
+def test_a_stop_that_was_resumed_and_comes_again_is_not_said_to_have_stopped(plane: SafetyPlane, add: Add) -> None:
+    robot, epoch = add(), new_epoch()
+    assert plane.emergency_stop(order(epoch))["arm-1"].stopped is True
+    plane.clear_local("ann")
+    robot.start()
+    seen: list[RobotReport] = []
+    assert plane.begin(order(epoch), seen.append) is None
+    assert [each.stopped for each in seen] == [None]
+    assert robot.moving
+
+
 def test_an_id_resumed_before_comes_again_and_is_answered_without_a_halt(plane: SafetyPlane, add: Add) -> None:
     robot, epoch = add(), new_epoch()
     plane.robots["arm-1"].latch.engage(epoch, "s", "")

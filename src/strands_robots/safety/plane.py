@@ -315,10 +315,10 @@ class SafetyPlane:
 
     def _repeat(self, order: StopOrder, robots: Iterable[Registered], on_report: OnReport) -> None:
         for entry in robots:
-            known = entry.reports.get(order.epoch)
-            if known is not None:
+            known, held = entry.reports.get(order.epoch), order.epoch in entry.epochs
+            if known is not None and (held or entry.latch.state.overflow is not None):
                 on_report(_again(entry, known))
-            elif order.epoch not in entry.epochs and order.epoch in entry.latch.seen:
+            elif not held and order.epoch in entry.latch.seen:
                 why = {entry.robot_id: "this stop was resumed before it came again"}
                 on_report(RobotReport(entry.robot_id, order.epoch, StopVerdict(unknown=why), entry.epochs, 0.0))
 

@@ -124,7 +124,6 @@ def test_a_robot_that_resumed_this_very_stop_says_that_it_does_not_act_on_it(
 ) -> None:
     site = site_of("arm-1")
     first = controller.stop(["arm-1"], deadline_s=20)
-    site.plane.robots["arm-1"].reports.clear()
     site.plane.clear_local("ann")
 
     def refused() -> bool:
