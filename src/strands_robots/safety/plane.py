@@ -183,9 +183,6 @@ class SafetyPlane:
                 return
             self._robots = {name: each for name, each in self._robots.items() if each is not entry}
             self._bequeath(entry)
-            if entry.locked and entry.latch.state is not entry.on_disk:
-                # Its last stop may still be on the way to the disk, and whoever registers next reads it there.
-                self._kept([entry])
             # Decided here: a robot that registers meanwhile has a reporter of its own, and this one ends all the same.
             last = None
             if not self._robots:
@@ -203,7 +200,10 @@ class SafetyPlane:
                 entry.robot.gate.detach(latch)
 
     def _bequeath(self, entry: Registered) -> None:
-        """The lock of a robot that leaves goes on: in the entry of its other name, else in its gate."""
+        """The lock of a robot that leaves goes on: on the disk, in the entry of its other name, else in its gate."""
+        if entry.locked and entry.latch.state is not entry.on_disk:
+            # Its last stop may still be on the way there, and whoever registers next reads it there.
+            self._kept([entry])
         for gate in entry.gates:
             heirs = [each for each in self._robots.values() if gate in each.gates]
             for heir in heirs:
