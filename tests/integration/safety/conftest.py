@@ -57,7 +57,7 @@ class Stage:
 
     def meet(self, hand: Child, *ids: str) -> None:
         """Wait until a stop of ``hand`` comes through to each robot and back: from then on nobody is unknown."""
-        eventually(lambda: hand.ask("stop", ids, 0.5)["ok"], what="the first stop")
+        eventually(lambda: hand.ask("stop", ids, 5.0)["ok"], what="the first stop")
 
     def close(self) -> None:
         """End every process."""
