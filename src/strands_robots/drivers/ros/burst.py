@@ -52,9 +52,10 @@ class Burst:
         self.state = "running"
         self.answer: Envelope | None = None
         self.sent = 0
+        self.ended = threading.Event()
+        """Set by whoever runs it, once the base is free for the next drive."""
         self._began = time.monotonic()
         self._took_s: float | None = None
-        self.ended = threading.Event()
         self._wire = wire
         self._permit = permit
         self._stopped = threading.Event()
@@ -101,7 +102,6 @@ class Burst:
                 halt_problem = self._halt()
             self.answer = self._answered(problem, halt_problem)
             self._took_s = time.monotonic() - self._began
-            self.ended.set()
         return self.answer
 
     def _send_all(self) -> None:

@@ -225,9 +225,10 @@ class MobileBaseRobot:
         burst = self._burst
         if burst is None:
             return success("Idle.", task_status="idle", instruction="", step_count=0, duration=0.0)
+        state = burst.state if burst.ended.is_set() else "running"
         return success(
-            f"The last drive is {burst.state}.",
-            task_status=burst.state,
+            f"The last drive is {state}.",
+            task_status=state,
             instruction=f"drive {burst.order.linear:g} m/s, {burst.order.angular:g} rad/s",
             step_count=burst.sent,
             duration=round(burst.elapsed_s, 3),
@@ -337,7 +338,9 @@ class MobileBaseRobot:
             answer = burst.run()
             self._latched = burst.order.latches and not burst.order.zero and burst.state == "completed"
         finally:
+            # The slot first: whoever stopped the drive and waits for its end may drive anew at once.
             self._slot.release()
+            burst.ended.set()
             self._observers.finished(burst)
         return answer
 

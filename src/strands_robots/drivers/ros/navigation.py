@@ -54,6 +54,7 @@ class Navigation:
         self.to = to
         self.state = "running"
         self.ended = threading.Event()
+        """Set by whoever runs it, once the base is free for the next motion."""
         self.report: GoalReport | None = None
         self.feedback: list[Mapping[str, Any]] = []
         self.sent = 0
@@ -131,7 +132,6 @@ class Navigation:
             self.answer = error(f"The goal was not begun: {exc}", goal_state="not sent")
         finally:
             self._took_s = time.monotonic() - self._began
-            self.ended.set()
         return self.answer
 
     def _hear(self, message: Message) -> None:

@@ -169,9 +169,10 @@ class RosBridgedRobot(PosedBaseRobot):
         if going is None or self._burst is not None:
             return super().get_task_status()
         latest: Mapping[str, Any] = going.feedback[-1] if going.feedback else {}
+        state = going.state if going.ended.is_set() else "running"
         return success(
-            f"The last goal is {going.state}.",
-            task_status=going.state,
+            f"The last goal is {state}.",
+            task_status=state,
             instruction=going.instruction,
             step_count=going.sent,
             duration=round(going.elapsed_s, 3),
@@ -237,5 +238,7 @@ class RosBridgedRobot(PosedBaseRobot):
         try:
             return going.run()
         finally:
+            # The slot first: whoever waits for the end may send the robot on at once.
             self._slot.release()
+            going.ended.set()
             self._observers.finished(going)
