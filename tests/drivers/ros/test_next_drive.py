@@ -29,7 +29,7 @@ def test_a_base_whose_drive_is_told_to_be_over_takes_the_next_one() -> None:
     link.watch("/cmd_vel", "geometry_msgs/msg/Twist", lambda message: None)
     robot = MobileBaseRobot("rover", link, "/cmd_vel", publish_rate=1000.0, command_gate=OPEN)
     try:
-        for _ in range(100):
+        for _ in range(300):
             answer = robot.start_drive(0.1, 0.0, 0.001)
             assert answer["status"] == "success", answer
             while robot.get_task_status()["task_status"] == "running":
