@@ -89,10 +89,10 @@ def test_a_sender_is_told_how_its_command_went(
 
     console = peers.join(None, "console")
     Strict(peers, "there", 0.0)
-    plain = console.send("there", {"action": "ping"}, timeout=2)
+    plain = console.send("there", {"action": "ping"}, timeout=20)
     assert (plain["via"], plain["confirmed"]) == ("publish", False)
     monkeypatch.setattr(MemoryTransport, "put_confirmed", put_confirmed, raising=False)
-    for answer in (console.send("there", {"action": "ping"}, timeout=2), console.ping("there")):
+    for answer in (console.send("there", {"action": "ping"}, timeout=20), console.ping("there", timeout=20)):
         assert (answer["via"], answer["confirmed"]) == ("direct", taken is True)
     absent = console.send("nobody", {"action": "ping"}, timeout=0.05)
     assert (absent["status"], absent["via"]) == ("timeout", "direct")
