@@ -74,7 +74,8 @@ def until_answered(transport: Transport, key: str, body: dict[str, Any], found: 
 
     def ask() -> dict[str, Any] | None:
         if not found:
-            transport.put(key, body)
+            # As another turn each time: the same one would be refused as a replay of what was not answered to us.
+            transport.put(key, {**body, "turn_id": uuid.uuid4().hex})
             time.sleep(0.1)
         return found[0] if found else None
 
