@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from fixtures.devices import RecordingDevice
 
+from strands_robots.cli.far import found
 from strands_robots.cli.published import Glide
 from strands_robots.hardware import HardwareRobot
+from strands_robots.mesh.transport import posture, zenoh_config
 from strands_robots.utils import ValidationError
+
+
+def test_a_peer_is_waited_for_as_long_as_its_link_may_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: list[float] = []
+
+    def wait(mesh: object, peer: str, timeout: float) -> bool:
+        waited.append(timeout)
+        return True
+
+    monkeypatch.setattr("strands_robots.mesh.core.wait_for_peer", wait)
+    console: Any = None
+    assert found(console, "arm-1")
+    monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7447")
+    assert found(console, "arm-1")
+    retry = zenoh_config.explicit(posture.from_settings())["connect"]["retry"]
+    assert waited[0] < retry["period_max_ms"] / 1000 < waited[1]
 
 
 def test_the_first_frames_glide_and_a_pause_is_not_saved_up(monkeypatch: pytest.MonkeyPatch) -> None:

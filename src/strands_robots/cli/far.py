@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
+from strands_robots import settings
 from strands_robots.cli.mesh import joined, own_id
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.envelope import is_error, text_of
@@ -24,7 +25,7 @@ MESH = "mesh:"
 
 LEADER = "leader"
 
-FOUND_S, _ANSWER_S, _OPEN_S = 3.0, 5.0, 3.0
+_FOUND_S, _LINKED_S, _ANSWER_S, _OPEN_S = 3.0, 12.0, 5.0, 3.0
 _LOOK_S = 0.05
 _ASK_EVERY_S = 0.25
 SILENT_S = 2.0
@@ -78,6 +79,14 @@ class FarBody:
         return result
 
 
+def found(mesh: Mesh, peer: str) -> bool:
+    """Whether a peer is seen in time; with stated endpoints it may pause for 8 s between two tries of its link."""
+    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when something is led
+
+    stated = settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT")
+    return wait_for_peer(mesh, peer, _LINKED_S if stated else _FOUND_S)
+
+
 def known_to(follower: str, leader: Any, bounds: Ranges) -> None:
     """Refuse a leader that leads what the follower has not. Raises :class:`ValidationError`, before anything moves."""
     unknown = [key for key in getattr(leader, "keys", ()) if key not in bounds]
@@ -121,12 +130,11 @@ def lead_far(
         Failure: it was refused, it failed, or the follower did not confirm its stop.
     """
     from strands_robots.leaders import BoundedLeader  # noqa: PLC0415 - loaded when something is led
-    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - as above
-    from strands_robots.mesh.input import InputPublisher  # noqa: PLC0415
+    from strands_robots.mesh.input import InputPublisher  # noqa: PLC0415 - as above
 
     rate, speed = number("hz", hz, low=1, high=1000), number("max_speed", max_speed, above=0, high=20)
     with joined(None, own_id("lead"), "tool") as mesh:
-        if not wait_for_peer(mesh, peer, FOUND_S):
+        if not found(mesh, peer):
             raise Failure(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
         far = FarBody(mesh, peer)
         with led(far) as source:

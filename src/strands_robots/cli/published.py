@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from strands_robots.cli.far import FOUND_S, LEADER, SILENT_S, Wait, leads, reason_of
+from strands_robots.cli.far import LEADER, SILENT_S, Wait, found, leads, reason_of
 from strands_robots.cli.mesh import joined
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.policies.actions import SpeedLimit, checked_action
@@ -122,12 +122,11 @@ def follow_far(
     Raises:
         Failure: the mesh is off, nobody of that name is on it, or the robot may not move.
     """
-    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when something is led
-    from strands_robots.mesh.input import InputReceiver  # noqa: PLC0415 - as above
+    from strands_robots.mesh.input import InputReceiver  # noqa: PLC0415 - loaded when something is led
 
     if robot.mesh is None or not robot.mesh.alive:
         raise Failure("The mesh has no session, or STRANDS_MESH switches it off.")
-    if not wait_for_peer(robot.mesh, peer, FOUND_S):
+    if not found(robot.mesh, peer):
         raise Failure(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
     receiver = InputReceiver(robot.mesh, robot, peer, LEADER, Glide(robot.body(), max_speed))
     receiver.start()

@@ -94,6 +94,7 @@ def test_a_stop_is_heard_halts_every_robot_and_each_answers(open_site: Callable[
     site, listener = open_site("arm-1", "arm-2", "arm-3")
     for robot in site.robots.values():
         robot.start()
+    eventually(lambda: all(robot.device.times for robot in site.robots.values()))
     epoch = new_epoch()
 
     def answers() -> dict[str, dict[str, Any]]:
