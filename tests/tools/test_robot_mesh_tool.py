@@ -3,6 +3,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,7 +12,9 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.mesh import init_mesh, safety
-from strands_robots.mesh.session import clear_peers
+from strands_robots.mesh.core import Mesh
+from strands_robots.mesh.session import clear_peers, get_peers
+from strands_robots.mesh.transport import posture, zenoh_config
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.networks import DeviceConnect, NativeMesh, verdict_of
 
@@ -167,6 +170,33 @@ def test_robots_on_the_mesh_are_found_told_and_stopped_by_name(on_the_mesh: None
         assert meshes[0] is not None and meshes[0].lockout_epoch == verdict["estop_id"]
     finally:
         for mesh in meshes:
+            if mesh is not None:
+                mesh.close()
+
+
+def test_where_robots_connect_to_the_tool_they_have_as_long_as_they_may_pause(
+    on_the_mesh: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stated = zenoh_config.explicit(posture.from_settings())["connect"]["retry"]
+    assert stated["period_max_ms"] / 1000 < networks.LINKED_S
+    monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7447")
+    monkeypatch.setattr(networks, "LINKED_S", 60.0)
+    slept: list[float] = []
+    arm: list[Mesh | None] = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        if seconds > 1.0:  # the pause of the arm is over
+            arm.append(init_mesh(World("left"), "sim-1", "sim"))
+            eventually(lambda: any(row["peer_id"] == "sim-1" for row in get_peers()))
+
+    monkeypatch.setattr(networks, "time", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(safety, "COLLECT_S", 0.5)
+    try:
+        assert robot_mesh(action="emergency_stop")["robots"] == {"sim-1": "stopped"}
+        assert sum(slept) == pytest.approx(60.0)
+    finally:
+        for mesh in arm:
             if mesh is not None:
                 mesh.close()
 

@@ -23,6 +23,11 @@ SOURCE = "robot-mesh-tool"
 """The name that the tool's calls carry; what a robot's allowlist has to hold."""
 
 HEAR_S = 1.1
+"""Two heartbeats: who is there has been heard by then."""
+
+LINKED_S = 9.5
+"""The same where robots connect to this process: they pause for up to 8 s between two tries."""
+
 ANSWER_S = 10.0
 STOP_S = 5.0
 ESTOP_S = 1.5
@@ -63,6 +68,7 @@ class NativeMesh:
         """Every peer in reach, with its type and state."""
 
         def listed(console: Mesh) -> Envelope:
+            time.sleep(_hearing_s())
             rows = [
                 {"id": row["peer_id"], "type": row["type"], "status": row.get("task_status", "")}
                 for row in console.peers
@@ -82,37 +88,41 @@ class NativeMesh:
             "policy_provider": policy_provider,
             "duration": duration,
         }
-        return _with_console(lambda console: _answer_of(target, console.send(target, command, ANSWER_S)))
+        return _with_console(lambda console: _answer_of(target, _asked(console, target, command, ANSWER_S)))
 
     def status(self, target: str) -> Envelope:
         """The peer's ``status``."""
-        return _with_console(lambda console: _answer_of(target, console.send(target, {"action": "status"}, ANSWER_S)))
+        command = {"action": "status"}
+        return _with_console(lambda console: _answer_of(target, _asked(console, target, command, ANSWER_S)))
 
     def stop(self, target: str) -> Envelope:
         """The peer's ``stop``, or that of every peer in reach at once; answers by name."""
 
         def stopped(console: Mesh) -> Envelope:
+            command = {"action": "stop"}
             if target:
-                return verdict_of({target: _stop_answer(target, console.send(target, {"action": "stop"}, STOP_S))})
+                return verdict_of({target: _stop_answer(target, _asked(console, target, command, STOP_S))})
+            _await_peers(lambda: console.broadcast(command, ESTOP_S))
             expected = [row["peer_id"] for row in console.peers if row["reachable"]]
-            return verdict_of(_by_name(console.broadcast({"action": "stop"}, ESTOP_S), expected))
+            return verdict_of(_by_name(console.broadcast(command, ESTOP_S), expected))
 
         return _with_console(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
         """The mesh's emergency stop, sent at once; and again when it is known who is there, for their answers by name.
 
-        Who can be seen and gave no answer is named. Both hold the robots; a resume of the operator's frees both.
+        Where robots connect to this process it is sent in between as well, to those that have. Who can be seen and
+        gave no answer is named. Each holds the robots; a resume of the operator's frees them of all.
         """
 
         def stopped(console: Mesh) -> Envelope:
             console.emergency_stop()
-            time.sleep(HEAR_S)
+            _await_peers(console.emergency_stop)
             expected = [row["peer_id"] for row in console.peers if row["reachable"]]
             replies = [each for each in console.emergency_stop() if each["responder_id"] != console.peer_id]
             return {**verdict_of(_by_name(replies, expected)), "estop_id": console.lockout_epoch}
 
-        return _with_console(stopped, hear_s=0.0, stopped=None)
+        return _with_console(stopped, stopped=None)
 
 
 def _by_name(replies: list[dict[str, Any]], expected: list[str]) -> dict[str, Envelope]:
@@ -138,7 +148,28 @@ def _answer_of(target: str, reply: dict[str, Any]) -> Envelope:
     return result if isinstance(result, dict) else error(f"{target} answered nothing known.")
 
 
-def _with_console(work: Callable[[Mesh], Envelope], hear_s: float = HEAR_S, **fields: Any) -> Envelope:
+def _hearing_s() -> float:
+    return LINKED_S if settings.items("ZENOH_LISTEN") else HEAR_S
+
+
+def _await_peers(stop: Callable[[], object]) -> None:
+    """Wait until it is known who is there; where that takes long, ``stop`` those who are there already meanwhile."""
+    time.sleep(HEAR_S)
+    rest = _hearing_s() - HEAR_S
+    if rest > 0:
+        stop()
+        time.sleep(rest)
+
+
+def _asked(console: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
+    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - the network is loaded when it is used
+
+    time.sleep(HEAR_S)
+    wait_for_peer(console, target, _hearing_s() - HEAR_S)
+    return console.send(target, command, seconds)
+
+
+def _with_console(work: Callable[[Mesh], Envelope], **fields: Any) -> Envelope:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the network is loaded when it is used
     from strands_robots.mesh.transport.base import TransportError  # noqa: PLC0415 - as above
     from strands_robots.mesh.transport.posture import visitor_id  # noqa: PLC0415
@@ -150,8 +181,6 @@ def _with_console(work: Callable[[Mesh], Envelope], hear_s: float = HEAR_S, **fi
     if console is None or not console.alive:
         return error("The native mesh is off or has no session; see the log.", **fields)
     try:
-        # Two heartbeats: who is there has been heard by then.
-        time.sleep(hear_s)
         return work(console)
     finally:
         console.close()
