@@ -216,6 +216,8 @@ class ZenohStopLink:
         config = self._link.zenoh()
         config["connect"]["retry"] = {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2}
         config["transport"]["link"]["tx"]["lease"] = LEASE_MS
+        # The answers of many robots come at once; Zenoh's own queue holds two batches, and drops what finds no room.
+        config["transport"]["link"]["tx"]["queue"] = {"size": {"real_time": 16}}
         # Zenoh keeps a descriptor of each link that agreed on shared memory; a stop has no use for it.
         config["transport"]["shared_memory"] = {"enabled": False}
         if not self._link.is_peer:
