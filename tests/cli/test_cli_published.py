@@ -14,7 +14,8 @@ from strands_robots.mesh.transport import posture, zenoh_config
 from strands_robots.utils import ValidationError
 
 
-def test_a_peer_is_waited_for_as_long_as_its_link_may_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("stated", ["ZENOH_LISTEN", "ZENOH_CONNECT"])
+def test_a_peer_is_waited_for_as_long_as_its_link_may_pause(monkeypatch: pytest.MonkeyPatch, stated: str) -> None:
     waited: list[float] = []
 
     def wait(mesh: object, peer: str, timeout: float) -> bool:
@@ -24,7 +25,7 @@ def test_a_peer_is_waited_for_as_long_as_its_link_may_pause(monkeypatch: pytest.
     monkeypatch.setattr("strands_robots.mesh.core.wait_for_peer", wait)
     console: Any = None
     assert found(console, "arm-1")
-    monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7447")
+    monkeypatch.setenv(stated, "tcp/127.0.0.1:7447")
     assert found(console, "arm-1")
     retry = zenoh_config.explicit(posture.from_settings())["connect"]["retry"]
     assert waited[0] < retry["period_max_ms"] / 1000 < waited[1]

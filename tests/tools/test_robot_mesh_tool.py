@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
-from types import SimpleNamespace
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -12,8 +11,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.mesh import init_mesh, safety
-from strands_robots.mesh.core import Mesh
-from strands_robots.mesh.session import clear_peers, get_peers
+from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import posture, zenoh_config
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.networks import DeviceConnect, NativeMesh, verdict_of
@@ -131,7 +129,7 @@ def test_with_device_connect_off_the_native_mesh_is_used(monkeypatch: pytest.Mon
 def on_the_mesh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
-    monkeypatch.setattr(networks, "HEAR_S", 0.1)
+    monkeypatch.setattr(posture, "HEARD_S", 0.1)
     monkeypatch.setattr(networks, "STOP_S", 20.0)
     monkeypatch.setattr(safety, "COLLECT_S", 20.0)
     clear_peers()
@@ -174,31 +172,91 @@ def test_robots_on_the_mesh_are_found_told_and_stopped_by_name(on_the_mesh: None
                 mesh.close()
 
 
-def test_where_robots_connect_to_the_tool_they_have_as_long_as_they_may_pause(
-    on_the_mesh: None, monkeypatch: pytest.MonkeyPatch
+def test_a_link_to_a_stated_endpoint_is_waited_for_longer_than_it_pauses() -> None:
+    pause = zenoh_config.explicit(posture.from_settings())["connect"]["retry"]["period_max_ms"] / 1000
+    assert pause + posture.HEARD_S < posture.LINKED_S
+
+
+class Visit:
+    """What the tool sees of a mesh on its own clock: robots that come at a time, and when each was told to stop."""
+
+    def __init__(self, coming: dict[str, float], silent: frozenset[str] = frozenset()) -> None:
+        self.now, self.coming, self.silent = 0.0, coming, silent
+        self.peer_id, self.lockout_epoch, self.alive = "tool", "e" * 32, True
+        self.stops: list[float] = []
+
+    @property
+    def peers(self) -> list[dict[str, Any]]:
+        return [{"peer_id": name, "reachable": True} for name, at in self.coming.items() if at <= self.now]
+
+    def emergency_stop(self) -> list[dict[str, Any]]:
+        self.stops.append(self.now)
+        told = [row["peer_id"] for row in self.peers if row["peer_id"] not in self.silent]
+        return [{"responder_id": name, "result": {"ok": True, "stopped": True}} for name in told]
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def close(self) -> None:
+        self.alive = False
+
+
+@pytest.fixture
+def visit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Visit]:
+    def visiting(coming: dict[str, float], **options: Any) -> Visit:
+        made = Visit(coming, **options)
+        monkeypatch.setattr("strands_robots.mesh.init_mesh", lambda *_: made)
+        monkeypatch.setattr(networks, "time", made)
+        return made
+
+    return visiting
+
+
+def test_on_loopback_a_stop_is_sent_at_once_and_again_when_somebody_is_seen(visit: Callable[..., Visit]) -> None:
+    seen = visit({"arm-1": 0.4, "arm-2": 0.5})
+    assert NativeMesh().emergency_stop("")["robots"] == {"arm-1": "stopped", "arm-2": "stopped"}
+    assert len(seen.stops) == 2
+    assert seen.stops[0] == 0.0
+    assert seen.now < 1.5
+
+
+def test_a_robot_that_connects_late_to_who_listens_is_stopped_when_it_comes(
+    visit: Callable[..., Visit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stated = zenoh_config.explicit(posture.from_settings())["connect"]["retry"]
-    assert stated["period_max_ms"] / 1000 < networks.LINKED_S
     monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7447")
-    monkeypatch.setattr(networks, "LINKED_S", 60.0)
-    slept: list[float] = []
-    arm: list[Mesh | None] = []
+    seen = visit({"arm-1": 0.4, "arm-2": 5.0, "arm-3": 8.5})
+    assert NativeMesh().emergency_stop("")["robots"] == dict.fromkeys(("arm-1", "arm-2", "arm-3"), "stopped")
+    for came in seen.coming.values():
+        assert any(0 <= at - came <= networks.AGAIN_S + networks.LOOK_S for at in seen.stops), seen.stops
+    assert len(seen.stops) == 4
+
+
+def test_who_connects_and_finds_nobody_waits_for_the_listener(
+    visit: Callable[..., Visit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
+    seen = visit({"arm-1": 7.0})
+    assert NativeMesh().emergency_stop("")["stopped"] is True
+    assert seen.now < 7.0 + 2 * posture.HEARD_S
+
+
+def test_a_robot_that_was_seen_and_left_without_an_answer_is_named(
+    visit: Callable[..., Visit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7447")
+    seen = visit({"arm-1": 0.4, "arm-2": 0.4}, silent=frozenset({"arm-2"}))
 
     def sleep(seconds: float) -> None:
-        slept.append(seconds)
-        if seconds > 1.0:  # the pause of the arm is over
-            arm.append(init_mesh(World("left"), "sim-1", "sim"))
-            eventually(lambda: any(row["peer_id"] == "sim-1" for row in get_peers()))
+        seen.now += seconds
+        if seen.now > 4.0:
+            seen.coming.pop("arm-2", None)
 
-    monkeypatch.setattr(networks, "time", SimpleNamespace(sleep=sleep))
-    monkeypatch.setattr(safety, "COLLECT_S", 0.5)
-    try:
-        assert robot_mesh(action="emergency_stop")["robots"] == {"sim-1": "stopped"}
-        assert sum(slept) == pytest.approx(60.0)
-    finally:
-        for mesh in arm:
-            if mesh is not None:
-                mesh.close()
+    monkeypatch.setattr(seen, "sleep", sleep)
+    verdict = NativeMesh().emergency_stop("")
+    assert (verdict["stopped"], verdict["silent"]) == (None, ["arm-2"])
 
 
 @pytest.mark.parametrize("word", ["auto", "on", "", "maybe"])

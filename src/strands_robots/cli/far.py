@@ -25,7 +25,7 @@ MESH = "mesh:"
 
 LEADER = "leader"
 
-_FOUND_S, _LINKED_S, _ANSWER_S, _OPEN_S = 3.0, 12.0, 5.0, 3.0
+_FOUND_S, _ANSWER_S, _OPEN_S = 3.0, 5.0, 3.0
 _LOOK_S = 0.05
 _ASK_EVERY_S = 0.25
 SILENT_S = 2.0
@@ -80,11 +80,12 @@ class FarBody:
 
 
 def found(mesh: Mesh, peer: str) -> bool:
-    """Whether a peer is seen in time; with stated endpoints it may pause for 8 s between two tries of its link."""
+    """Whether a peer is seen in time, which is longer with stated endpoints."""
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when something is led
+    from strands_robots.mesh.transport.posture import LINKED_S  # noqa: PLC0415 - as above
 
     stated = settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT")
-    return wait_for_peer(mesh, peer, _LINKED_S if stated else _FOUND_S)
+    return wait_for_peer(mesh, peer, LINKED_S if stated else _FOUND_S)
 
 
 def known_to(follower: str, leader: Any, bounds: Ranges) -> None:

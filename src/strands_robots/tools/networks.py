@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -22,16 +23,12 @@ if TYPE_CHECKING:
 SOURCE = "robot-mesh-tool"
 """The name that the tool's calls carry; what a robot's allowlist has to hold."""
 
-HEAR_S = 1.1
-"""Two heartbeats: who is there has been heard by then."""
-
-LINKED_S = 9.5
-"""The same where robots connect to this process: they pause for up to 8 s between two tries."""
-
 ANSWER_S = 10.0
 STOP_S = 5.0
 ESTOP_S = 1.5
 """Seconds in which robots answer an emergency stop; it is sent again and again until then."""
+
+AGAIN_S, LOOK_S = 1.0, 0.05
 
 
 class RobotNetwork(Protocol):
@@ -68,7 +65,7 @@ class NativeMesh:
         """Every peer in reach, with its type and state."""
 
         def listed(console: Mesh) -> Envelope:
-            time.sleep(_hearing_s())
+            _hear(console)
             rows = [
                 {"id": row["peer_id"], "type": row["type"], "status": row.get("task_status", "")}
                 for row in console.peers
@@ -102,32 +99,47 @@ class NativeMesh:
             command = {"action": "stop"}
             if target:
                 return verdict_of({target: _stop_answer(target, _asked(console, target, command, STOP_S))})
-            _await_peers(lambda: console.broadcast(command, ESTOP_S))
-            expected = [row["peer_id"] for row in console.peers if row["reachable"]]
-            return verdict_of(_by_name(console.broadcast(command, ESTOP_S), expected))
+            return _stop_all(console, lambda: console.broadcast(command, ESTOP_S))
 
         return _with_console(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
-        """The mesh's emergency stop, sent at once; and again when it is known who is there, for their answers by name.
+        """The mesh's emergency stop, sent at once; and again for who is seen since and has not confirmed it.
 
-        Where robots connect to this process it is sent in between as well, to those that have. Who can be seen and
-        gave no answer is named. Each holds the robots; a resume of the operator's frees them of all.
+        Who was seen and gave no answer is named. Each of them holds the robots; a resume of the operator's frees them
+        of all. ``estop_id`` names the first.
         """
 
         def stopped(console: Mesh) -> Envelope:
-            console.emergency_stop()
-            _await_peers(console.emergency_stop)
-            expected = [row["peer_id"] for row in console.peers if row["reachable"]]
-            replies = [each for each in console.emergency_stop() if each["responder_id"] != console.peer_id]
-            return {**verdict_of(_by_name(replies, expected)), "estop_id": console.lockout_epoch}
+            return {**_stop_all(console, console.emergency_stop), "estop_id": console.lockout_epoch}
 
         return _with_console(stopped, stopped=None)
 
 
-def _by_name(replies: list[dict[str, Any]], expected: list[str]) -> dict[str, Envelope]:
-    silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in expected}
-    return silent | {each["responder_id"]: _stop_answer(each["responder_id"], each) for each in replies}
+def _stop_all(console: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
+    """Send a stop now, and again, at most once in :data:`AGAIN_S`, while somebody in reach has not confirmed it."""
+    seen: set[str] = set()
+    answers: dict[str, Envelope] = {}
+    asked = time.monotonic()
+
+    def ask() -> None:
+        nonlocal asked
+        asked = time.monotonic()
+        for reply in stop():
+            name = reply["responder_id"]
+            if name != console.peer_id:
+                answers[name] = _stop_answer(name, reply)
+
+    def unconfirmed() -> bool:
+        seen.update(_in_reach(console))
+        return any(not answers.get(name, {}).get("stopped") for name in seen)
+
+    ask()
+    _hear(console, lambda: ask() if unconfirmed() and time.monotonic() - asked >= AGAIN_S else None)
+    if unconfirmed():
+        ask()
+    silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in seen}
+    return verdict_of(silent | answers)
 
 
 def _stop_answer(target: str, reply: dict[str, Any]) -> Envelope:
@@ -148,24 +160,37 @@ def _answer_of(target: str, reply: dict[str, Any]) -> Envelope:
     return result if isinstance(result, dict) else error(f"{target} answered nothing known.")
 
 
-def _hearing_s() -> float:
-    return LINKED_S if settings.items("ZENOH_LISTEN") else HEAR_S
+def _in_reach(console: Mesh) -> list[str]:
+    return [row["peer_id"] for row in console.peers if row["reachable"]]
 
 
-def _await_peers(stop: Callable[[], object]) -> None:
-    """Wait until it is known who is there; where that takes long, ``stop`` those who are there already meanwhile."""
-    time.sleep(HEAR_S)
-    rest = _hearing_s() - HEAR_S
-    if rest > 0:
-        stop()
-        time.sleep(rest)
+def _hear(console: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None:
+    """Return when it is known who is there; ``meanwhile`` is called again and again.
+
+    Who connects here, or to what this process connects to and found nobody at, may pause between two tries.
+    """
+    from strands_robots.mesh.transport.posture import HEARD_S, LINKED_S  # noqa: PLC0415 - loaded when it is used
+
+    began, found = time.monotonic(), math.inf
+    listens, connects = settings.items("ZENOH_LISTEN"), settings.items("ZENOH_CONNECT")
+    while (now := time.monotonic()) < began + LINKED_S:
+        if _in_reach(console):
+            found = min(found, now)
+        known = now >= found + HEARD_S if connects else now >= began + HEARD_S
+        if known and not listens:
+            return
+        meanwhile()
+        time.sleep(LOOK_S)
 
 
 def _asked(console: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
-    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - the network is loaded when it is used
+    """What ``target`` replies, asked when it is in reach or when it is known who is."""
+    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport.posture import HEARD_S, LINKED_S  # noqa: PLC0415 - as above
 
-    time.sleep(HEAR_S)
-    wait_for_peer(console, target, _hearing_s() - HEAR_S)
+    time.sleep(HEARD_S)
+    if settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT"):
+        wait_for_peer(console, target, LINKED_S - HEARD_S)
     return console.send(target, command, seconds)
 
 

@@ -21,6 +21,12 @@ logger = logging.getLogger(__name__)
 ACL_MAX_BYTES = 256 * 1024
 HOW_TO_KEYS = "strands-robots mesh keys init"
 
+HEARD_S = 1.1
+"""Two heartbeats: who has a link to a peer has been heard by it."""
+
+LINKED_S = 12.0
+"""The same where links go to stated endpoints: of two tries the second may come 8 s after the first."""
+
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
