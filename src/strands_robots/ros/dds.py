@@ -29,8 +29,11 @@ _SLICE_MS = 100
 LOOPBACK_ONLY = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
-"""Cyclone DDS on this machine alone, without multicast; for Linux, whose loopback interface is ``lo``."""
+<SPDPInterval>2s</SPDPInterval><Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+"""Cyclone DDS on this machine alone, without multicast; for Linux, whose loopback interface is ``lo``.
+
+A participant says every 2 s that it is there, because nobody repeats an announcement that was lost (RTPS 2.5, 8.5.3).
+"""
 
 _domains: dict[int, Any] = {}
 _domains_lock = threading.Lock()
