@@ -218,6 +218,7 @@ def test_a_stop_that_was_resumed_and_comes_again_is_not_said_to_have_stopped(pla
     seen: list[RobotReport] = []
     assert plane.begin(order(epoch), seen.append) is None
     assert [each.stopped for each in seen] == [None]
+    assert plane.emergency_stop(order(epoch))["arm-1"].stopped is None
     assert robot.moving
 
 

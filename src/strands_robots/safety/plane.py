@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, Protocol
 
 from strands_robots import settings
@@ -200,7 +201,7 @@ class SafetyPlane:
                 entry.robot.gate.detach(latch)
 
     def _bequeath(self, entry: Registered) -> None:
-        """The lock of a robot that leaves goes on: on the disk, in the entry of its other name, else in its gate."""
+        """The lock of a robot that leaves goes on: on the disk, and in the entry of its other name or its gate."""
         if entry.locked and entry.latch.state is not entry.on_disk:
             # Its last stop may still be on the way there, and whoever registers next reads it there.
             self._kept([entry])
@@ -214,8 +215,8 @@ class SafetyPlane:
     def begin(self, order: StopOrder, on_report: OnReport = lambda report: None) -> StopRun | None:
         """Lock every robot at once and set every halt going; returns before any of them has answered.
 
-        A robot that has seen this stop is not halted again; its report of then is given to ``on_report`` at once,
-        where there is one. None when no robot had anything to do.
+        A robot that has seen this stop is not halted again; ``on_report`` gets at once its report of then while this
+        stop still holds it, and ``stopped`` None once it was resumed. None when no robot had anything to do.
         """
         robots = [each for each in self._robots.values() if not (order.heard and each.wire_id == order.source)]
         fresh: list[Registered] = []
@@ -259,13 +260,18 @@ class SafetyPlane:
         """Lock and halt every robot of the process and wait for their answers, by robot id.
 
         Returns within the halt deadline and the time the lockout file takes, whatever the robots do. A robot that
-        has seen this stop before answers with its report of then.
+        has seen this stop before answers as in :meth:`begin`.
         """
-        run = self.begin(order, on_report)
+        answers: dict[str, RobotReport] = {}
+
+        def reported(report: RobotReport) -> None:
+            answers[report.robot_id] = report
+            on_report(report)
+
+        run = self.begin(order, reported)
         if run is not None:
             run.wait(run.deadline_s + 2.0)
-        answers = (entry.reports.get(order.epoch) for entry in self._robots.values())
-        return {report.robot_id: report for report in answers if report is not None}
+        return dict(answers)
 
     def resume(self, robot_id: str, assertion: object, road: str) -> Envelope:
         """Check a signed resume for one robot; the wire's answer never says why it was rejected."""
@@ -325,7 +331,8 @@ class SafetyPlane:
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.
         with self._keeping:
-            kept = {each: Kept(each.latch.state, each.latch.seen, each.wire_id) for each in entries if each.key}
+            due = [each for each in entries if each.key and each.latch.state is not each.on_disk]
+            kept = {each: Kept(each.latch.state, each.latch.seen, each.wire_id) for each in due}
             if kept:
                 self.store.save({entry.key: record for entry, record in kept.items() if entry.key})
             for entry, record in kept.items():
