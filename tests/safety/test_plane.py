@@ -90,6 +90,23 @@ def test_a_robot_wedged_in_one_stop_is_asked_again_by_the_next(
     assert plane.emergency_stop(order())["wedged"].stopped is True
 
 
+def test_a_wedged_robot_is_reported_where_no_thread_can_start(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    release = threading.Event()
+    add("wedged", before_halt=lambda: release.wait(60))
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.3")
+
+    def no_thread() -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(plane.robots["wedged"].worker, "renew", no_thread)
+    for _ in range(2):
+        assert plane.emergency_stop(order())["wedged"].stopped is False
+    assert "can't start new thread" in caplog.text
+    release.set()
+
+
 @pytest.mark.parametrize(
     ("answer", "stopped"),
     [

@@ -175,8 +175,14 @@ class Reporter:
             if robot_id not in run.answers:
                 why = {robot_id: f"no answer in {run.deadline_s:g} s"}
                 run.answers[robot_id] = (StopVerdict(not_stopped=why), time.monotonic())
-                run.workers[robot_id].renew()
+                self._renew(run, robot_id)
             self._report(run, robot_id)
+
+    def _renew(self, run: StopRun, robot_id: str) -> None:
+        try:
+            run.workers[robot_id].renew()
+        except RuntimeError as exc:
+            logger.critical("%s is stuck in its halt and no other thread can halt it: %s.", robot_id, exc)
 
     def _report(self, run: StopRun, robot_id: str, *, late: bool = False) -> None:
         verdict, at = run.answers[robot_id]
