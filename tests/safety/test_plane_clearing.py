@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -82,7 +85,7 @@ def test_a_slip_laid_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane
     clearance.lay("ann", ["arm-1"])
     eventually(lambda: not robots["arm-1"].refuses())
     assert robots["arm-2"].refuses()
-    eventually(lambda: list(clearance.clearances().iterdir()) == [])
+    eventually(lambda: [each.suffix for each in clearance.clearances().iterdir()] == [".said"])
 
 
 def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_says_of_a_third_that_it_is_free(
@@ -113,9 +116,10 @@ class SlowProcess:
         self._desk = clearance.ClearanceDesk(lambda: ["arm-1"], self._clear)
         self._thread = threading.Thread(target=lambda: eventually(self._took, within=60))
 
-    def _clear(self, who: str, names: list[str]) -> None:
+    def _clear(self, who: str, name: str) -> str:
         self.doing.set()
         self.go_on.wait()
+        return "cleared"
 
     def _took(self) -> bool:
         self._desk.look(0.0)
@@ -148,6 +152,78 @@ def test_an_order_that_its_process_does_not_carry_out_is_not_said_to_be_cleared(
         said = clearance.clear_here("ann", ["arm-1"], wait_s=2.0)
     assert "has not carried it out" in said["arm-1"]
     assert list(clearance.clearances().iterdir()) == []
+
+
+def test_an_order_from_another_time_is_void_and_not_said_to_be_cleared(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lay_an_hour_ago(who: str, names: list[str]) -> list[Path]:
+        clearance.clearances().mkdir(mode=0o700, parents=True)
+        slip = clearance.clearances() / "a.draft"
+        slip.write_text(json.dumps({"who": who, "robot_id": names[0], "t": time.time() - 3600}), encoding="utf-8")
+        return [slip.replace(slip.with_suffix(".json"))]
+
+    monkeypatch.setattr(clearance, "lay", lay_an_hour_ago)
+    robot = add()
+    plane.emergency_stop(order())
+    assert "nothing was cleared" in clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
+    assert robot.refuses()
+
+
+def test_a_running_robot_that_is_not_locked_is_not_said_to_be_cleared(plane: SafetyPlane, add: Add) -> None:
+    add("arm-1")
+    add("arm-2")
+    plane.emergency_stop(order())
+    plane.clear_local("bob", ["arm-1"])
+    assert clearance.clear_here("ann", ["arm-1"], wait_s=20) == {"arm-1": "not locked here"}
+
+
+def test_a_robot_that_leaves_before_its_order_is_carried_out_is_not_said_to_be_cleared(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clear = plane.clear_local
+
+    def too_late(who: str, names: list[str]) -> object:
+        plane.robots["arm-1"].close()
+        return clear(who, names)
+
+    monkeypatch.setattr(plane, "clear_local", too_late)
+    robot = add("arm-1")
+    add("arm-2")
+    plane.emergency_stop(order())
+    assert "left its process" in clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
+    assert robot.refuses()
+
+
+def test_a_robot_whose_clearing_no_disk_took_is_free_and_that_is_said(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = add(key="k")
+    plane.emergency_stop(order())
+
+    def full(kept: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(plane.store, "save", full)
+    said = clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
+    assert said == "cleared, but not kept on the disk: after a restart it may be locked again"
+    assert not robot.refuses()
+    assert LockoutStore().load("k").state.locked
+
+
+def test_what_was_left_half_done_at_the_desk_is_removed_after_a_minute(plane: SafetyPlane, add: Add) -> None:
+    add()
+    directory = clearance.clearances()
+    directory.mkdir(mode=0o700, parents=True)
+    old = [directory / name for name in ("a.taken", "b.draft", "c.said")]
+    young = directory / "d.taken"
+    for path in (*old, young):
+        path.touch()
+    long_ago = time.time() - 2 * clearance.VALID_S
+    for path in old:
+        os.utime(path, (long_ago, long_ago))
+    plane.emergency_stop(order())
+    eventually(lambda: list(directory.iterdir()) == [young])
 
 
 def test_a_slip_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:

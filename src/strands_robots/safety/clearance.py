@@ -28,6 +28,12 @@ logger = logging.getLogger(__name__)
 
 VALID_S = 60.0
 
+CLEARED = "cleared"
+NOT_KEPT = "cleared, but not kept on the disk: after a restart it may be locked again"
+NOT_LOCKED = "not locked here"
+LEFT = "it left its process meanwhile; ask again"
+VOID = "its process found the order older than a minute, or ahead of its clock; nothing was cleared"
+
 
 def clearances() -> Path:
     """Where the slips lie."""
@@ -51,9 +57,10 @@ def lay(who: str, robot_ids: Iterable[str]) -> list[Path]:
 def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[str, str]:
     """Clear robots of this machine at the word of ``who``, whether their process runs or not.
 
-    Returns, for each name: ``cleared`` once its running process has done so and kept it, ``cleared on disk`` where
-    none runs, ``not locked here``, or that the process took the order and has not carried it out in ``wait_s``
-    seconds. Recorded in the audit either way.
+    Returns, for each name: what its running process says it did, ``cleared`` where it did so and kept it; ``cleared
+    on disk`` where none runs; ``not locked here``; or that the process took the order and has not carried it out.
+    Waits at most ``wait_s`` seconds for the processes to take the orders and as long for them to carry them out.
+    What was cleared is recorded in the audit.
 
     Raises:
         ValidationError: ``who`` is blank, or a name is no identifier.
@@ -61,28 +68,30 @@ def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[
     """
     names = list(dict.fromkeys(robot_ids))
     slips = dict(zip(names, lay(who, names), strict=True))
-    _until(lambda: not any(path.exists() for path in slips.values()), wait_s)
+    _until(lambda: not any(path.exists() for path in slips.values()), time.monotonic() + wait_s)
+    deadline = time.monotonic() + wait_s
     outcome: dict[str, str] = {}
     for name, path in slips.items():
         try:
             path.unlink()
         except FileNotFoundError:
-            outcome[name] = _answered(path, wait_s)
+            outcome[name] = _answered(path, deadline)
         else:
-            outcome[name] = "cleared on disk" if _clear_on_disk(who, name) else "not locked here"
+            outcome[name] = "cleared on disk" if _clear_on_disk(who, name) else NOT_LOCKED
     return outcome
 
 
-def _answered(slip: Path, wait_s: float) -> str:
-    taken = _taken(slip)
-    if _until(lambda: not taken.exists(), wait_s):
-        return "cleared"
-    taken.unlink(missing_ok=True)
+def _answered(slip: Path, deadline: float) -> str:
+    said = _said(slip)
+    if _until(said.exists, deadline):
+        answer = said.read_text(encoding="utf-8")
+        said.unlink(missing_ok=True)
+        return answer
+    _taken(slip).unlink(missing_ok=True)
     return "its process took the order and has not carried it out; ask for its state"
 
 
-def _until(condition: Callable[[], bool], wait_s: float) -> bool:
-    deadline = time.monotonic() + wait_s
+def _until(condition: Callable[[], bool], deadline: float) -> bool:
     while not condition():
         if time.monotonic() >= deadline:
             return False
@@ -93,6 +102,11 @@ def _until(condition: Callable[[], bool], wait_s: float) -> bool:
 def _taken(slip: Path) -> Path:
     """Where a slip lies while the process that took it clears the robot."""
     return slip.with_suffix(".taken")
+
+
+def _said(slip: Path) -> Path:
+    """Where the process that took a slip says what came of it, for whoever waits."""
+    return slip.with_suffix(".said")
 
 
 def _clear_on_disk(who: str, name: str) -> bool:
@@ -121,10 +135,10 @@ class ClearanceDesk:
 
     Args:
         here: the ids of the robots that this process holds.
-        clear: clears the named robots at the word of somebody.
+        clear: clears the named robot at the word of somebody, and says what came of it.
     """
 
-    def __init__(self, here: Callable[[], Collection[str]], clear: Callable[[str, list[str]], object]) -> None:
+    def __init__(self, here: Callable[[], Collection[str]], clear: Callable[[str, str], str]) -> None:
         self._here = here
         self._clear = clear
         self._looked = float("-inf")
@@ -142,9 +156,13 @@ class ClearanceDesk:
                 taken = path.replace(_taken(path))
             except FileNotFoundError:
                 continue  # another process took it
-            if -5.0 < time.time() - slip["t"] < VALID_S:
-                self._clear(slip["who"], [slip["robot_id"]])
-            taken.unlink(missing_ok=True)
+            valid = -5.0 < time.time() - slip["t"] < VALID_S
+            answer = self._clear(slip["who"], slip["robot_id"]) if valid else VOID
+            with contextlib.suppress(FileNotFoundError):  # nobody waits for it any more
+                with taken.open("r+", encoding="utf-8") as file:
+                    file.truncate()
+                    file.write(answer)
+                taken.replace(_said(path))
 
 
 def _slips() -> Iterator[tuple[Path, dict[str, Any]]]:
@@ -154,8 +172,17 @@ def _slips() -> Iterator[tuple[Path, dict[str, Any]]]:
         if status.st_uid != os.getuid() or status.st_mode & 0o022:
             logger.error("%s may be written by others; no clearance is taken from it.", directory)
             return
+        _sweep(directory)
         for path in sorted(directory.glob("*.json")):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # taken by another, or no slip
                 if not path.is_symlink():
                     slip = json.loads(path.read_text())
                     yield path, {"who": str(slip["who"]), "robot_id": str(slip["robot_id"]), "t": float(slip["t"])}
+
+
+def _sweep(directory: Path) -> None:
+    """Remove what somebody who is gone left half done, and answers that nobody waited for."""
+    for path in directory.iterdir():
+        with contextlib.suppress(OSError):  # gone meanwhile, or none of ours
+            if path.suffix in (".taken", ".draft", ".said") and time.time() - path.lstat().st_mtime > VALID_S:
+                path.unlink()

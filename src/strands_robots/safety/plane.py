@@ -15,7 +15,7 @@ from strands_robots.audit import log_safety_event
 from strands_robots.contract import Haltable
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
-from strands_robots.safety.clearance import ClearanceDesk
+from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceDesk
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.halting import HaltWorker
 from strands_robots.safety.latch import LockoutLatch
@@ -121,7 +121,7 @@ class SafetyPlane:
         self._robots: dict[str, Registered] = {}
         self._reporter: Reporter | None = None
         self._issued: dict[str, int] = {}
-        self._desk = ClearanceDesk(self.robot_ids, self.clear_local)
+        self._desk = ClearanceDesk(self.robot_ids, self._clear_one)
         self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
 
     @property
@@ -300,10 +300,10 @@ class SafetyPlane:
 
     def clear_local(self, who: str, robot_ids: Iterable[str] | None = None) -> dict[str, tuple[Hold, ...]]:
         """Clear everything that these robots hold (all by default) at the word of ``who``, at this machine."""
-        wanted = self._robots.keys() if robot_ids is None else set(robot_ids)
+        robots = self._robots
         cleared: dict[str, tuple[Hold, ...]] = {}
-        for name in wanted & self._robots.keys():
-            entry = self._robots[name]
+        for name in robots.keys() & set(robots if robot_ids is None else robot_ids):
+            entry = robots[name]
             effect = entry.latch.clear_local(who)
             if not isinstance(effect, Cleared):
                 continue
@@ -319,11 +319,17 @@ class SafetyPlane:
         """Who is locked now, and by what."""
         return {name: entry.latch.state.all for name, entry in self._robots.items() if entry.locked}
 
+    def _clear_one(self, who: str, robot_id: str) -> str:
+        entry = self._robots.get(robot_id)
+        if entry is None or robot_id not in self.clear_local(who, [robot_id]):
+            return NOT_LOCKED if robot_id in self._robots else LEFT
+        return NOT_KEPT if entry.key and entry.latch.state is not entry.on_disk else CLEARED
+
     def _repeat(self, order: StopOrder, robots: Iterable[Registered], on_report: OnReport) -> None:
         for entry in robots:
             known, held = entry.reports.get(order.epoch), order.epoch in entry.epochs
             if known is not None and (held or entry.latch.state.overflow is not None):
-                on_report(_again(entry, known))
+                on_report(replace(known, epochs=entry.epochs, repeated=True, late=False))
             elif not held and order.epoch in entry.latch.seen:
                 why = {entry.robot_id: "this stop was resumed before it came again"}
                 on_report(RobotReport(entry.robot_id, order.epoch, StopVerdict(unknown=why), entry.epochs, 0.0))
