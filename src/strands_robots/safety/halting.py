@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 from collections.abc import Callable
@@ -40,8 +41,9 @@ class HaltWorker:
     def __init__(self, robot: Haltable, robot_id: str) -> None:
         self._robot = robot
         self._robot_id = robot_id
-        # Taken for an assignment or a put alone: a halt ordered while the thread is renewed must not fall between.
+        # Taken for assignments and puts alone: a halt ordered while the thread is renewed must not fall between.
         self._changing = threading.Lock()
+        self._closed = False
         self._jobs: _Jobs = queue.SimpleQueue()
         self._thread = self._start(self._jobs)
 
@@ -51,16 +53,25 @@ class HaltWorker:
             self._jobs.put((reason, answered))
 
     def renew(self) -> None:
-        """Put a fresh thread beside one whose halt has not answered; that one ends when its halt returns."""
+        """Put a fresh thread beside one whose halt has not answered; that one ends when its halt returns.
+
+        The fresh one takes over what waits behind that halt. Raises RuntimeError where no thread can start.
+        """
         jobs: _Jobs = queue.SimpleQueue()
         thread = self._start(jobs)
         with self._changing:
-            self._jobs.put(None)
-            self._jobs, self._thread = jobs, thread
+            stuck, self._jobs, self._thread = self._jobs, jobs, thread
+            with contextlib.suppress(queue.Empty):  # all taken over
+                while True:
+                    jobs.put(stuck.get_nowait())
+            stuck.put(None)
+            if self._closed:
+                jobs.put(None)
 
     def close(self, wait: float = 1.0) -> None:
         """End the thread; one that is stuck in a halt is left behind as a daemon."""
         with self._changing:
+            self._closed = True
             self._jobs.put(None)
             thread = self._thread
         if thread is not threading.current_thread():
