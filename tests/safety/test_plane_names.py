@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from fixtures.planes import own_plane
 from fixtures.recording_robot import RecordingRobot
 from fixtures.waiting import eventually
 
+from strands_robots.safety import reporting
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.persistence import Kept, LockoutStore, hardware_key
 from strands_robots.safety.plane import SafetyPlane
@@ -96,6 +98,25 @@ def test_what_an_operator_cleared_on_the_disk_meanwhile_stays_cleared(robot: Rec
         store.save({KEY: Kept(seen=store.load(KEY).seen)})
         assert not plane.register("arm-1", robot, key=KEY).locked
         assert not robot.refuses()
+
+
+def test_a_stop_whose_file_is_written_late_does_not_undo_what_was_cleared_meanwhile(
+    robot: RecordingRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "GRACE_S", 60.0)
+    store, halted = LockoutStore(tmp_path), threading.Event()
+    with own_plane(20.0, store) as plane:
+        entry = plane.register("arm-1", robot, key=KEY)
+        plane.register("arm-2", RecordingRobot(before_halt=lambda: halted.wait(20)), key="slow")
+        run = plane.begin(StopOrder(new_epoch(), "safety-1"))
+        entry.close()
+        assert store.load(KEY).state.locked
+        store.save({KEY: Kept(seen=store.load(KEY).seen)})
+        halted.set()
+        assert run is not None
+        assert run.wait(20)
+        assert store.load("slow").state.locked
+        assert not store.load(KEY).state.locked
 
 
 def test_a_robot_that_moves_while_it_comes_up_locked_is_halted(robot: RecordingRobot, tmp_path: Path) -> None:

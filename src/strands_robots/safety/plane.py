@@ -391,12 +391,6 @@ def _body(robot: Stoppable) -> object:
     return getattr(robot, "wrapped", robot)
 
 
-def _again(entry: Registered, known: RobotReport) -> RobotReport:
-    return RobotReport(
-        known.robot_id, known.epoch, known.verdict, entry.epochs, known.elapsed_ms, known.persisted, repeated=True
-    )
-
-
 _PLANE = SafetyPlane()
 
 
