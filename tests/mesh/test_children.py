@@ -13,6 +13,7 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope, success
 from strands_robots.mesh.core import Mesh
+from strands_robots.mesh.presence import DESCRIBE_S
 from strands_robots.mesh.transport.memory import MemoryTransport
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
@@ -173,6 +174,89 @@ def test_robots_come_and_go_with_their_world(peers: Fleet) -> None:
     eventually(lambda: "sim-1__middle" in console.peers_by_id)
     mesh.stop()
     assert console.send("sim-1__middle", {"action": "ping"}, timeout=0.1)["status"] == "timeout"
+
+
+class Wedged(World):
+    """A world whose list of policies hangs while it is held."""
+
+    def __init__(self, *names: str) -> None:
+        super().__init__(*names)
+        self.hangs, self.free = threading.Event(), threading.Event()
+        self.free.set()
+
+    def list_policies_running(self) -> list[dict[str, Any]]:
+        if not self.free.is_set():
+            self.hangs.set()
+            self.free.wait(60)
+        return super().list_policies_running()
+
+
+def shown(peers: Fleet) -> list[str]:
+    """What the robots of ``sim-1`` have declared."""
+    held, own = [*peers.bus._subscribers, *peers.bus._tokens], peers.transports["sim-1"]
+    return [each.key for each in held if each.owner is own and "sim-1__" in each.key]
+
+
+def test_robots_whose_world_hangs_in_its_read_take_commands_and_are_announced_by_name_alone(peers: Fleet) -> None:
+    world = Wedged("left")
+    mesh, console = peers.join(world, "sim-1", "sim"), peers.join(None, "console")
+    children = mesh._assembled.children
+    assert children is not None
+    world.free.clear()
+    # The sampler hangs as well, so that nobody but this test asks for the children.
+    assert world.hangs.wait(20)
+    world.names.append("right")
+    reading = threading.Thread(target=children.refresh)
+    reading.start()
+    try:
+        eventually(lambda: set(children._children) == {"sim-1__left", "sim-1__right"})
+        children.announce()
+        assert set(console.peers_by_id) == {"sim-1"}, "neither has been described yet"
+        peers.clock.pass_(DESCRIBE_S)
+        children.announce()
+        assert "tool_name" not in console.peers_by_id["sim-1__right"]
+        assert console.ping("sim-1__right", timeout=20)["status"] == "ok"
+        children.close()
+        assert shown(peers) == []
+    finally:
+        world.free.set()
+        reading.join(20)
+    assert children._children == {}
+
+
+def test_a_robot_that_begins_while_its_world_leaves_is_taken_away(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World("left")
+    children = peers.join(world, "sim-1", "sim")._assembled.children
+    assert children is not None
+    transport, declared = peers.transports["sim-1"], list[str]()
+    declare = transport.declare_token
+
+    def while_leaving(key: str) -> Any:
+        children.close()
+        token = declare(key)
+        declared.append(key)
+        return token
+
+    monkeypatch.setattr(transport, "declare_token", while_leaving)
+    world.names.append("right")
+    eventually(lambda: declared)
+    eventually(lambda: not shown(peers))
+    assert len(declared) == 1
+
+
+def test_who_hears_a_robot_may_leave_the_mesh_on_the_thread_that_announces_it(peers: Fleet) -> None:
+    _, mesh, _ = joined(peers)
+    left = threading.Event()
+
+    def leave(_: object) -> None:
+        mesh.stop()
+        left.set()
+
+    peers.stranger().declare_subscriber("strands/sim-1__left/presence", leave)
+    eventually(left.is_set)
+    assert shown(peers) == []
 
 
 def test_a_broker_that_pins_a_peer_to_its_topics_is_shown_no_children(

@@ -21,7 +21,7 @@ from strands_robots.mesh.dispatch import Dispatcher
 from strands_robots.mesh.door import PlaneDoor, SafetyDoor
 from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.input_receiver import InputReceiver
-from strands_robots.mesh.presence import Herald
+from strands_robots.mesh.presence import DESCRIBE_S, Herald
 from strands_robots.mesh.recorder import AuditSink, Recorder
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Caller
@@ -48,7 +48,6 @@ logger = logging.getLogger(__name__)
 
 PRUNE_HZ = 1.0
 TOKENS_HZ = 5.0
-DESCRIBE_S = 0.2
 
 
 @dataclass(slots=True)

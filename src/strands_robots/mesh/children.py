@@ -19,7 +19,7 @@ from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.dispatch import Dispatcher, stop_one
 from strands_robots.mesh.executor import Lanes
-from strands_robots.mesh.presence import Herald
+from strands_robots.mesh.presence import DESCRIBE_S, Herald
 from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.serving import Line, MotionDoor, Server
 from strands_robots.mesh.teleop import TeleopDesk
@@ -100,8 +100,14 @@ class _Child:
     context: Context
     herald: Herald
     held: list[Subscription]
-    leaving: threading.Lock = field(default_factory=threading.Lock)
+    begun: float
+    # In memory a heartbeat is delivered on the thread that announces, and who hears it may leave the mesh there.
+    leaving: threading.RLock = field(default_factory=threading.RLock)
     gone: bool = False
+
+    def presentable(self) -> bool:
+        """Whether it may be announced: it has a description, or one that hangs had its time."""
+        return self.herald.described.is_set() or self.context.monotonic() - self.begun >= DESCRIBE_S
 
 
 class Children:
@@ -148,14 +154,15 @@ class Children:
             return
         names = self._world.list_robots()
         wanted = {each: name for name in names[:MOST] if (each := self._id(name))} if len(names) > 1 else {}
-        for peer in [peer for peer in self._children if peer not in wanted]:
-            self._end(self._children.pop(peer))
+        for peer in list(self._children):
+            if peer not in wanted:
+                self._end(peer)
         for peer, name in wanted.items():
             if peer not in self._children and self._open:
-                child = self._begin(peer, name)
-                # Described before the timer's thread announces it.
-                child.herald.refresh()
-                self._children[peer] = child
+                self._children[peer] = self._begin(peer, name)
+                if not self._open:
+                    self._end(peer)
+        # When all have begun: a robot that hangs in its read costs no other its commands.
         for child in list(self._children.values()):
             child.herald.refresh()
 
@@ -163,14 +170,13 @@ class Children:
         for child in list(self._children.values()):
             with child.leaving:
                 # A heartbeat after its token went would have it in reach again.
-                if not child.gone:
+                if not child.gone and child.presentable():
                     child.herald.announce()
 
     def close(self) -> None:
         self._open = False
-        children, self._children = self._children, {}
-        for child in children.values():
-            self._end(child)
+        for peer in list(self._children):
+            self._end(peer)
 
     def _id(self, robot: str) -> str | None:
         peer = f"{self._context.peer_id}__{robot}"
@@ -208,7 +214,7 @@ class Children:
             context, self._lanes, door, self._locked, dispatch, line=self._line.of(name), meant=dispatcher.meant
         )
         held: list[Subscription] = []
-        child = _Child(context, Herald(context, self._kind, robot.facts), held)
+        child = _Child(context, Herald(context, self._kind, robot.facts), held, context.monotonic())
         held.append(transport.declare_subscriber(topics.command(peer), server.on_command))
         held.append(transport.declare_subscriber(topics.broadcast(), server.on_command))
         session = transport.session_id
@@ -216,8 +222,11 @@ class Children:
             held.append(transport.declare_token(topics.token(peer, session)))
         return child
 
-    @staticmethod
-    def _end(child: _Child) -> None:
+    def _end(self, peer: str) -> None:
+        # The sampler and whoever leaves the mesh may both come: the first one ends it.
+        child = self._children.pop(peer, None)
+        if child is None:
+            return
         with child.leaving:
             child.gone = True
         for each in child.held:

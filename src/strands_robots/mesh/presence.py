@@ -17,6 +17,9 @@ from strands_robots.mesh.wire_identity import IdentityError
 
 logger = logging.getLogger(__name__)
 
+DESCRIBE_S = 0.2
+"""How long the first heartbeat waits for what the peer says of itself."""
+
 TOKEN_PATIENCE_S = 0.3
 SAME_LOSS_S = 0.5
 RETURN_S = 2.0
