@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -67,7 +68,8 @@ def run_goal(
                 break
     except BaseException:
         # A Ctrl-C in the wait must not leave the robot on its way.
-        sent.cancel()
+        with contextlib.suppress(RosError):  # what cut the wait off is what is told
+            sent.cancel()
         raise
     problem = _cancelled(sent) if cut else ""
     if sent.rejected:

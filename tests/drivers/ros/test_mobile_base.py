@@ -15,6 +15,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from strands_robots.contract import TaskRobot
+from strands_robots.drivers.ros.burst import Burst
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.drivers.ros.posed_base import PosedBaseRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
@@ -226,6 +227,58 @@ def test_the_tools_are_named_by_the_robot_and_describe_every_parameter(made: Mad
         for name, parameter in spec["inputSchema"]["json"]["properties"].items():
             assert len(parameter["description"]) > 10, name
             assert not parameter["description"].startswith("Parameter")
+
+
+class CutOff(MemoryLink):
+    """A Ctrl-C comes right after a message of this number, counted from 1, went out."""
+
+    def __init__(self, after: int) -> None:
+        super().__init__()
+        self.after = after
+
+    def publish(self, topic: str, kind: str, fields: Mapping[str, Any]) -> None:
+        super().publish(topic, kind, fields)
+        if len(self.sent) == self.after:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("order", "left"), [({"duration": 0.1}, ()), ({}, ("drive",))], ids=["timed", "single"])
+def test_a_drive_that_a_ctrl_c_cuts_off_is_told_as_an_error_and_a_single_shot_of_it_as_going_on(
+    made: Made, order: dict[str, Any], left: tuple[str, ...]
+) -> None:
+    robot = made(CutOff(1))
+    told: list[tuple[str, str, str]] = []
+    robot.subscribe(lambda event: told.append((event.kind, event.state, event.error)))
+    with pytest.raises(KeyboardInterrupt):
+        robot.drive(0.5, **order)
+    assert told[1] == (
+        "finished",
+        "error",
+        f"The drive failed after 0 of {100 if order else 1} messages: it was interrupted.",
+    )
+    assert robot.get_task_status()["task_status"] == "error"
+    assert velocities(memory(robot)) == ([(0.5, 0.0)] if left else [(0.5, 0.0), (0.0, 0.0)])
+    assert robot.halt("test").halted == left
+
+
+def test_a_drive_that_gets_no_thread_is_told_to_be_over_once_the_base_is_free(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, free = made(), list[bool]()
+    begin = robot._begin
+
+    def noting(*asked: Any) -> Any:
+        burst = begin(*asked)
+        assert isinstance(burst, Burst)
+        told = burst.ended.set
+        monkeypatch.setattr(burst.ended, "set", lambda: (free.append(not robot._slot.locked()), told()))
+        return burst
+
+    monkeypatch.setattr(robot, "_begin", noting)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", none_left)
+        assert "could not begin" in robot.start_drive(0.1, 0.0, 0.01)["reason"]
+    assert free == [True]
 
 
 def test_a_drive_that_gets_no_thread_leaves_the_base_free(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:

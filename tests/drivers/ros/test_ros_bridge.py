@@ -15,7 +15,7 @@ from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros import goals, roads
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import Goal, Heard, MemoryLink, Message
+from strands_robots.ros.link import Goal, Heard, MemoryLink, Message, RosError
 from strands_robots.utils import ValidationError
 
 NAV = "/navigate_to_pose"
@@ -164,6 +164,41 @@ def test_a_stop_that_gets_no_thread_to_ask_a_lost_goal_again_revokes_sends_its_z
     assert velocities(memory(robot))[before:] == [(0.0, 0.0)]
     assert verdict.stopped is False
     assert "was not asked again: can't start new thread" in verdict.not_stopped["navigation"]
+
+
+@pytest.mark.parametrize("cut", [KeyboardInterrupt, ValueError])
+def test_a_goal_whose_wait_is_cut_off_is_over_and_in_doubt(
+    made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch, cut: type[BaseException]
+) -> None:
+    begun = stack.begun
+
+    def cut_off(within_s: float) -> bool:
+        raise cut("in the wait")
+
+    def unreachable() -> None:
+        stack.cancels += 1
+        raise RosError("the connection is gone")
+
+    def begun_and_cut_off(goal: Message, feedback: Heard, sent: Goal) -> None:
+        begun(goal, feedback, sent)
+        sent.cancel = unreachable
+        monkeypatch.setattr(sent.done, "wait", cut_off)
+
+    monkeypatch.setattr(stack, "begun", begun_and_cut_off)
+    robot = made()
+    told: list[tuple[str, str]] = []
+    robot.subscribe(lambda event: told.append((event.kind, event.state)))
+    with pytest.raises(cut):
+        robot.navigate_to(1.0, 2.0)
+    assert (robot.get_task_status()["task_status"], stack.cancels) == ("error", 1)
+    assert told == [("started", "running"), ("finished", "error")]
+    verdict = robot.halt("test")
+    assert verdict.stopped is False
+    assert "interrupted" in verdict.not_stopped["navigation"]
+    memory(robot).serve(NAV, begun)
+    stack.at_once = 4
+    assert robot.navigate_to(1.0, 2.0)["goal_state"] == "succeeded"
+    assert robot.halt("test").stopped is True
 
 
 def test_a_stop_cancels_the_goal_and_says_so(made: Made, stack: Stack) -> None:

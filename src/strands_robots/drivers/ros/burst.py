@@ -84,7 +84,6 @@ class Burst:
         self.state = "error"
         self.answer = error(f"The drive could not begin: {why}.", messages=0)
         self._took_s = 0.0
-        self.ended.set()
         return self.answer
 
     def run(self) -> Envelope:
@@ -96,6 +95,9 @@ class Burst:
             self.state = "stopped"
         except Exception as exc:  # noqa: BLE001 - whatever the link raises, the zero still goes out and the answer says so
             problem = str(exc) or type(exc).__name__
+        except BaseException:
+            problem = "it was interrupted"
+            raise
         finally:
             # In a finally, so that a Ctrl-C inside the burst leaves no velocity behind either.
             if self.order.trailing_zero:

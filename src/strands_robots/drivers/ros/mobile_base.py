@@ -328,6 +328,7 @@ class MobileBaseRobot:
         except RuntimeError as exc:
             answer = motion.never_began(str(exc))
             self._slot.release()
+            motion.ended.set()
             self._holds.resume()
             return answer
         return None
@@ -336,8 +337,9 @@ class MobileBaseRobot:
         self._observers.started(burst)
         try:
             answer = burst.run()
-            self._latched = burst.order.latches and not burst.order.zero and burst.state == "completed"
         finally:
+            # A shot that failed, or that a Ctrl-C cut off, may have reached the base all the same.
+            self._latched = burst.order.latches and not burst.order.zero and burst.state != "stopped"
             # The slot first: whoever stopped the drive and waits for its end may drive anew at once.
             self._slot.release()
             burst.ended.set()

@@ -86,6 +86,8 @@ class Navigation:
         if not self.ended.is_set():
             return "the goal is being cancelled, and its server has not told its end"
         report = self.report
+        if report is None and self.answer is None:
+            return "the goal was interrupted, and nobody knows whether it still goes on"
         if report is None or report.over or (report.sent is not None and report.sent.status is not None):
             return None
         return said(report)
@@ -112,7 +114,6 @@ class Navigation:
         self.state = "error"
         self.answer = error(f"The goal could not begin: {why}.", goal_state="not sent")
         self._took_s = 0.0
-        self.ended.set()
         return self.answer
 
     def run(self) -> Envelope:
@@ -131,6 +132,8 @@ class Navigation:
             self.state = "error"
             self.answer = error(f"The goal was not begun: {exc}", goal_state="not sent")
         finally:
+            # A Ctrl-C has left neither a report nor an answer.
+            self.state = "error" if self.state == "running" else self.state
             self._took_s = time.monotonic() - self._began
         return self.answer
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Mapping
 from typing import Literal, Protocol
 
@@ -38,6 +39,8 @@ class Motion(Protocol):
 
 class Unbegun(Protocol):
     """A motion that has leave to begin, and may get no thread to do it on."""
+
+    ended: threading.Event
 
     def never_began(self, why: str) -> Envelope:
         """It ends here; the error to answer."""
