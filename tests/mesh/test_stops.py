@@ -37,6 +37,7 @@ class Hanging(Arm):
 
 def test_a_stop_does_not_wait_for_a_stream_whose_frame_hangs(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
+    monkeypatch.setattr(teleop, "JOIN_S", 60.0)
     arm = Hanging()
     peers.join(arm, "arm-1")
     console, leader = peers.join(None, "console"), peers.join(None, "lead")

@@ -172,8 +172,8 @@ def test_a_halt_on_a_link_that_blocks_answers_in_time_that_it_did_not_stop(
     robot = made(link)
     link.free.clear()
     verdict = robot.halt()
-    assert not link.free.is_set(), "it answered while the link still blocked"
     link.free.set()
+    assert verdict.elapsed_ms < 5000, "it answers by its deadline, and not when its patience ends"
     assert verdict.stopped is False
     assert "in time" in verdict.not_stopped["velocity"]
 
