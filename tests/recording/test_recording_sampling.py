@@ -159,6 +159,27 @@ def test_a_world_records_each_of_its_robots(tmp_path: Path) -> None:
         world.cleanup()
 
 
+def test_a_recording_whose_last_look_fails_still_leaves_the_robot_and_tells_what_it_skipped(
+    arm: HardwareRobot, tmp_path: Path
+) -> None:
+    class Unreadable(Latch):
+        def refusal(self, verb: str) -> Envelope | None:
+            if self.locked:
+                raise OSError("the lockout cannot be read")
+            return None
+
+    path, latch = tmp_path / "run.mcap", Unreadable()
+    arm.gate.attach(latch)
+    with Recorder(path, joints_of_events=False) as recorder:
+        with RobotRecording(arm, recorder, "arm-1") as sampling:
+            sampling.skipped["joints"] += 1
+            latch.locked = True
+        latch.locked = False
+        arm.start_task("wave", duration=0.05)
+        eventually(lambda: arm.get_task_status()["task_status"] != "running")
+    assert [entry.event for entry in read_entries(path)] == ["samplesSkipped"]
+
+
 def test_beats_that_a_slow_camera_skips_are_counted_and_told(arm: HardwareRobot, tmp_path: Path) -> None:
     path, looked = tmp_path / "run.mcap", threading.Event()
 

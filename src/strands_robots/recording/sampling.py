@@ -89,7 +89,7 @@ class RobotRecording:
         for thread in self._threads:
             thread.join()
         # After the thread that looks has ended: of two looks at a time each would tell of the same halt.
-        self._look()
+        self._attempt("gate", self._look)
         self._unsubscribe()
         if self.skipped:
             self._recorder.take(self._device, "samplesSkipped", dict(self.skipped))
