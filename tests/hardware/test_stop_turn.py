@@ -6,6 +6,7 @@ import gc
 import threading
 from collections.abc import Callable
 
+import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
@@ -80,6 +81,34 @@ def test_a_read_that_lost_an_answer_gives_the_bus_to_a_stop_instead_of_asking_ag
         assert device.began == 1, "the exchange that was under way, and no other"
     reader.join(20)
     assert len(failed) == 1
+
+
+def test_a_stop_that_a_ctrl_c_cuts_off_leaves_the_bus_free_and_nobody_waiting_for_it() -> None:
+    class CutOff:
+        """The device's lock; a Ctrl-C comes while it is waited for."""
+
+        def __enter__(self) -> None:
+            raise KeyboardInterrupt
+
+        def __exit__(self, *exc: object) -> None:
+            raise AssertionError
+
+    body = DeviceBody("arm", RecordingDevice())
+    lock = body.lock
+    body.lock = CutOff()
+    with pytest.raises(KeyboardInterrupt), body.stopping():
+        pass
+    assert not body.stop_waits
+    body.lock = lock
+    with pytest.raises(KeyboardInterrupt), body.stopping():
+        assert body.stop_waits
+        raise KeyboardInterrupt
+    assert not body.stop_waits
+    taken = list[bool]()
+    other = threading.Thread(target=lambda: taken.append(lock.acquire(timeout=20)))
+    other.start()
+    other.join(20)
+    assert taken == [True]
 
 
 def test_the_stop_itself_asks_again() -> None:

@@ -162,17 +162,18 @@ class DeviceBody:
         """
         # Halts take turns on the freezer's thread, so that nobody else counts here.
         self._stops += 1
+        counted = 1
         try:
-            self.lock.acquire()
-        except BaseException:
-            self._stops -= 1
-            raise
-        try:
-            yield
+            with self.lock:
+                try:
+                    yield
+                finally:
+                    # Before the bus is free: whoever reads next waits for no stop that is over.
+                    self._stops -= counted
+                    counted = 0
         finally:
-            # Before the bus is free: whoever reads next waits for no stop that is over.
-            self._stops -= 1
-            self.lock.release()
+            # Nothing is left to take off but for a wait for the bus that was cut off.
+            self._stops -= counted
 
     def stop(self) -> None:
         """Freeze, or let go, as the stop level says.
