@@ -145,7 +145,7 @@ class Children:
         self._audit = audit
         self._children: dict[str, _Child] = {}
         self._told: set[str] = set()
-        self._open = True
+        self._closed = threading.Event()
 
     def refresh(self) -> None:
         """Announce the robots that came and take away those that went."""
@@ -158,9 +158,9 @@ class Children:
             if peer not in wanted:
                 self._end(peer)
         for peer, name in wanted.items():
-            if peer not in self._children and self._open:
+            if peer not in self._children and not self._closed.is_set():
                 self._children[peer] = self._begin(peer, name)
-                if not self._open:
+                if self._closed.is_set():
                     self._end(peer)
         # When all have begun: a robot that hangs in its read costs no other its commands.
         for child in list(self._children.values()):
@@ -174,7 +174,7 @@ class Children:
                     child.herald.announce()
 
     def close(self) -> None:
-        self._open = False
+        self._closed.set()
         for peer in list(self._children):
             self._end(peer)
 
