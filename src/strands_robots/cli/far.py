@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
-from strands_robots import settings
 from strands_robots.cli.mesh import joined, own_id
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.envelope import is_error, text_of
@@ -82,10 +81,9 @@ class FarBody:
 def found(mesh: Mesh, peer: str) -> bool:
     """Whether a peer is seen in time, which is longer with stated endpoints."""
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when something is led
-    from strands_robots.mesh.transport.posture import LINKED_S  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport.posture import linked_within_s  # noqa: PLC0415 - as above
 
-    stated = settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT")
-    return wait_for_peer(mesh, peer, LINKED_S if stated else _FOUND_S)
+    return wait_for_peer(mesh, peer, linked_within_s(_FOUND_S))
 
 
 def known_to(follower: str, leader: Any, bounds: Ranges) -> None:

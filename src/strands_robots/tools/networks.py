@@ -186,11 +186,10 @@ def _hear(console: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None
 def _asked(console: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
     """What ``target`` replies, asked when it is in reach or when it is known who is."""
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when it is used
-    from strands_robots.mesh.transport.posture import HEARD_S, LINKED_S  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport.posture import HEARD_S, linked_within_s  # noqa: PLC0415 - as above
 
     time.sleep(HEARD_S)
-    if settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT"):
-        wait_for_peer(console, target, LINKED_S - HEARD_S)
+    wait_for_peer(console, target, linked_within_s(HEARD_S) - HEARD_S)
     return console.send(target, command, seconds)
 
 

@@ -88,6 +88,11 @@ def from_settings() -> Posture:
     )
 
 
+def linked_within_s(otherwise: float) -> float:
+    """How long to wait for a peer to be seen: :data:`LINKED_S` with stated endpoints, else ``otherwise`` seconds."""
+    return LINKED_S if settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT") else otherwise
+
+
 def credentials_from_settings() -> Credentials | None:
     """The three files, checked; None when none of them is stated.
 
