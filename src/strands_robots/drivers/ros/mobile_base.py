@@ -12,7 +12,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.drivers.ros.burst import COUNT_MAX, Burst, Order, messages_for
-from strands_robots.drivers.ros.observers import Observers, Unbegun
+from strands_robots.drivers.ros.observers import Observers, Unbegun, state_of
 from strands_robots.drivers.ros.odometry import Odometry
 from strands_robots.drivers.ros.wire import Hold, Holds, VelocityWire
 from strands_robots.envelope import Envelope, error, success
@@ -225,7 +225,7 @@ class MobileBaseRobot:
         burst = self._burst
         if burst is None:
             return success("Idle.", task_status="idle", instruction="", step_count=0, duration=0.0)
-        state = burst.state if burst.ended.is_set() else "running"
+        state = state_of(burst)
         return success(
             f"The last drive is {state}.",
             task_status=state,

@@ -19,6 +19,7 @@ class Motion(Protocol):
     policy: str
     state: str
     answer: Envelope | None
+    ended: threading.Event
 
     @property
     def instruction(self) -> str:
@@ -37,13 +38,16 @@ class Motion(Protocol):
         """``linear`` in m/s and ``angular`` in rad/s, where those were ordered."""
 
 
-class Unbegun(Protocol):
+class Unbegun(Motion, Protocol):
     """A motion that has leave to begin, and may get no thread to do it on."""
-
-    ended: threading.Event
 
     def never_began(self, why: str) -> Envelope:
         """It ends here; the error to answer."""
+
+
+def state_of(motion: Motion) -> str:
+    """What is told of a motion: ``running`` until the base is free for the next one."""
+    return motion.state if motion.ended.is_set() else "running"
 
 
 class Observers:

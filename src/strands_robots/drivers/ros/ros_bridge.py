@@ -11,6 +11,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.drivers.ros.mobile_base import ANSWER_SHARE, TWIST
 from strands_robots.drivers.ros.navigation import Destination, Navigation
+from strands_robots.drivers.ros.observers import state_of
 from strands_robots.drivers.ros.posed_base import PosedBaseRobot
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
@@ -169,7 +170,7 @@ class RosBridgedRobot(PosedBaseRobot):
         if going is None or self._burst is not None:
             return super().get_task_status()
         latest: Mapping[str, Any] = going.feedback[-1] if going.feedback else {}
-        state = going.state if going.ended.is_set() else "running"
+        state = state_of(going)
         return success(
             f"The last goal is {state}.",
             task_status=state,
