@@ -6,6 +6,5 @@ import pytest
 
 
 @pytest.fixture(autouse=True)
-def patient_halts(monkeypatch: pytest.MonkeyPatch) -> None:
+def patient(patient_halts: None) -> None:
     """A halt has as long as a busy machine takes; where one is to give up, the test says when."""
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")

@@ -75,9 +75,10 @@ def test_a_robot_is_served_until_its_event_and_is_halted_first(patient_halts: No
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_halts_the_robot_and_then_departs(number: signal.Signals, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_halts_the_robot_and_then_departs(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, patient_halts: None
+) -> None:
     monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     process = subprocess.Popen([sys.executable, "-c", SERVE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None

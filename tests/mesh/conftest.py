@@ -13,10 +13,9 @@ from strands_robots.mesh import safety
 
 
 @pytest.fixture
-def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
+def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patient_halts: None) -> Iterator[Fleet]:
     monkeypatch.setenv("STRANDS_MESH_AUDIT_DIR", str(tmp_path / "audit"))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     # Who is there answers when a busy machine lets it; a test with somebody who never does has less patience.
     monkeypatch.setattr(safety, "COLLECT_S", 20.0)
     monkeypatch.setattr(input_module, "_INPUT_JOIN_TIMEOUT_S", 20.0)

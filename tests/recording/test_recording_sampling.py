@@ -52,8 +52,7 @@ class Latch:
 
 
 @pytest.fixture
-def arm(monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
+def arm(patient_halts: None) -> Any:
     robot = HardwareRobot(SeeingDevice(), "arm", control_hz=50)
     robot.connect()
     yield robot

@@ -22,8 +22,7 @@ def patient_files(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def plane(monkeypatch: pytest.MonkeyPatch) -> Iterator[SafetyPlane]:
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
+def plane(patient_halts: None) -> Iterator[SafetyPlane]:
     with own_plane(None) as here:
         yield here
 

@@ -18,11 +18,10 @@ from strands_robots.tools import robot_mesh
 
 
 @pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ToyWorld]:
+def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, patient_halts: None) -> Iterator[ToyWorld]:
     """One toy world, served on a loopback port that the tool uses too."""
     monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     toy = ToyWorld("toys", robots=("left",))
     runtime = init_device_connect_sync(toy, peer_id="toys", link=loopback_config())
     try:
