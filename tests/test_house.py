@@ -13,10 +13,13 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "strands_robots"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
+LINES_MAX = 700
+"""A file is one concept; most are far below this."""
+
 FLOORS: list[set[str]] = [
-    {"envelope", "settings", "utils", "quaternions", "agent_tool", "_mesh_switch"},
+    {"envelope", "errors", "settings", "utils", "quaternions", "agent_tool", "_mesh_switch"},
     {"safety", "audit", "contract"},
-    {"policies", "rollout", "teleop", "teleop_mixin", "leaders", "recording", "cameras"},
+    {"policies", "rollout", "teleop", "teleop_mixin", "teleoperators", "leaders", "recording", "cameras"},
     {
         "hardware",
         "simulation",
@@ -27,6 +30,7 @@ FLOORS: list[set[str]] = [
         "hardware_rtps_bridge",
         "bus_access",
     },
+    {"serving"},
     {"device_connect", "mesh", "mesh_session"},
     {"cli", "tools", "robot"},
 ]
@@ -86,7 +90,7 @@ def test_device_connect_and_the_mesh_never_import_one_another() -> None:
 def test_every_file_is_short_enough_to_hold_in_the_head() -> None:
     folders = ("src", "tests", "fixtures", "benchmarks", "examples", "scripts")
     files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
-    long = {relative(path): count for path in files if (count := len(path.read_text("utf-8").splitlines())) > 400}
+    long = {relative(path): count for path in files if (count := len(path.read_text("utf-8").splitlines())) > LINES_MAX}
     assert files
     assert not long
 

@@ -12,6 +12,8 @@ import math
 import re
 from typing import Any
 
+from strands_robots.errors import StrandsRobotsError
+
 IDENTIFIER_MAX = 128
 """Longest peer id and message identifier, in characters (the mesh wire's bound)."""
 
@@ -21,7 +23,7 @@ _HOSTNAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_
 _SHOWN_MAX = 80
 
 
-class ValidationError(ValueError):
+class ValidationError(StrandsRobotsError, ValueError):
     """A value outside its domain. ``code`` is for machines, the message for people."""
 
     def __init__(self, message: str, code: str = "INVALID") -> None:
@@ -29,7 +31,7 @@ class ValidationError(ValueError):
         self.code = code
 
 
-class MissingExtraError(ImportError):
+class MissingExtraError(StrandsRobotsError, ImportError):
     """An optional dependency is not installed; the message says which extra brings it."""
 
 
