@@ -13,7 +13,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import DeviceBody
 from strands_robots.hardware.freezer import Freezer, NoAnswerError
 from strands_robots.policies.registry import create_policy, resolve_provider
-from strands_robots.rollout import Observers, Rollout, loop_options
+from strands_robots.policies.rollout import Observers, Rollout, loop_options
 from strands_robots.safety.gate import MotionGate, MotionRefused, Waiting
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole

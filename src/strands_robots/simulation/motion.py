@@ -12,7 +12,7 @@ from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.registry import create_policy
-from strands_robots.rollout import STOP_JOIN_S, Observers, Rollout, loop_options
+from strands_robots.policies.rollout import STOP_JOIN_S, Observers, Rollout, loop_options
 from strands_robots.safety.gate import Waiting
 from strands_robots.simulation.arguments import answered
 from strands_robots.simulation.body import RobotBody

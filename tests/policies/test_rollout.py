@@ -12,7 +12,7 @@ from fixtures.bodies import RecordingBody, ScriptedPolicy, StepClock
 from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
-from strands_robots.rollout import Clock, Observers, Rollout, loop_options
+from strands_robots.policies.rollout import Clock, Observers, Rollout, loop_options
 from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError
 
@@ -173,7 +173,7 @@ def test_an_observer_that_raises_harms_neither_the_loop_nor_the_others(caplog: p
     one, _ = run(ScriptedPolicy([{"a": 0.1}] * 5), observers=observers)
     assert one.state == "completed"
     assert len(seen) == 7
-    assert len([record for record in caplog.records if record.name == "strands_robots.rollout"]) == 1
+    assert len([record for record in caplog.records if record.name == "strands_robots.policies.rollout"]) == 1
 
 
 def test_an_observer_that_unsubscribed_is_told_no_more() -> None:
