@@ -15,9 +15,9 @@ from fixtures.devices import RecordingDevice
 from mcap.writer import Writer
 
 from benchmarks.table import Row
-from strands_robots.cameras import jpeg
 from strands_robots.hardware import HardwareRobot
 from strands_robots.recording import Entry, Joints, Picture, Recorder, RobotRecording, read_items
+from strands_robots.recording.cameras import jpeg
 
 ARMS, HZ, CAMERA_HZ = 8, 50.0, 15.0
 WIDTH, HEIGHT = 320, 240

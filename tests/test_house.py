@@ -19,7 +19,7 @@ LINES_MAX = 700
 FLOORS: list[set[str]] = [
     {"envelope", "errors", "settings", "utils", "quaternions", "agent_tool", "_mesh_switch"},
     {"safety", "audit", "contract"},
-    {"policies", "teleop", "teleop_mixin", "teleoperators", "leaders", "recording", "cameras"},
+    {"policies", "teleop_mixin", "teleoperators", "recording"},
     {
         "hardware",
         "simulation",

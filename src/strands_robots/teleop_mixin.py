@@ -13,7 +13,7 @@ from typing import Any
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import STOP_JOIN_S, Body, Observers, Rollout
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, Waiting
-from strands_robots.teleop import FULL_RANGES_PER_S, InputSink, LeaderPolicy
+from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
 
 _LATE = "the loop still waits for its leader; it sends no action any more"

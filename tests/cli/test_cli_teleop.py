@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.cli.conftest import Run
 
-from strands_robots.leaders import write_csv
+from strands_robots.teleoperators.recorded import write_csv
 
 
 def test_a_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) -> None:

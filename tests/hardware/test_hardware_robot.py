@@ -18,7 +18,7 @@ from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware import robot as robots
 from strands_robots.policies import registry
-from strands_robots.teleop import ScriptedLeader
+from strands_robots.teleoperators.leader import ScriptedLeader
 from strands_robots.utils import ValidationError
 
 WAVES = {"pan.pos": (0.0, 50.0, 1.0), "lift.pos": (0.0, 50.0, 1.0), "grip.pos": (50.0, 40.0, 1.0)}

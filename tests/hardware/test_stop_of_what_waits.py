@@ -14,7 +14,7 @@ from fixtures.waiting import eventually
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot, tasks
 from strands_robots.safety.gate import Permit
-from strands_robots.teleop import ScriptedLeader
+from strands_robots.teleoperators.leader import ScriptedLeader
 
 WAVES = {"pan.pos": (0.0, 50.0, 1.0)}
 

@@ -13,7 +13,7 @@ from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.teleop import LeaderPolicy, ScriptedLeader
+from strands_robots.teleoperators.leader import LeaderPolicy, ScriptedLeader
 
 WAVES = {"pan.pos": (20.0, 50.0, 1.0), "lift.pos": (20.0, 50.0, 1.0)}
 

@@ -11,7 +11,7 @@ from tests.mesh.peers import Fleet
 from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.mesh.input_sink import MeshInputSink
-from strands_robots.teleop import ScriptedLeader
+from strands_robots.teleoperators.leader import ScriptedLeader
 
 
 def test_the_frames_of_a_local_leader_move_a_follower_elsewhere(peers: Fleet) -> None:

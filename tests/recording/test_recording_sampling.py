@@ -12,12 +12,12 @@ import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
-from strands_robots.cameras import chosen_frames, frames_of
 from strands_robots.envelope import Envelope, error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.recording import Entry, Joints, Picture, Recorder, RobotRecording, read_entries, read_items
+from strands_robots.recording.cameras import chosen_frames, frames_of
 from strands_robots.simulation import Simulation
-from strands_robots.teleop import ScriptedLeader
+from strands_robots.teleoperators.leader import ScriptedLeader
 from strands_robots.utils import ValidationError
 
 pytest.importorskip("mcap")

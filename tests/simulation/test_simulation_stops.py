@@ -13,7 +13,7 @@ from fixtures.waiting import eventually
 from strands_robots.envelope import error
 from strands_robots.safety.gate import Permit
 from strands_robots.simulation import Simulation, motion
-from strands_robots.teleop import ScriptedLeader
+from strands_robots.teleoperators.leader import ScriptedLeader
 
 pytestmark = pytest.mark.usefixtures("patient_halts")
 

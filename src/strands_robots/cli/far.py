@@ -12,12 +12,12 @@ from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.envelope import is_error, text_of
 from strands_robots.policies.actions import numbers
 from strands_robots.policies.base import Ranges
-from strands_robots.teleop import LeaderPolicy
+from strands_robots.teleoperators.leader import LeaderPolicy
 from strands_robots.utils import ValidationError, number
 
 if TYPE_CHECKING:
-    from strands_robots.leaders import BoundedLeader
     from strands_robots.mesh import Mesh
+    from strands_robots.teleoperators.leader import BoundedLeader
 
 MESH = "mesh:"
 """What stands before the name of a follower on the mesh."""
@@ -128,8 +128,8 @@ def lead_far(
     Raises:
         Failure: it was refused, it failed, or the follower did not confirm its stop.
     """
-    from strands_robots.leaders import BoundedLeader  # noqa: PLC0415 - loaded when something is led
     from strands_robots.mesh.input import InputPublisher  # noqa: PLC0415 - as above
+    from strands_robots.teleoperators.leader import BoundedLeader  # noqa: PLC0415 - loaded when something is led
 
     rate, speed = number("hz", hz, low=1, high=1000), number("max_speed", max_speed, above=0, high=20)
     with joined(None, own_id("lead"), "tool") as mesh:

@@ -11,7 +11,7 @@ from strands_robots.cli.mesh import joined
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.policies.actions import SpeedLimit, checked_action
 from strands_robots.policies.base import Ranges
-from strands_robots.teleop import UNBOUNDED_PER_S, LeaderDone
+from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, LeaderDone
 from strands_robots.utils import ValidationError, number
 
 NOBODY = "none"

@@ -7,9 +7,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from strands_robots.cameras import chosen_frames
 from strands_robots.cli.output import Failure, Screen, table
 from strands_robots.recording import Recorder, RobotRecording
+from strands_robots.recording.cameras import chosen_frames
 
 NO_CAMERAS = "none"
 

@@ -21,7 +21,7 @@ from strands_robots.cli.published import NOBODY, NoBody, follow_far, publish_far
 from strands_robots.cli.recorded import recorded
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.teleop import FULL_RANGES_PER_S
+from strands_robots.teleoperators.leader import FULL_RANGES_PER_S
 from strands_robots.utils import ValidationError, identifier
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ def calibrate(
 def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
     """The leader of that name, ready to lead ``robot``."""
     if leader in _METHODS:
-        from strands_robots.leaders import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
+        from strands_robots.teleoperators.manual import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
 
         body = robot.body()
         present = body.get_joints()
@@ -271,8 +271,8 @@ def recording(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
         ValidationError: it cannot be read, or it has no actions of that device.
         MissingExtraError: what reads it is not installed.
     """
-    from strands_robots.leaders import RecordedLeader, read_episode, read_frames  # noqa: PLC0415 - as above
     from strands_robots.recording import recorded_actions  # noqa: PLC0415
+    from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames  # noqa: PLC0415 - as above
 
     if path.suffix == ".mcap":
         frames = recorded_actions(path, device)

@@ -12,13 +12,13 @@ from typing import Any, cast
 
 from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
-from strands_robots.cameras import Shots
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
 from strands_robots.hardware.motors import joint_units, tells_temperature, temperatures
 from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks, ended
 from strands_robots.policies.actions import checked_action
+from strands_robots.recording.cameras import Shots
 from strands_robots.safety.gate import MotionRefused, Permit, PermitVoidError
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stopping import StopVerdict, halt_each

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
-from strands_robots.cameras import frames_of
 from strands_robots.contract import WorldRobot
 from strands_robots.mesh import session, topics
 from strands_robots.mesh.camera import CameraFeed
@@ -36,6 +35,7 @@ from strands_robots.mesh.teleop import TeleopDesk, join
 from strands_robots.mesh.transport.base import Transport
 from strands_robots.mesh.transport.posture import Posture, credentials_from_settings
 from strands_robots.mesh.wire_identity import Identity, demanded, from_settings
+from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.halting import halt_of
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane

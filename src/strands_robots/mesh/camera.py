@@ -9,10 +9,10 @@ import time
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.cameras import Frames, jpeg
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.topics import camera as camera_topic
+from strands_robots.recording.cameras import Frames, jpeg
 from strands_robots.utils import identifier, shown
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ import pytest
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
 
-from strands_robots.leaders import write_csv
+from strands_robots.teleoperators.recorded import write_csv
 
 Join = Callable[..., MeshPeer]
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from fixtures.waiting import free_port
 
-from strands_robots.leaders import write_csv
 from strands_robots.mesh import keys
+from strands_robots.teleoperators.recorded import write_csv
 
 pytest.importorskip("cryptography")
 

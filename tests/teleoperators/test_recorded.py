@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.leaders import read_episode
+from strands_robots.teleoperators.recorded import read_episode
 from strands_robots.utils import ValidationError
 
 pyarrow = pytest.importorskip("pyarrow")

@@ -13,8 +13,9 @@ from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.leaders import GamepadLeader, KeyboardLeader, RecordedLeader, read_frames, write_csv
-from strands_robots.teleop import LeaderDone
+from strands_robots.teleoperators.leader import LeaderDone
+from strands_robots.teleoperators.manual import GamepadLeader, KeyboardLeader
+from strands_robots.teleoperators.recorded import RecordedLeader, read_frames, write_csv
 from strands_robots.utils import ValidationError
 
 START = {"pan.pos": 0.0, "grip.pos": 50.0}

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.leaders import BoundedLeader
-from strands_robots.teleop import LeaderDone, LeaderPolicy
+from strands_robots.teleoperators.leader import BoundedLeader, LeaderDone, LeaderPolicy
 from strands_robots.utils import ValidationError
 
 RANGES = {"pan.pos": (-100.0, 100.0)}

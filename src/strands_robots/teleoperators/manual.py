@@ -1,0 +1,223 @@
+"""Keyboard and gamepad leaders, which jog the joints of a follower.
+
+Source of the joystick format: Linux, ``Documentation/input/joydev/joystick-api.rst``: events of eight bytes, ``u32
+time`` in milliseconds, ``s16 value``, ``u8 type`` (1 button, 2 axis, with 0x80 for the state at opening), ``u8
+number``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import struct
+import sys
+import termios
+import time
+import tty
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from strands_robots.policies.base import Action, Ranges
+from strands_robots.teleoperators.leader import LeaderDone
+from strands_robots.utils import ValidationError
+
+SHARE_PER_S = 0.25
+"""Part of a joint's whole range that a key held down, or a stick pushed to its end, crosses in a second."""
+
+UNBOUNDED_PER_S = 45.0
+"""The same for a joint without a range, in its unit a second."""
+
+UP, DOWN = "qwertyuiop", "asdfghjkl;"
+"""The key of each joint, in their order, that raises and lowers it."""
+
+STEP_S = 0.1
+"""One press moves a joint as far as a held one goes in so long."""
+
+_END = "\x1b\x03\x04"
+
+PORT = "/dev/input/js0"
+DEAD_ZONE = 0.1
+"""Part of a stick's way that is taken for rest."""
+
+_EVENT = struct.Struct("<IhBB")
+_BUTTON, _AXIS, _OPENING = 1, 2, 0x80
+_END_BUTTON = 1
+_FULL = 32767
+_GAP_MAX_S = 0.1
+
+
+class Jog:
+    """The targets of some joints, each moved by itself and kept inside its range.
+
+    Args:
+        start: where they stand, by action key, in the follower's units.
+        ranges: lowest and highest target by action key; what is not named is unbounded.
+    """
+
+    def __init__(self, start: Mapping[str, float], ranges: Ranges) -> None:
+        if not start:
+            raise ValidationError("start must hold at least one joint to lead.")
+        self.keys = tuple(start)
+        self._targets = dict(start)
+        self._ranges = {key: ranges.get(key, (-math.inf, math.inf)) for key in start}
+
+    @property
+    def targets(self) -> Action:
+        """Every target as it is now."""
+        return dict(self._targets)
+
+    def move(self, key: str, push: float, seconds: float) -> None:
+        """Push a joint for so long; ``push`` is -1 to 1."""
+        low, high = self._ranges[key]
+        speed = (high - low) * SHARE_PER_S if math.isfinite(high - low) else UNBOUNDED_PER_S
+        self._targets[key] = min(max(self._targets[key] + push * speed * seconds, low), high)
+
+
+class KeyboardLeader:
+    """Reads single keys of a terminal while it is entered as a context; Escape or Ctrl-D ends the leading.
+
+    Args:
+        start: where the follower stands, by action key; at most ten joints.
+        ranges: of the follower's action keys.
+        fd: the terminal; standard input by default.
+
+    Raises:
+        ValidationError: too many joints, or ``fd`` is no terminal.
+    """
+
+    def __init__(self, start: Mapping[str, float], ranges: Ranges, fd: int | None = None) -> None:
+        if len(start) > len(UP):
+            raise ValidationError(f"start must hold at most {len(UP)} joints, not {len(start)}.")
+        self._fd = sys.stdin.fileno() if fd is None else fd
+        if not os.isatty(self._fd):
+            raise ValidationError("keyboard needs a terminal; standard input is none.")
+        self._jog = Jog(start, ranges)
+        self._pushes = {up: (key, 1.0) for up, key in zip(UP, self._jog.keys, strict=False)}
+        self._pushes |= {down: (key, -1.0) for down, key in zip(DOWN, self._jog.keys, strict=False)}
+        self._before: list[int | list[bytes | int]] | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the terminal gives single keys."""
+        return self._before is not None
+
+    @property
+    def help(self) -> list[tuple[str, str, str]]:
+        """For each joint: its name, the key that raises it and the one that lowers it."""
+        return [(key, UP[index], DOWN[index]) for index, key in enumerate(self._jog.keys)]
+
+    def __enter__(self) -> Self:
+        self._before = termios.tcgetattr(self._fd)
+        tty.setcbreak(self._fd)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        before, self._before = self._before, None
+        if before is not None:
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, before)
+
+    def get_action(self) -> Action:
+        """Every target, after the keys that were pressed since.
+
+        Raises:
+            LeaderDone: Escape or Ctrl-D was pressed.
+        """
+        while select.select([self._fd], [], [], 0)[0]:
+            pressed = os.read(self._fd, 64).decode("ascii", "ignore")
+            if not pressed:
+                break
+            for char in pressed:
+                if char in _END:
+                    raise LeaderDone("the keyboard ended it")
+                if char.lower() in self._pushes:
+                    key, push = self._pushes[char.lower()]
+                    self._jog.move(key, push, STEP_S)
+        return self._jog.targets
+
+
+class GamepadLeader:
+    """Axis 0 pushes the first joint, axis 1 the second and so on; button 1 ends the leading.
+
+    Args:
+        start: where the follower stands, by action key.
+        ranges: of the follower's action keys.
+        port: the joystick device.
+        now: monotonic seconds.
+
+    Raises:
+        ValidationError: the device cannot be opened.
+    """
+
+    def __init__(
+        self,
+        start: Mapping[str, float],
+        ranges: Ranges,
+        port: str = PORT,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._jog = Jog(start, ranges)
+        self._now = now
+        self._at: float | None = None
+        self._pushes: dict[int, float] = {}
+        self._buttons: dict[int, bool] = {}
+        try:
+            self._fd: int | None = os.open(port, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as exc:
+            raise ValidationError(f"gamepad {port!r} cannot be opened: {exc.strerror}.") from exc
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the device is open."""
+        return self._fd is not None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        fd, self._fd = self._fd, None
+        if fd is not None:
+            os.close(fd)
+
+    def get_action(self) -> Action:
+        """Every target, pushed by the sticks for the time since the last call, of which at most 0.1 s counts.
+
+        Raises:
+            LeaderDone: button 1 was pressed.
+            OSError: the gamepad was unplugged.
+        """
+        self._read()
+        if self._buttons.get(_END_BUTTON):
+            raise LeaderDone("the gamepad ended it")
+        now = self._now()
+        seconds = 0.0 if self._at is None else min(now - self._at, _GAP_MAX_S)
+        self._at = now
+        for axis, push in self._pushes.items():
+            if axis < len(self._jog.keys) and abs(push) > DEAD_ZONE:
+                self._jog.move(self._jog.keys[axis], push, seconds)
+        return self._jog.targets
+
+    def get_teleop_events(self) -> dict[str, Any]:
+        """The buttons by number."""
+        return {f"button_{number}": pressed for number, pressed in self._buttons.items()}
+
+    def _read(self) -> None:
+        if self._fd is None:
+            raise ConnectionError("the gamepad is closed")
+        while True:
+            try:
+                data = os.read(self._fd, _EVENT.size * 64)
+            except BlockingIOError:
+                return
+            for _, value, kind, number in _EVENT.iter_unpack(data[: len(data) // _EVENT.size * _EVENT.size]):
+                if kind & ~_OPENING == _AXIS:
+                    self._pushes[number] = max(value / _FULL, -1.0)
+                elif kind & ~_OPENING == _BUTTON:
+                    self._buttons[number] = bool(value)
+            if len(data) < _EVENT.size * 64:
+                return
