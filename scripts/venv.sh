@@ -9,7 +9,7 @@ want=$(cat "$lock" pyproject.toml | sha256sum)
 [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$want" ] && exit 0
 python=${PYTHON:-python3}
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
-  echo "strands-robots needs Python 3.11 or newer; $python is $("$python" -V). Set PYTHON to a newer one." >&2
+  echo "strands-robots-edge needs Python 3.11 or newer; $python is $("$python" -V). Set PYTHON to a newer one." >&2
   exit 1
 }
 if [ ! -x "$dir/bin/pip" ]; then
@@ -18,6 +18,8 @@ if [ ! -x "$dir/bin/pip" ]; then
 fi
 echo "Installing into $dir (once; about a minute)..."
 "$dir/bin/pip" install --quiet --disable-pip-version-check --no-deps --require-hashes -r "$lock"
+# Before it had a name of its own, this project was installed as strands-robots, which is another project's name.
+"$dir/bin/pip" uninstall --quiet --quiet --yes strands-robots
 "$dir/bin/pip" install --quiet --disable-pip-version-check --no-deps --editable .
 rm -f "$dir"/.installed-*
 echo "$want" >"$stamp"

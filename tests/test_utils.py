@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import string
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -172,6 +173,13 @@ def test_a_missing_extra_is_one_sentence_that_names_it() -> None:
     error = utils.missing_extra("A simulated robot", "sim")
     assert str(error) == "A simulated robot needs the [sim] extra: in the clone, .venv/bin/pip install -e '.[sim]'."
     assert isinstance(error, ImportError)
+
+
+def test_outside_a_clone_an_extra_is_installed_by_the_name_of_our_own_distribution(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(utils, "__file__", str(tmp_path / "site-packages" / "strands_robots" / "utils.py"))
+    assert utils.install_line("sim") == "pip install 'strands-robots-edge[sim]'"
 
 
 def test_a_leader_needs_a_callable_get_action() -> None:

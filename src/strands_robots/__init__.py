@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
+__version__ = "0.1.0"
+
 TYPE_CHECKING = False  # importing typing would be most of this import's time
 if TYPE_CHECKING:
     from typing import Any
@@ -14,8 +16,6 @@ if TYPE_CHECKING:
     from strands_robots.hardware import HardwareRobot
     from strands_robots.robot import Robot, run
     from strands_robots.simulation import Simulation
-
-    __version__: str
 
 __all__ = ["HardwareRobot", "Robot", "Simulation", "__version__", "run"]
 
@@ -29,8 +29,6 @@ _SIM_PACKAGES = ("mujoco", "numpy", "PIL")
 
 
 def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        return import_module("importlib.metadata").version("strands-robots")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

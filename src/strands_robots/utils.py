@@ -10,9 +10,13 @@ from __future__ import annotations
 import ipaddress
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 from strands_robots.errors import StrandsRobotsError
+
+DISTRIBUTION = "strands-robots-edge"
+"""Name of this project on a package index; ``strands-robots`` is another project's."""
 
 IDENTIFIER_MAX = 128
 """Longest peer id and message identifier, in characters (the mesh wire's bound)."""
@@ -36,8 +40,10 @@ class MissingExtraError(StrandsRobotsError, ImportError):
 
 
 def install_line(extra: str) -> str:
-    """How an extra is added; from a clone, because the distribution is not published."""
-    return f"in the clone, .venv/bin/pip install -e '.[{extra}]'"
+    """Return the command that adds an extra to this installation: a clone, or an installed distribution."""
+    if (Path(__file__).resolve().parents[2] / "pyproject.toml").is_file():
+        return f"in the clone, .venv/bin/pip install -e '.[{extra}]'"
+    return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
 def missing_extra(what: str, extra: str) -> MissingExtraError:

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
+import sys
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -10,8 +12,9 @@ import pytest
 from click.testing import Result
 from fixtures.certificates import Authority
 
+from strands_robots import __version__
 from strands_robots.cli import checks
-from strands_robots.cli.checks import certificate_error
+from strands_robots.cli.checks import certificate_error, other_owners
 
 Run = Callable[..., Result]
 
@@ -96,3 +99,57 @@ def test_people_get_a_table_and_a_verdict(run: Run) -> None:
     result = run("doctor")
     assert result.exit_code == 0
     assert "Everything that is required works." in result.stdout
+
+
+def installed(folder: Path, name: str, *files: str) -> Path:
+    """Make the metadata of a distribution in ``folder``, as pip leaves it in a site-packages folder."""
+    metadata = folder / f"{name.replace('-', '_')}-0.4.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.4.0\n")
+    (metadata / "RECORD").write_text("".join(f"{file},sha256=x,1\n" for file in files))
+    return folder
+
+
+def test_only_another_distribution_with_our_import_package_is_an_owner(tmp_path: Path) -> None:
+    installed(tmp_path, "strands-robots", "strands_robots/__init__.py", "strands_robots/robot.py")
+    installed(tmp_path, "strands-robots-edge", "strands_robots/__init__.py")
+    installed(tmp_path, "strands-robots-sim", "strands_robots_sim/__init__.py", "docs/strands_robots/__init__.py")
+    assert other_owners([str(tmp_path)]) == ["strands-robots 0.4.0"]
+
+
+def test_doctor_warns_of_another_owner_of_the_import_package(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, "strands-robots", "strands_robots/__init__.py")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    found = checked(run("doctor", "--json"))["distribution"]
+    assert found["mark"] == "warn"
+    assert "strands-robots 0.4.0" in found["said"]
+    assert "pip uninstall strands-robots" in found["remedy"]
+
+
+def test_a_command_starts_with_one_warning_line_about_another_owner(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "Warning" not in run("audit", "tail").stderr
+    installed(tmp_path, "strands-robots", "strands_robots/__init__.py")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    warnings = [line for line in run("audit", "tail").stderr.splitlines() if line.startswith("Warning")]
+    assert len(warnings) == 1
+    assert "strands-robots 0.4.0" in warnings[0]
+
+
+def test_version_is_printed_with_the_name_of_the_distribution(run: Run) -> None:
+    result = run("--version")
+    assert result.exit_code == 0
+    assert result.stdout == f"strands-robots-edge {__version__}\n"
+    assert re.fullmatch(r"\d+\.\d+\.\d+", __version__)
+
+
+def test_doctor_names_the_distribution_also_where_it_is_not_installed(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checks, "_version", lambda name: None if name == "strands-robots-edge" else "0.2.5")
+    found = checked(run("doctor", "--json"))["distribution"]
+    assert found["mark"] == "ok"
+    assert found["said"] == f"strands-robots-edge {__version__}, run from its source tree"

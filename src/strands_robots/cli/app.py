@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
+from strands_robots import __version__
 from strands_robots.cli import (
     audit,
     demo,
@@ -20,11 +23,31 @@ from strands_robots.cli import (
     teleop,
     watch,
 )
+from strands_robots.cli.checks import other_owners, owner_remedy
+from strands_robots.utils import DISTRIBUTION
 
 HELP = """Robots on Device Connect: serve one, find them, drive them, and always stop them.
 
 Without network flags everything stays on this machine. Exit codes: 0 done, 1 refused or failed,
 2 wrong usage, 3 nobody answered, 130 Ctrl-C."""
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"{DISTRIBUTION} {__version__}")
+        raise typer.Exit
+
+
+def _start(
+    version: Annotated[
+        bool,
+        typer.Option("--version", is_eager=True, callback=_print_version, help="Print name and version, and exit."),
+    ] = False,
+) -> None:
+    others = [] if version else other_owners()
+    if others:
+        owners = f"{', '.join(others)} also installs the import package strands_robots"
+        typer.echo(f"Warning: {owners}, so its code may run instead. Remedy: {owner_remedy(others)}.", err=True)
 
 
 def build() -> typer.Typer:
@@ -37,6 +60,7 @@ def build() -> typer.Typer:
         # A traceback with local variables could print keys.
         pretty_exceptions_enable=False,
     )
+    app.callback()(_start)
     for module in (
         serve,
         fleet,

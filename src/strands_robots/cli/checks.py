@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from enum import Enum
@@ -13,11 +14,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from strands_robots import settings
+from strands_robots import __version__, settings
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import Failure
 from strands_robots.safety.approval import state_dir
-from strands_robots.utils import MissingExtraError, ValidationError, install_line
+from strands_robots.utils import DISTRIBUTION, MissingExtraError, ValidationError, install_line
 
 FRAMEWORK = "0.2.5"
 """The release of device-connect-edge that the backends are written for."""
@@ -39,6 +40,8 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "mesh": ("eclipse-zenoh", "cryptography"),
     "iot": ("awsiotsdk",),
 }
+_IMPORT_PACKAGE = "strands_robots"
+_OWNS = re.compile(rf"^(\.\./)*{_IMPORT_PACKAGE}/__init__\.py\b", re.MULTILINE)
 _REQUIRED = ("device-connect",)
 _RENDER_S = 20.0
 
@@ -83,6 +86,7 @@ def examine(network: Network) -> list[Finding]:
     """Run every check, in the order of the report."""
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
         _python,
+        _distribution,
         _packages,
         lambda: _network(network),
         lambda: _meeting_port(network),
@@ -97,6 +101,38 @@ def examine(network: Network) -> list[Finding]:
 
 def _python() -> Iterator[Finding]:
     yield Finding("python", Mark.OK, sys.version.split()[0])
+
+
+def _distribution() -> Iterator[Finding]:
+    others = other_owners()
+    if others:
+        said = f"{', '.join(others)} also installs the import package {_IMPORT_PACKAGE}"
+        yield Finding("distribution", Mark.WARN, said, owner_remedy(others))
+        return
+    installed = _version(DISTRIBUTION)
+    said = f"{DISTRIBUTION} {__version__}"
+    yield Finding("distribution", Mark.OK, said if installed else f"{said}, run from its source tree")
+
+
+def other_owners(path: Sequence[str] | None = None) -> list[str]:
+    """Return name and version of every other distribution on ``path`` that installs our import package.
+
+    The lists of installed files are searched as text, in about 5 ms: ``importlib.metadata.packages_distributions``
+    parses all of them in about 100 ms, which every command would pay.
+    """
+    found = set()
+    for installed in metadata.distributions(path=list(sys.path if path is None else path)):
+        files = installed.read_text("RECORD") or installed.read_text("installed-files.txt") or ""
+        name = installed.metadata["Name"] if _OWNS.search(files) else None
+        if name and name.lower().replace("_", "-") != DISTRIBUTION:
+            found.add(f"{name} {installed.version}")
+    return sorted(found)
+
+
+def owner_remedy(others: Sequence[str]) -> str:
+    """Return the commands that leave this project as the only owner of its import package."""
+    names = " ".join(other.split()[0] for other in others)
+    return f"pip uninstall {names}, then reinstall {DISTRIBUTION} (pip install --force-reinstall --no-deps)"
 
 
 def _packages() -> Iterator[Finding]:
