@@ -10,7 +10,8 @@ from fixtures.devices import RecordingDevice
 from strands_robots.cli.far import found
 from strands_robots.cli.published import Glide
 from strands_robots.hardware import HardwareRobot
-from strands_robots.mesh.transport import posture, zenoh_config
+from strands_robots.mesh.transport import zenoh_config
+from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.utils import ValidationError
 
 
@@ -27,7 +28,7 @@ def test_a_peer_is_waited_for_as_long_as_its_link_may_pause(monkeypatch: pytest.
     assert found(console, "arm-1")
     monkeypatch.setenv(stated, "tcp/127.0.0.1:7447")
     assert found(console, "arm-1")
-    retry = zenoh_config.explicit(posture.from_settings())["connect"]["retry"]
+    retry = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]
     assert waited[0] < retry["period_max_ms"] / 1000 < waited[1]
 
 

@@ -10,8 +10,8 @@ import pytest
 from fixtures.waiting import eventually
 from tests.mesh.peers import Clock
 
+from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport import bridge as bridges
-from strands_robots.mesh.transport.base import TransportError
 from strands_robots.mesh.transport.bridge import BridgeTransport, Near, Seen
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 

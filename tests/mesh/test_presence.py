@@ -17,8 +17,8 @@ from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
 from strands_robots.mesh.presence import Herald
 from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport import bridge as bridges
-from strands_robots.mesh.transport.base import TransportError
 from strands_robots.mesh.transport.bridge import BridgeTransport
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity

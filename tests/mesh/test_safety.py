@@ -14,7 +14,7 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.mesh import safety
 from strands_robots.mesh.resume_authority import keygen, load_signing_key, main
-from strands_robots.mesh.transport.base import Sample
+from strands_robots.mesh.transport import Sample
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
 

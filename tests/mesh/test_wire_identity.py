@@ -140,7 +140,7 @@ def test_any_unknown_word_demands_signatures_on_every_road_and_is_warned_of_once
     required: bool,
 ) -> None:
     monkeypatch.setenv("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY", word)
-    wire_identity._taken_as_one.cache_clear()
+    wire_identity._unknown_policy.cache_clear()
     broker = MemoryTransport(MemoryBus(), sessionless=True)
     assert [identity_of(broker).required for _ in range(3)] == [required] * 3
     assert len([each for each in caplog.records if "taken as 1" in each.getMessage()]) == (word not in "01")

@@ -12,7 +12,8 @@ from fixtures.waiting import eventually
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.mesh import init_mesh, safety
 from strands_robots.mesh.session import clear_peers
-from strands_robots.mesh.transport import posture, zenoh_config
+from strands_robots.mesh.transport import zenoh_config
+from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.networks import DeviceConnect, NativeMesh, verdict_of
 
@@ -129,7 +130,7 @@ def test_with_device_connect_off_the_native_mesh_is_used(monkeypatch: pytest.Mon
 def on_the_mesh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
-    monkeypatch.setattr(posture, "HEARD_S", 0.1)
+    monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 0.1)
     monkeypatch.setattr(networks, "STOP_S", 20.0)
     monkeypatch.setattr(safety, "COLLECT_S", 20.0)
     clear_peers()
@@ -173,8 +174,8 @@ def test_robots_on_the_mesh_are_found_told_and_stopped_by_name(on_the_mesh: None
 
 
 def test_a_link_to_a_stated_endpoint_is_waited_for_longer_than_it_pauses() -> None:
-    pause = zenoh_config.explicit(posture.from_settings())["connect"]["retry"]["period_max_ms"] / 1000
-    assert pause + posture.HEARD_S < posture.LINKED_S
+    pause = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]["period_max_ms"] / 1000
+    assert pause + zenoh_config.DISCOVERY_S < zenoh_config.LINK_DISCOVERY_S
 
 
 class Visit:
@@ -240,7 +241,7 @@ def test_who_connects_and_finds_nobody_waits_for_the_listener(
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
     seen = visit({"arm-1": 7.0})
     assert NativeMesh().emergency_stop("")["stopped"] is True
-    assert seen.now < 7.0 + 2 * posture.HEARD_S
+    assert seen.now < 7.0 + 2 * zenoh_config.DISCOVERY_S
 
 
 def test_a_robot_that_was_seen_and_left_without_an_answer_is_named(

@@ -81,9 +81,9 @@ class FarBody:
 def found(mesh: Mesh, peer: str) -> bool:
     """Whether a peer is seen in time, which is longer with stated endpoints."""
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when something is led
-    from strands_robots.mesh.transport.posture import linked_within_s  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport.zenoh_config import discovery_timeout  # noqa: PLC0415 - as above
 
-    return wait_for_peer(mesh, peer, linked_within_s(_FOUND_S))
+    return wait_for_peer(mesh, peer, discovery_timeout(_FOUND_S))
 
 
 def known_to(follower: str, leader: Any, bounds: Ranges) -> None:

@@ -131,9 +131,8 @@ def stopped_on_mesh(screen: Screen, told: Envelope, end: str = "") -> None:
 
 def own_id(word: str) -> str:
     """An id for a command's stay on the mesh, which the certificate speaks for where there is one."""
-    from strands_robots.mesh.transport.base import TransportError  # noqa: PLC0415 - loaded when it is used
-    from strands_robots.mesh.transport.posture import visitor_id  # noqa: PLC0415 - as above
-    from strands_robots.mesh.wire_identity import IdentityError  # noqa: PLC0415
+    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
     try:
         return visitor_id(word)

@@ -32,9 +32,9 @@ from strands_robots.mesh.state import StateReader
 from strands_robots.mesh.stream import StepFeed
 from strands_robots.mesh.subscriptions import Subscriptions
 from strands_robots.mesh.teleop import TeleopDesk, join
-from strands_robots.mesh.transport.base import Transport
-from strands_robots.mesh.transport.posture import Posture, credentials_from_settings
-from strands_robots.mesh.wire_identity import Identity, demanded, from_settings
+from strands_robots.mesh.transport import Transport
+from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
+from strands_robots.mesh.wire_identity import Identity, signature_policy
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.halting import halt_of
 from strands_robots.safety.persistence import simulation_key
@@ -264,8 +264,8 @@ def identity_of(transport: Transport) -> Identity:
     """
     posture: Posture | None = getattr(transport, "posture", None)
     if posture is not None:
-        return from_settings(posture.credentials)
-    return from_settings(credentials_from_settings() if demanded() == "1" else None)
+        return Identity.from_settings(posture.credentials)
+    return Identity.from_settings(TlsCredentials.from_settings() if signature_policy() == "1" else None)
 
 
 def _body(robot: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from strands_robots.mesh.transport.base import Sample
+from strands_robots.mesh.transport import Sample
 
 
 class Attribution(Enum):

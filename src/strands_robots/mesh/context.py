@@ -11,7 +11,7 @@ from typing import Any
 
 from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.registry import PeerRegistry
-from strands_robots.mesh.transport.base import Transport, TransportError
+from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.wire_identity import Identity
 from strands_robots.policies.registry import policy_names
 

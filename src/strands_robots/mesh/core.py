@@ -19,7 +19,7 @@ from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import SensorLoopsMixin
 from strands_robots.mesh.subscriptions import DataCallback, SampleCallback
 from strands_robots.mesh.topics import stream
-from strands_robots.mesh.transport.base import Sample
+from strands_robots.mesh.transport import Sample
 from strands_robots.utils import number
 
 logger = logging.getLogger(__name__)

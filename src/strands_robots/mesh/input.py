@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.mesh import topics
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.mesh.security import validate_mesh_identifier
-from strands_robots.mesh.transport.base import TransportError
+from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
 from strands_robots.teleoperators.leader import named_events
 from strands_robots.utils import ValidationError, number, shown, teleoperator_contract_error, text

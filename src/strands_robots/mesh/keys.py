@@ -1,7 +1,7 @@
 """Certificates and access rules for a mesh that leaves its machine: ``strands-robots mesh keys init|issue|acl``.
 
 One authority for a fleet, one certificate a peer with the peer's id as its common name, and Zenoh access rules
-that let each peer publish under its own name alone. Nobody needs an openssl recipe.
+that let each peer publish under its own name alone.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ import ipaddress
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from strands_robots.mesh import topics
 from strands_robots.mesh.security import validate_peer_id
-from strands_robots.mesh.transport.zenoh_config import MESSAGES
+from strands_robots.mesh.transport.zenoh_config import MESSAGES, TlsCredentials
 from strands_robots.utils import ValidationError, missing_extra, text, whole
 
 AUTHORITY_DAYS = 3650
@@ -26,25 +25,8 @@ CA_CERT, CA_KEY = "ca.pem", "ca.key"
 LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
-@dataclass(frozen=True, slots=True)
-class Issued:
-    """The files of one peer, and the settings that name them."""
-
-    cert: Path
-    key: Path
-    ca: Path
-
-    def settings(self) -> dict[str, str]:
-        """The environment that makes a peer use them."""
-        return {
-            "STRANDS_MESH_TLS_CA": str(self.ca),
-            "STRANDS_MESH_TLS_CERT": str(self.cert),
-            "STRANDS_MESH_TLS_KEY": str(self.key),
-        }
-
-
 def init(folder: Path, name: str = "strands-robots mesh", days: int = AUTHORITY_DAYS) -> Path:
-    """Make the fleet's authority: ``ca.pem`` and ``ca.key`` (mode 0600); the certificate's path.
+    """Make the fleet's authority, ``ca.pem`` and ``ca.key`` (mode 0600), and return the certificate's path.
 
     Raises:
         ValidationError: a blank name, or ``days`` not from 1 to 36500.
@@ -66,7 +48,7 @@ def init(folder: Path, name: str = "strands-robots mesh", days: int = AUTHORITY_
     return folder / CA_CERT
 
 
-def issue(folder: Path, peer_id: str, hosts: Sequence[str] = (), days: int = PEER_DAYS) -> Issued:
+def issue(folder: Path, peer_id: str, hosts: Sequence[str] = (), days: int = PEER_DAYS) -> TlsCredentials:
     """Make a certificate for ``peer_id``, good on loopback and on ``hosts`` (names or addresses).
 
     Raises:
@@ -91,7 +73,7 @@ def issue(folder: Path, peer_id: str, hosts: Sequence[str] = (), days: int = PEE
         .add_extension(x509.SubjectAlternativeName(alternatives), critical=False)
         .sign(signing, hashes.SHA256())
     )
-    issued = Issued(folder / f"{name}.pem", folder / f"{name}.key", folder / CA_CERT)
+    issued = TlsCredentials(folder / CA_CERT, folder / f"{name}.pem", folder / f"{name}.key")
     _write(issued.key, _pem(key), 0o600)
     _write(issued.cert, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
     return issued
@@ -103,38 +85,38 @@ def acl(
     relays: Sequence[str] | None = None,
     namespace: str = "strands",
 ) -> str:
-    """Zenoh access rules (JSON5): default deny; a robot speaks as itself, an operator also commands.
+    """Return Zenoh access rules (JSON5): default deny; a robot publishes as itself, an operator also commands.
 
-    Every certified peer hears everything, may stop the fleet and may relay a resume, which only the operator's key
-    can have signed. A relay is a peer through which others are connected (the hub); what it forwards arrives under
-    its own certificate, so others take everything from it, and the signatures on the messages say whose they are.
-    The relays are the operators where None.
+    Every certified peer receives everything, may stop the fleet and may relay a resume, which only the operator's
+    key can have signed. A relay is a peer through which others are connected (the hub); what it forwards arrives
+    under its own certificate, so others accept everything from it, and the signatures on the messages say whose
+    they are. The relays are the operators where None.
 
     Raises:
         ValueError: no robot and no operator, or a name that is no peer id.
     """
     through = operators if relays is None else relays
-    everybody = [validate_peer_id(each) for each in dict.fromkeys((*robots, *operators, *through))]
-    if not everybody:
+    certified = [validate_peer_id(each) for each in dict.fromkeys((*robots, *operators, *through))]
+    if not certified:
         raise ValidationError("robots or operators must name at least one peer.")
     prefix = f"{namespace}/{topics.ROOT}" if namespace else topics.ROOT
-    hear = [message for message in MESSAGES if message not in ("put", "delete")]
+    receiving = [message for message in MESSAGES if message not in ("put", "delete")]
     rules: list[dict[str, Any]] = [
-        _rule("hear", hear, ["ingress", "egress"], [f"{prefix}/**"]),
+        _rule("hear", receiving, ["ingress", "egress"], [f"{prefix}/**"]),
         _rule("be-told", ["put", "delete"], ["egress"], [f"{prefix}/**"]),
         _rule("safety", ["put"], ["ingress"], [f"{prefix}/safety/*"]),
         _rule("relay", ["put", "delete"], ["ingress"], [f"{prefix}/**"]),
         _rule("command", ["put"], ["ingress"], [f"{prefix}/*/cmd", f"{prefix}/broadcast"]),
     ]
     subjects, policies = [], []
-    for peer in everybody:
+    for peer in certified:
         # A certificate speaks for its name, and for what its owner calls NAME__something.
         names = (peer, f"{peer}__$*")
         own = [key for name in names for key in (f"{prefix}/{name}/**", f"{prefix}/*/response/{name}/**")]
         rules.append(_rule(f"own-{peer}", ["put", "delete", "liveliness_token"], ["ingress"], own))
         subjects.append({"id": peer, "cert_common_names": [peer]})
         granted = ["hear", "be-told", "safety", f"own-{peer}"]
-        granted += [rule for rule, who in (("command", operators), ("relay", through)) if peer in who]
+        granted += [rule for rule, peers in (("command", operators), ("relay", through)) if peer in peers]
         policies.append({"rules": granted, "subjects": [peer]})
     rules_of = {
         "enabled": True,

@@ -16,7 +16,7 @@ from strands_robots.mesh import topics, wire
 from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.security import validate_command
-from strands_robots.mesh.transport.base import PutConfirmed, Sample, TransportError
+from strands_robots.mesh.transport import PutConfirmed, Sample, TransportError
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.utils import ValidationError, number, shown
 

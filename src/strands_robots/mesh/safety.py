@@ -19,7 +19,7 @@ from strands_robots.mesh.door import SafetyDoor
 from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.pursuit import KNOWN_S, Pursuit
 from strands_robots.mesh.rpc import Caller, stop_outcome
-from strands_robots.mesh.transport.base import Sample, TransportError
+from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.orders import StopOrder, derived_epoch, new_epoch
 from strands_robots.safety.resume import REJECTED, configured_keys, sign

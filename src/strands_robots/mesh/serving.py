@@ -17,7 +17,7 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lane, Lanes
 from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, STOP_FIELDS, validate_command
 from strands_robots.mesh.stops import Asker, Stops, Tell
-from strands_robots.mesh.transport.base import Sample, TransportError
+from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate
 from strands_robots.safety.stopping import Outcome, explain, grade

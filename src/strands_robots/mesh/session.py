@@ -15,7 +15,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.mesh.registry import PEER_TIMEOUT, PeerRegistry
-from strands_robots.mesh.transport.base import Transport, TransportError
+from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.transport.factory import make_transport
 from strands_robots.mesh.wire import WireError
 from strands_robots.utils import MissingExtraError, number

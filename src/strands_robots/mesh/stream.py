@@ -12,7 +12,7 @@ from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lane
-from strands_robots.mesh.transport.base import TransportError
+from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
 
 logger = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from typing import Any
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.executor import Lane
-from strands_robots.mesh.transport.base import Sample, Subscription, Transport, TransportError
+from strands_robots.mesh.transport import Handle, Sample, Transport, TransportError
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ INBOX_MAX = 256
 @dataclass(slots=True)
 class _Entry:
     topic: str
-    handle: Subscription
+    handle: Handle
 
 
 class Subscriptions:

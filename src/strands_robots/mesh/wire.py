@@ -12,13 +12,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, identifier, shown
 
 FRESH_S = 60.0
 AHEAD_S = 5.0
 
 
-class WireError(ValueError):
+class WireError(StrandsRobotsError, ValueError):
     """Bytes that are no message of this wire, and why."""
 
 

@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
+from strands_robots.mesh.transport.zenoh_config import TlsCredentials
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
 
 if TYPE_CHECKING:
     from cryptography import x509
-
-    from strands_robots.mesh.transport.posture import Credentials
 
 logger = logging.getLogger(__name__)
 
@@ -42,13 +42,13 @@ FIELDS = frozenset({"v", "alg", "cert", "t", "nonce", "sig"})
 ALGORITHMS = ("rsa-pss-sha256", "ecdsa-sha256", "ed25519")
 
 
-class IdentityError(ValueError):
-    """A signature that does not count, and why."""
+class IdentityError(StrandsRobotsError, ValueError):
+    """A signature that does not count; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """Whose certificate signed: its SHA-256 in hex and its common name."""
+    """The certificate that signed: its SHA-256 in hex and its common name."""
 
     cert_sha256: str
     common_name: str
@@ -58,7 +58,7 @@ class Verified:
 
 
 class Signer:
-    """Signs what this peer publishes.
+    """Signs the messages of this peer.
 
     Raises:
         ValueError: the files hold no certificate and matching private key of a kind in :data:`ALGORITHMS`.
@@ -80,7 +80,7 @@ class Signer:
         self.common_name = _common_name(certificate)
 
     def sign(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """``body`` with its ``sig``."""
+        """Return ``body`` with its ``sig``."""
         bare = {key: value for key, value in body.items() if key != "sig"}
         head = {"v": VERSION, "alg": self._algorithm, "t": self._clock(), "nonce": secrets.token_hex(16)}
         signature = _make(self._key, self._algorithm, _signed_bytes(bare, head, self._digest))
@@ -111,10 +111,10 @@ class Verifier:
         self._lock = threading.Lock()
 
     def verify(self, body: Mapping[str, Any]) -> Verified:
-        """Whose signature is on ``body``.
+        """Return the certificate whose signature is on ``body``.
 
         Raises:
-            IdentityError: it does not count; the message says why.
+            IdentityError: the signature does not count; the message says why.
         """
         sig = _shape(body.get("sig"))
         if not self._roots:
@@ -145,7 +145,7 @@ class Verifier:
         for root in self._roots:
             try:
                 certificate.verify_directly_issued_by(root)
-            except Exception as exc:  # noqa: BLE001 - each root refuses in its own way; the next one is asked
+            except Exception as exc:  # noqa: BLE001 - each root refuses in its own way; the next one is tried
                 logger.debug("Not issued by %s: %s", root.subject, exc)
             else:
                 return
@@ -169,19 +169,29 @@ class Verifier:
 
 
 class Identity:
-    """This peer's signer and verifier, and whether unsigned messages still count."""
+    """Signer and verifier of this peer; ``required`` says that unsigned messages do not count."""
 
     def __init__(self, signer: Signer | None = None, verifier: Verifier | None = None, required: bool = False) -> None:
         self._signer = signer
         self._verifier = verifier
         self.required = required
 
+    @classmethod
+    def from_settings(cls, credentials: TlsCredentials | None) -> Identity:
+        """The identity that the environment asks for: by default signed where there are certificates."""
+        policy = signature_policy()
+        signer, verifier = None, None
+        if credentials is not None:
+            signer = Signer(credentials.cert, credentials.key)
+            verifier = Verifier(credentials.ca.read_bytes())
+        return cls(signer, verifier, required=policy == "1" or (policy == "auto" and verifier is not None))
+
     def sign(self, body: dict[str, Any]) -> dict[str, Any]:
-        """``body``, signed when this peer holds a certificate."""
+        """Return ``body``, signed when this peer holds a certificate."""
         return self._signer.sign(body) if self._signer is not None else body
 
     def verify(self, body: Mapping[str, Any], peer_id: str) -> Verified:
-        """Who signed ``body`` and may speak for ``peer_id``. Raises IdentityError when nobody did."""
+        """Return the certificate that signed ``body`` and speaks for ``peer_id``, or raise IdentityError."""
         if self._verifier is None:
             raise IdentityError("this peer has no roots to check signatures against")
         verified = self._verifier.verify(body)
@@ -190,7 +200,7 @@ class Identity:
         return verified
 
     def refusal(self, body: Mapping[str, Any], peer_id: str) -> str | None:
-        """Why ``body`` does not count as signed by ``peer_id``, or None."""
+        """The reason why ``body`` does not count as signed by ``peer_id``, or None."""
         try:
             self.verify(body, peer_id)
         except IdentityError as exc:
@@ -203,26 +213,27 @@ class Identity:
         return self._verifier is not None
 
 
-def from_settings(credentials: Credentials | None) -> Identity:
-    """The identity the environment asks for: signed when there are certificates, unless it is told otherwise."""
-    word = demanded()
-    signer, verifier = None, None
-    if credentials is not None:
-        signer = Signer(credentials.cert, credentials.key)
-        verifier = Verifier(credentials.ca.read_bytes())
-    return Identity(signer, verifier, required=word == "1" or (word == "auto" and verifier is not None))
+def visitor_id(prefix: str) -> str:
+    """Make a fresh id for a short stay on the mesh, which our certificate speaks for where there is one.
+
+    Raises:
+        TransportError: the certificate's settings name files that cannot be used.
+        IdentityError: the certificate cannot be read.
+    """
+    own, files = f"{prefix}-{secrets.token_hex(4)}", TlsCredentials.from_settings()
+    return own if files is None else f"{Signer(files.cert, files.key).common_name}__{own}"
 
 
-def demanded() -> str:
-    """What ``STRANDS_MESH_REQUIRE_SIGNED_IDENTITY`` asks for: ``1``, ``0`` or ``auto``; any other word is ``1``."""
-    word = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY").strip().lower()
-    return word if word in ("0", "1", "auto") else _taken_as_one(word)
+def signature_policy() -> str:
+    """``STRANDS_MESH_REQUIRE_SIGNED_IDENTITY`` as ``1``, ``0`` or ``auto``; any other text counts as ``1``."""
+    stated = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY").strip().lower()
+    return stated if stated in ("0", "1", "auto") else _unknown_policy(stated)
 
 
 @lru_cache(maxsize=16)
-def _taken_as_one(word: str) -> str:
-    """``1``; each unknown word is warned of once."""
-    logger.warning("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY=%s is none of 1, 0 and auto; taken as 1.", shown(word))
+def _unknown_policy(stated: str) -> str:
+    """``1``; the cache limits the warning to one for each text."""
+    logger.warning("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY=%s is none of 1, 0 and auto; taken as 1.", shown(stated))
     return "1"
 
 
@@ -263,9 +274,9 @@ def _parse(der: bytes) -> Any:
     x509, _ = _cryptography()
     try:
         certificate = x509.load_der_x509_certificate(der)
-        # The parser reads some parts when they are asked for, and finds them broken only then.
+        # The parser reads some parts lazily and finds them broken only then.
         certificate.public_key()
-        certificate.subject, certificate.issuer, certificate.extensions  # noqa: B018 - asked for, not used
+        certificate.subject, certificate.issuer, certificate.extensions  # noqa: B018 - parsed, not used
     except Exception as exc:  # noqa: BLE001 - hostile bytes make the parser raise several kinds
         raise IdentityError(f"the certificate cannot be read: {type(exc).__name__}") from None
     return certificate

@@ -169,14 +169,14 @@ def _hear(console: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None
 
     Who connects here, or to what this process connects to and found nobody at, may pause between two tries.
     """
-    from strands_robots.mesh.transport.posture import HEARD_S, LINKED_S  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, LINK_DISCOVERY_S  # noqa: PLC0415 - loaded when it is used
 
     began, found = time.monotonic(), math.inf
     listens, connects = settings.items("ZENOH_LISTEN"), settings.items("ZENOH_CONNECT")
-    while (now := time.monotonic()) < began + LINKED_S:
+    while (now := time.monotonic()) < began + LINK_DISCOVERY_S:
         if _in_reach(console):
             found = min(found, now)
-        known = now >= found + HEARD_S if connects else now >= began + HEARD_S
+        known = now >= found + DISCOVERY_S if connects else now >= began + DISCOVERY_S
         if known and not listens:
             return
         meanwhile()
@@ -186,17 +186,17 @@ def _hear(console: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None
 def _asked(console: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
     """What ``target`` replies, asked when it is in reach or when it is known who is."""
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when it is used
-    from strands_robots.mesh.transport.posture import HEARD_S, linked_within_s  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
 
-    time.sleep(HEARD_S)
-    wait_for_peer(console, target, linked_within_s(HEARD_S) - HEARD_S)
+    time.sleep(DISCOVERY_S)
+    wait_for_peer(console, target, discovery_timeout(DISCOVERY_S) - DISCOVERY_S)
     return console.send(target, command, seconds)
 
 
 def _with_console(work: Callable[[Mesh], Envelope], **fields: Any) -> Envelope:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.mesh.transport.base import TransportError  # noqa: PLC0415 - as above
-    from strands_robots.mesh.transport.posture import visitor_id  # noqa: PLC0415
+    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
+    from strands_robots.mesh.wire_identity import visitor_id  # noqa: PLC0415
 
     try:
         console = init_mesh(None, visitor_id(SOURCE), "tool")

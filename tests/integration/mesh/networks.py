@@ -17,10 +17,10 @@ from fixtures.waiting import eventually, free_port
 from tests.mesh.peers import Fleet, RealClock
 
 from strands_robots.mesh import keys
-from strands_robots.mesh.transport.base import Transport
+from strands_robots.mesh.transport import Transport
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport
-from strands_robots.mesh.transport.posture import Credentials, Posture
 from strands_robots.mesh.transport.zenoh import ZenohTransport
+from strands_robots.mesh.transport.zenoh_config import Posture
 
 CANNOT = {
     ("mqtt", "input"): "input frames are not sent over MQTT",
@@ -150,8 +150,7 @@ class OverTls(OverZenoh):
         return self._start(peer_id, robot, {"STRANDS_MESH_PORT": str(self.port), **issued.settings()})
 
     def _stranger(self, name: str) -> Transport:
-        issued = keys.issue(self.folder / "keys", name)
-        own = Credentials(issued.ca, issued.cert, issued.key)
+        own = keys.issue(self.folder / "keys", name)
         return ZenohTransport(Posture("strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, None, False, 16))
 
 
@@ -202,8 +201,7 @@ class OverBoth(OverMqtt):
         return {**super()._account(peer_id), "STRANDS_MESH_BACKEND": "bridge"}
 
     def _stranger(self, name: str) -> Transport:
-        issued = keys.issue(self._keys, name)
-        own = Credentials(issued.ca, issued.cert, issued.key)
+        own = keys.issue(self._keys, name)
         return ZenohTransport(Posture("strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, None, False, 16))
 
 

@@ -17,7 +17,7 @@ from fixtures.waiting import eventually
 from tests.integration.mesh.networks import Network, network
 
 from strands_robots.mesh.resume_authority import keygen
-from strands_robots.mesh.transport.base import Transport
+from strands_robots.mesh.transport import Transport
 
 PASSPHRASE = "Correct-Horse-7-Battery"
 APPROVED = "execute@arm-1,start@arm-1,teleop_receive@arm-1"

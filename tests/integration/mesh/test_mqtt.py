@@ -14,7 +14,7 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.mesh import keys
 from strands_robots.mesh.resume_authority import keygen
-from strands_robots.mesh.transport.base import TransportError
+from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport, filter_of
 
 Join = Callable[..., MeshPeer]

@@ -1,31 +1,34 @@
-"""Transports of the mesh: in memory, Zenoh, MQTT 5 (AWS IoT), and both at once. Loaded when they are named."""
+"""Transports of the mesh: what every backend offers, and the backends themselves, each loaded when it is named.
+
+``zenoh`` is the default, ``iot`` is MQTT 5, ``bridge`` is both at once, ``memory`` stays inside one process.
+"""
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
-from strands_robots.mesh.transport.base import Sample, Subscription, Transport, TransportError
-
-if TYPE_CHECKING:
-    from strands_robots.mesh.transport.bridge import BridgeTransport
-    from strands_robots.mesh.transport.iot import IotMqttTransport
-    from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
-    from strands_robots.mesh.transport.zenoh import ZenohTransport
+from strands_robots.errors import StrandsRobotsError
 
 __all__ = [
     "BridgeTransport",
+    "Callback",
+    "Handle",
     "IotMqttTransport",
+    "LiveTransport",
+    "LivenessCallback",
     "MemoryBus",
     "MemoryTransport",
+    "PutConfirmed",
     "Sample",
-    "Subscription",
     "Transport",
     "TransportError",
     "ZenohTransport",
 ]
 
-_HOMES = {
+_MODULES = {
     "BridgeTransport": "bridge",
     "IotMqttTransport": "iot",
     "MemoryBus": "memory",
@@ -35,6 +38,82 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+class TransportError(StrandsRobotsError, RuntimeError):
+    """A transport cannot connect or publish; the message says why and what to do."""
+
+
+@dataclass(slots=True)  # not frozen: that would cost each message a microsecond
+class Sample:
+    """One message as it arrived.
+
+    Attributes:
+        session: id of the publisher's session, None where the publisher or the transport names none.
+        sessionless: the transport has no sessions at all, so a missing one says nothing (MQTT).
+        retained: it is older than our subscription; the broker stored it for late joiners.
+    """
+
+    key: str
+    payload: bytes
+    session: str | None = None
+    sessionless: bool = False
+    retained: bool = False
+
+
+Callback = Callable[[Sample], None]
+"""Called on the transport's own thread: it returns at once and does not raise."""
+
+LivenessCallback = Callable[[str, bool], None]
+"""Called with the key of a liveliness token and whether it is there."""
+
+
+class Handle(Protocol):
+    """A declared subscriber or token."""
+
+    def undeclare(self) -> None:
+        """Withdraw it: no callback starts after this returns; twice is once."""
+
+
+class Transport(Protocol):
+    """Publish and subscribe on the mesh's keys, without the namespace."""
+
+    @property
+    def session_id(self) -> str | None:
+        """Id of our session on this transport, None where it has none or is closed."""
+
+    def connect(self) -> None:
+        """Open. Raises TransportError when that is not possible; already open is fine."""
+
+    def close(self) -> None:
+        """Close; every subscriber goes with it. Twice is once."""
+
+    def is_alive(self) -> bool:
+        """True between connect and close, as far as the transport can tell."""
+
+    def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
+        """Publish. Raises TransportError when closed, WireError for a message above its topic's size."""
+
+    def declare_subscriber(self, key: str, callback: Callback) -> Handle:
+        """Receive a key expression; ``*`` is one segment, ``**`` any number. Raises TransportError when closed."""
+
+
+@runtime_checkable
+class LiveTransport(Protocol):
+    """A transport that can tell at once when a session ends."""
+
+    def declare_token(self, key: str) -> Handle:
+        """Show ``key`` as alive until it is undeclared or this session ends."""
+
+    def watch_tokens(self, key: str, callback: LivenessCallback) -> Handle:
+        """Call back for every token that comes or goes, those already there included."""
+
+
+PutConfirmed = Callable[[str, bytes | Mapping[str, Any], float], bool | None]
+"""``put_confirmed(key, payload, timeout)``, which a transport may have: publish, and tell if the key has subscribers.
+
+True: there is one. False: there is none. None: not known within ``timeout`` seconds.
+"""

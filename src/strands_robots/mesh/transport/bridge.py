@@ -13,8 +13,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport.base import Callback, LivenessCallback, Sample, Subscription, Transport
-from strands_robots.mesh.transport.base import TransportError as LegError
+from strands_robots.mesh.transport import Callback, Handle, LivenessCallback, Sample, Transport, TransportError
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +89,7 @@ class _Both:
     def __init__(self, key: str, heard: list[tuple[Transport, Callback]]) -> None:
         self.key = key
         self._waiting = heard
-        self._handles: list[Subscription] = []
+        self._handles: list[Handle] = []
         self._gone = False
         self._lock = threading.Lock()
 
@@ -108,7 +107,7 @@ class _Both:
                     continue
                 try:
                     self._handles.append(leg.declare_subscriber(self.key, callback))
-                except LegError as exc:
+                except TransportError as exc:
                     problems.append(str(exc))
                 else:
                     self._waiting.remove(entry)
@@ -166,7 +165,7 @@ class BridgeTransport:
     def connect(self) -> None:
         problems = self._join()
         if not self._joined:
-            raise LegError(f"neither leg of the bridge connects: {'; '.join(problems)}")
+            raise TransportError(f"neither leg of the bridge connects: {'; '.join(problems)}")
         self._closed = threading.Event()
         for problem in problems:
             logger.error("One leg of the bridge is down and is tried again: %s", problem)
@@ -193,7 +192,7 @@ class BridgeTransport:
         legs = self._legs(topic)
         problems = [problem for leg in legs if (problem := self._put(leg, key, topic, data)) is not None]
         if len(problems) == len(legs):
-            raise LegError(f"{key}: {'; '.join(problems)}")
+            raise TransportError(f"{key}: {'; '.join(problems)}")
 
     def _put(self, leg: Transport, key: str, topic: topics.Topic, data: bytes) -> str | None:
         """Why a message did not go by a leg, or None."""
@@ -223,22 +222,22 @@ class BridgeTransport:
             heard(sample)
 
         if not self.is_alive():
-            raise LegError(f"{key}: no leg of the bridge is connected.")
+            raise TransportError(f"{key}: no leg of the bridge is connected.")
         both = _Both(key, [(leg, near if leg is self._local else far) for leg in self._legs(topic)])
         problems = both.settle()
         if len(problems) == len(self._legs(topic)):
-            raise LegError("; ".join(problems))
+            raise TransportError("; ".join(problems))
         with self._lock:
             self._subscribers = [each for each in self._subscribers if not each.gone] + [both]
         self._mend()
         return both
 
-    def declare_token(self, key: str) -> Subscription:
-        declare: Callable[[str], Subscription] = getattr(self._local, "declare_token", _nothing)
+    def declare_token(self, key: str) -> Handle:
+        declare: Callable[[str], Handle] = getattr(self._local, "declare_token", _nothing)
         return declare(key) if self._local.is_alive() else _Nothing()
 
-    def watch_tokens(self, key: str, callback: LivenessCallback) -> Subscription:
-        watch: Callable[[str, LivenessCallback], Subscription] = getattr(self._local, "watch_tokens", _nothing)
+    def watch_tokens(self, key: str, callback: LivenessCallback) -> Handle:
+        watch: Callable[[str, LivenessCallback], Handle] = getattr(self._local, "watch_tokens", _nothing)
         return watch(key, callback) if self._local.is_alive() else _Nothing()
 
     @property
@@ -320,7 +319,7 @@ def _bridged_names() -> frozenset[str]:
     stated = settings.items("STRANDS_MESH_BRIDGE_TOPICS")
     unknown = [name for name in stated if name not in topics.BY_NAME]
     if unknown:
-        raise LegError(
+        raise TransportError(
             f"STRANDS_MESH_BRIDGE_TOPICS must name topics of {', '.join(topics.BY_NAME)}, not {', '.join(unknown)}."
         )
     return frozenset(stated) or frozenset(topic.name for topic in topics.TABLE if topic.bridged)
@@ -368,7 +367,7 @@ def _mark(payload: bytes) -> bytes | None:
 def _try(verb: Callable[..., Any], *args: Any) -> str | None:
     try:
         verb(*args)
-    except (LegError, ImportError) as exc:
+    except (TransportError, ImportError) as exc:
         return str(exc)
     return None
 

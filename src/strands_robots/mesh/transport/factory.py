@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from strands_robots import settings
-from strands_robots.mesh.transport.base import Transport, TransportError
+from strands_robots.mesh.transport import Transport, TransportError
 
 BACKENDS = ("zenoh", "iot", "bridge", "memory")
 
 
 def make_transport(backend: str | None = None) -> Transport:
-    """A transport, not yet connected.
+    """Return a transport, not yet connected.
 
     Raises:
         TransportError: an unknown backend.

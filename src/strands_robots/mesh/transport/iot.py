@@ -19,7 +19,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport.base import Callback, Sample, TransportError
+from strands_robots.mesh.transport import Callback, Sample, TransportError
 from strands_robots.utils import missing_extra
 
 logger = logging.getLogger(__name__)

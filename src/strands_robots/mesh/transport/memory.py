@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport.base import Callback, LivenessCallback, Sample, TransportError
+from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, TransportError
 
 
 class _Subscriber:

@@ -14,9 +14,8 @@ from itertools import count
 from typing import Any
 
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport import zenoh_config
-from strands_robots.mesh.transport.base import Callback, LivenessCallback, Sample, TransportError
-from strands_robots.mesh.transport.posture import Posture, from_settings
+from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, TransportError, zenoh_config
+from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.utils import missing_extra
 
 logger = logging.getLogger(__name__)
@@ -76,14 +75,14 @@ class ZenohTransport:
             except ImportError:
                 raise missing_extra("The Zenoh mesh", "mesh") from None
             self._zenoh = zenoh
-            posture = self._posture = self._posture or from_settings()
+            posture = self._posture = self._posture or Posture.from_settings()
             self._closing.clear()
             self._hub = False
             if posture.hub is None:
                 self._session = self._open(zenoh_config.explicit(posture, self._id))
             else:
                 self._session = self._open_on_loopback(posture)
-            if not posture.verified:
+            if posture.credentials is None:
                 logger.info("The mesh runs without certificates, on this machine alone or by the operator's opt-in.")
 
     def close(self) -> None:

@@ -1,68 +1,193 @@
-"""The Zenoh configuration of one session, from a posture and the topic table.
+"""The Zenoh configuration of one session: endpoints, certificates, access rules, rates and sizes.
+
+A mesh bound to loopback alone comes up without certificates. Leaving loopback needs mutual TLS, or an opt-in
+that says in its name what it is.
 
 Measured on Zenoh 1.10: rules name keys with the namespace in front, and a downsampler keeps one clock for a whole
 rule and drops by spacing. So only telemetry is downsampled, where a dropped message is followed by the next one,
-and only on the way in, where each link has a clock of its own and a flood starves nobody but its sender.
+and only on the way in, where each link has a clock of its own and a flood starves only its own sender.
 """
 
 from __future__ import annotations
 
 import json
+import logging
+import stat
+from dataclasses import dataclass
+from ipaddress import ip_address
+from pathlib import Path
 from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics
-from strands_robots.mesh.transport.base import TransportError
-from strands_robots.mesh.transport.posture import Posture
+from strands_robots.mesh.transport import TransportError
+
+logger = logging.getLogger(__name__)
+
+ACL_MAX_BYTES = 256 * 1024
+KEYS_COMMAND = "strands-robots mesh keys init"
+PERMISSIVE_ACL = "STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"
 
 RETRY_MS = 250
 LEASE_MS = 4000
 HANDSHAKE_MS = 2000
 WAIT_BEFORE_DROP_US = 10_000
-HOW_TO_ACL = "STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"
+_RETRY = {"period_init_ms": RETRY_MS, "period_max_ms": RETRY_MS, "period_increase_factor": 1}
+
+MESSAGES = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+
+DISCOVERY_S = 1.1
+"""Two heartbeats: within these seconds a peer that is linked to us is in the registry."""
+
+LINK_DISCOVERY_S = 12.0
+"""The same where links go to stated endpoints: of two attempts the second may come 8 s after the first."""
+
+
+@dataclass(frozen=True, slots=True)
+class TlsCredentials:
+    """The PEM files of mutual TLS for one peer."""
+
+    ca: Path
+    cert: Path
+    key: Path
+
+    @classmethod
+    def from_settings(cls) -> TlsCredentials | None:
+        """The three files, checked; None when none of them is stated.
+
+        Raises:
+            TransportError: only some are stated, or one is missing, a symbolic link, or a key open to others.
+        """
+        names = ("STRANDS_MESH_TLS_CA", "STRANDS_MESH_TLS_CERT", "STRANDS_MESH_TLS_KEY")
+        stated = {name: settings.raw(name) for name in names}
+        if not any(stated.values()):
+            return None
+        missing = [name for name, value in stated.items() if not value]
+        if missing:
+            raise TransportError(f"mutual TLS needs {', '.join(names)}; {', '.join(missing)} is not set.")
+        ca, cert, key = (_plain_file(name, Path(value).expanduser()) for name, value in stated.items())
+        if stat.S_IMODE(key.stat().st_mode) & 0o077:
+            raise TransportError(f"STRANDS_MESH_TLS_KEY: others may read {key}; run chmod 600 on it.")
+        return cls(ca, cert, key)
+
+    def settings(self) -> dict[str, str]:
+        """The environment that makes a peer use these files."""
+        return {
+            "STRANDS_MESH_TLS_CA": str(self.ca),
+            "STRANDS_MESH_TLS_CERT": str(self.cert),
+            "STRANDS_MESH_TLS_KEY": str(self.key),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Posture:
+    """What a session is opened with.
+
+    Attributes:
+        hub: loopback endpoint of the automatic hub; None where endpoints are stated.
+        access_control: JSON5 text; None for the rules made from the topic table.
+    """
+
+    namespace: str
+    connect: tuple[str, ...]
+    listen: tuple[str, ...]
+    hub: str | None
+    credentials: TlsCredentials | None
+    access_control: str | None
+    multicast: bool
+    max_sessions: int
+
+    @classmethod
+    def from_settings(cls) -> Posture:
+        """The posture that the environment asks for.
+
+        Raises:
+            TransportError: it would leave loopback without certificates and without the opt-in, or a certificate
+                file is missing, a link, or a key that others can read.
+        """
+        connect, listen = settings.items("ZENOH_CONNECT"), settings.items("ZENOH_LISTEN")
+        multicast = settings.boolean("STRANDS_MESH_MULTICAST")
+        credentials = None if _insecure() else TlsCredentials.from_settings()
+        if credentials is None:
+            _refuse_to_leave_loopback(connect + listen, multicast)
+        if multicast:
+            logger.warning("Multicast scouting is on: every Zenoh process on this network learns of this peer.")
+        scheme = "tls" if credentials else "tcp"
+        return cls(
+            namespace=settings.raw("STRANDS_MESH_NAMESPACE"),
+            connect=connect,
+            listen=listen,
+            hub=None if connect or listen else f"{scheme}/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}",
+            credentials=credentials,
+            access_control=_access_control_file() if credentials else None,
+            multicast=multicast,
+            max_sessions=settings.integer("STRANDS_MESH_MAX_SESSIONS"),
+        )
+
+
+def discovery_timeout(default: float) -> float:
+    """Seconds to wait for a peer to be seen: :data:`LINK_DISCOVERY_S` with stated endpoints, else ``default``."""
+    return LINK_DISCOVERY_S if settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT") else default
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether a Zenoh endpoint such as ``tcp/127.0.0.1:7447`` stays on this machine."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol.startswith(("unix", "vsock")):
+        return protocol.startswith("unix")
+    host = address.split("#")[0].split("?")[0].rpartition(":")[0].strip("[]")
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host.partition("%")[0]).is_loopback
+    except ValueError:
+        return False
 
 
 def hub(posture: Posture, session: str | None = None) -> dict[str, Any]:
-    """A session that listens on the loopback hub's endpoint and fails where somebody else does."""
-    found = _base(posture, session)
-    found["mode"] = "peer"
-    found["listen"] = {"endpoints": [posture.hub], "exit_on_failure": True}
-    return found
+    """Configure a session that listens on the loopback hub's endpoint, and fails where it is taken."""
+    config = _base(posture, session)
+    config["mode"] = "peer"
+    config["listen"] = {"endpoints": [posture.hub], "exit_on_failure": True}
+    return config
 
 
 def child(posture: Posture, session: str | None = None, timeout_ms: int = 1000) -> dict[str, Any]:
-    """A client of the loopback hub; opening fails when no hub answers within ``timeout_ms``."""
-    found = _base(posture, session)
-    found["mode"] = "client"
-    found["listen"] = {"endpoints": []}
-    found["connect"] = {"endpoints": [posture.hub], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": _RETRY}
-    return found
+    """Configure a client of the loopback hub; opening it fails when no hub answers within ``timeout_ms``."""
+    config = _base(posture, session)
+    config["mode"] = "client"
+    config["listen"] = {"endpoints": []}
+    config["connect"] = {"endpoints": [posture.hub], "timeout_ms": timeout_ms, "exit_on_failure": True, "retry": _RETRY}
+    return config
 
 
 def explicit(posture: Posture, session: str | None = None) -> dict[str, Any]:
-    """A session with the endpoints the operator stated; a listener must bind, a connection may come later.
+    """Configure a session with stated endpoints; a listener must bind, a connection may come later.
 
-    It is a router, because of two peers that are connected to a third, Zenoh lets neither hear the other. Like a peer
-    it connects to those that gossip tells of, or multicast where that is on. Measured on 1.10 with peers, clients and
+    It is a router, because Zenoh does not forward between two peers that are connected to a third. Like a peer it
+    connects to those that gossip tells of, or multicast where that is on. Measured on 1.10 with peers, clients and
     routers on either side.
     """
-    found = _base(posture, session)
-    found["mode"] = "router"
-    for scout in found["scouting"].values():
+    config = _base(posture, session)
+    config["mode"] = "router"
+    for scout in config["scouting"].values():
         scout["autoconnect"] = {role: ["router", "peer"] for role in ("router", "peer")}
-    found["listen"] = {"endpoints": list(posture.listen), "exit_on_failure": True}
-    backing_off = {**_RETRY, "period_init_ms": 1000, "period_max_ms": 8000, "period_increase_factor": 2}
-    found["connect"] = {
+    config["listen"] = {"endpoints": list(posture.listen), "exit_on_failure": True}
+    config["connect"] = {
         "endpoints": list(posture.connect),
         # Zero would be one attempt and no second.
         "timeout_ms": -1,
         "exit_on_failure": False,
-        "retry": backing_off,
+        "retry": {"period_init_ms": 1000, "period_max_ms": 8000, "period_increase_factor": 2},
     }
-    return found
-
-
-_RETRY = {"period_init_ms": RETRY_MS, "period_max_ms": RETRY_MS, "period_increase_factor": 1}
+    return config
 
 
 def _base(posture: Posture, session: str | None) -> dict[str, Any]:
@@ -80,7 +205,7 @@ def _base(posture: Posture, session: str | None) -> dict[str, Any]:
         },
         "adminspace": {"enabled": False},
         "transport": {
-            # A session does not close while it waits for the first word of a far side that is no Zenoh.
+            # A session does not close while it waits for the first message of a remote that is no Zenoh.
             "unicast": {"max_sessions": posture.max_sessions, "open_timeout": HANDSHAKE_MS},
             "link": link,
         },
@@ -103,11 +228,11 @@ def _base(posture: Posture, session: str | None) -> dict[str, Any]:
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
         }
-        config["access_control"] = access_control(posture, prefix)
+        config["access_control"] = _access_control(posture, prefix)
     return config
 
 
-def access_control(posture: Posture, prefix: str) -> dict[str, Any]:
+def _access_control(posture: Posture, prefix: str) -> dict[str, Any]:
     """The operator's rules, or the table's topics for every holder of a certificate and nothing else.
 
     Raises:
@@ -132,21 +257,11 @@ def access_control(posture: Posture, prefix: str) -> dict[str, Any]:
     rules = _parsed(posture.access_control)
     if rules.get("enabled") is not True:
         raise TransportError("STRANDS_MESH_ACL_FILE: access control must have enabled: true.")
-    if rules.get("default_permission") != "deny" and not settings.boolean(HOW_TO_ACL):
+    if rules.get("default_permission") != "deny" and not settings.boolean(PERMISSIVE_ACL):
         raise TransportError(
-            f"STRANDS_MESH_ACL_FILE allows by default; set default_permission to deny, or {HOW_TO_ACL}=true."
+            f"STRANDS_MESH_ACL_FILE allows by default; set default_permission to deny, or {PERMISSIVE_ACL}=true."
         )
     return rules
-
-
-MESSAGES = (
-    "put",
-    "delete",
-    "declare_subscriber",
-    "liveliness_token",
-    "liveliness_query",
-    "declare_liveliness_subscriber",
-)
 
 
 def _parsed(text: str) -> dict[str, Any]:
@@ -183,3 +298,50 @@ def _low_pass(prefix: str) -> list[dict[str, Any]]:
         }
         for size in sizes
     ]
+
+
+def _insecure() -> bool:
+    if settings.boolean("STRANDS_MESH_LOCAL_DEV"):
+        return True
+    if settings.raw("STRANDS_MESH_AUTH_MODE").lower() != "none":
+        return False
+    if settings.boolean("STRANDS_MESH_I_KNOW_THIS_IS_INSECURE"):
+        return True
+    logger.warning(
+        "STRANDS_MESH_AUTH_MODE=none is ignored without STRANDS_MESH_I_KNOW_THIS_IS_INSECURE=true; "
+        "the mesh stays with mutual TLS."
+    )
+    return False
+
+
+def _refuse_to_leave_loopback(endpoints: tuple[str, ...], multicast: bool) -> None:
+    outside = [endpoint for endpoint in endpoints if not is_loopback(endpoint)]
+    if multicast:
+        outside.append("multicast scouting")
+    if not outside:
+        return
+    if _insecure():
+        logger.warning("The mesh is open to everybody on the network: %s, without certificates.", ", ".join(outside))
+        return
+    raise TransportError(
+        f"{', '.join(outside)} leaves this machine, and the mesh has no certificates: run '{KEYS_COMMAND}' and set "
+        "STRANDS_MESH_TLS_CA, STRANDS_MESH_TLS_CERT and STRANDS_MESH_TLS_KEY."
+    )
+
+
+def _plain_file(name: str, path: Path) -> Path:
+    if path.is_symlink():
+        raise TransportError(f"{name}: {path} is a symbolic link; name the file itself.")
+    if not path.is_file():
+        raise TransportError(f"{name}: there is no file {path}.")
+    return path
+
+
+def _access_control_file() -> str | None:
+    stated = settings.raw("STRANDS_MESH_ACL_FILE")
+    if not stated:
+        return None
+    path = _plain_file("STRANDS_MESH_ACL_FILE", Path(stated).expanduser())
+    if path.stat().st_size > ACL_MAX_BYTES:
+        raise TransportError(f"STRANDS_MESH_ACL_FILE: {path} is above {ACL_MAX_BYTES // 1024} KiB.")
+    return path.read_text(encoding="utf-8")

@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 from strands_robots.mesh import keys, topics
-from strands_robots.mesh.transport import TransportError, posture, zenoh_config
+from strands_robots.mesh.transport import TransportError, zenoh_config
+from strands_robots.mesh.transport.zenoh_config import Posture
 
 
 def test_without_any_setting_the_mesh_stays_on_loopback_without_certificates() -> None:
-    found = posture.from_settings()
+    found = Posture.from_settings()
     assert found.hub == "tcp/127.0.0.1:7447"
-    assert not found.verified
+    assert found.credentials is None
     config = zenoh_config.hub(found)
     assert config["scouting"]["multicast"]["enabled"] is False
     assert config["namespace"] == "strands"
@@ -34,24 +35,24 @@ def test_leaving_loopback_names_the_command_to_run(
 ) -> None:
     monkeypatch.setenv(setting, endpoint)
     with pytest.raises(TransportError, match="strands-robots mesh keys init"):
-        posture.from_settings()
+        Posture.from_settings()
     monkeypatch.setenv("STRANDS_MESH_LOCAL_DEV", "true")
-    assert posture.from_settings().hub is None
+    assert Posture.from_settings().hub is None
 
 
 def test_multicast_leaves_loopback_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_MESH_MULTICAST", "true")
     with pytest.raises(TransportError, match="multicast"):
-        posture.from_settings()
+        Posture.from_settings()
 
 
 def test_none_needs_its_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/10.0.0.1:7447")
     monkeypatch.setenv("STRANDS_MESH_AUTH_MODE", "none")
     with pytest.raises(TransportError):
-        posture.from_settings()
+        Posture.from_settings()
     monkeypatch.setenv("STRANDS_MESH_I_KNOW_THIS_IS_INSECURE", "true")
-    assert posture.from_settings().connect == ("tcp/10.0.0.1:7447",)
+    assert Posture.from_settings().connect == ("tcp/10.0.0.1:7447",)
 
 
 @pytest.mark.parametrize(
@@ -67,10 +68,10 @@ def test_none_needs_its_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_loopback_is_told_by_the_address(endpoint: str, inside: bool) -> None:
-    assert posture.is_loopback(endpoint) is inside
+    assert zenoh_config.is_loopback(endpoint) is inside
 
 
-def use(monkeypatch: pytest.MonkeyPatch, issued: keys.Issued) -> None:
+def use(monkeypatch: pytest.MonkeyPatch, issued: zenoh_config.TlsCredentials) -> None:
     for name, value in issued.settings().items():
         monkeypatch.setenv(name, value)
 
@@ -78,7 +79,7 @@ def use(monkeypatch: pytest.MonkeyPatch, issued: keys.Issued) -> None:
 def test_certificates_bring_mutual_tls_and_access_control(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     keys.init(tmp_path)
     use(monkeypatch, keys.issue(tmp_path, "arm-1", ["192.168.1.2", "arm.example"]))
-    found = posture.from_settings()
+    found = Posture.from_settings()
     assert found.hub == "tls/127.0.0.1:7447"
     config = zenoh_config.hub(found)
     assert config["transport"]["link"]["protocols"] == ["tls"]
@@ -95,16 +96,16 @@ def test_files_that_others_may_read_or_that_are_links_are_refused(
     use(monkeypatch, issued)
     issued.key.chmod(0o640)
     with pytest.raises(TransportError, match="chmod 600"):
-        posture.from_settings()
+        Posture.from_settings()
     issued.key.chmod(0o600)
     link = tmp_path / "link.pem"
     link.symlink_to(issued.cert)
     monkeypatch.setenv("STRANDS_MESH_TLS_CERT", str(link))
     with pytest.raises(TransportError, match="symbolic link"):
-        posture.from_settings()
+        Posture.from_settings()
     monkeypatch.delenv("STRANDS_MESH_TLS_CERT")
     with pytest.raises(TransportError, match="STRANDS_MESH_TLS_CERT is not set"):
-        posture.from_settings()
+        Posture.from_settings()
 
 
 def test_access_rules_that_allow_by_default_need_the_opt_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -114,15 +115,15 @@ def test_access_rules_that_allow_by_default_need_the_opt_in(monkeypatch: pytest.
     monkeypatch.setenv("STRANDS_MESH_ACL_FILE", str(rules))
     rules.write_text("{enabled: true, /* hm */ default_permission: 'allow', rules: [], subjects: [], policies: []}")
     with pytest.raises(TransportError, match="STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"):
-        zenoh_config.hub(posture.from_settings())
+        zenoh_config.hub(Posture.from_settings())
     monkeypatch.setenv("STRANDS_MESH_ACCEPT_PERMISSIVE_ACL", "true")
-    assert zenoh_config.hub(posture.from_settings())["access_control"]["default_permission"] == "allow"
+    assert zenoh_config.hub(Posture.from_settings())["access_control"]["default_permission"] == "allow"
     rules.write_text("nonsense")
     with pytest.raises(TransportError, match="no access control"):
-        zenoh_config.hub(posture.from_settings())
+        zenoh_config.hub(Posture.from_settings())
     rules.write_text(" " * (257 * 1024))
     with pytest.raises(TransportError, match="256 KiB"):
-        posture.from_settings()
+        Posture.from_settings()
 
 
 def test_an_authority_and_a_certificate_are_made_once(tmp_path: Path) -> None:
@@ -157,7 +158,7 @@ def test_every_topic_has_a_size_and_only_telemetry_is_thinned_out() -> None:
 
 def test_stated_endpoints_route_for_others_and_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
-    config = zenoh_config.explicit(posture.from_settings())
+    config = zenoh_config.explicit(Posture.from_settings())
     assert config["mode"] == "router"
     assert config["connect"]["exit_on_failure"] is False
     assert config["connect"]["timeout_ms"] == -1
