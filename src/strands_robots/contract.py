@@ -157,6 +157,11 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
     return AdaptedRobot(robot, joints)
 
 
+def body_of(robot: Any) -> Any:
+    """The robot itself, where :func:`adapt` wrapped it anew for each of its networks."""
+    return getattr(robot, "wrapped", robot)
+
+
 class _PutAway:
     def refusal(self, verb: str) -> Envelope:
         return error(f"{verb} is refused: the robot is being taken off its network.")

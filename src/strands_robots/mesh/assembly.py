@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
-from strands_robots.contract import WorldRobot
+from strands_robots.contract import WorldRobot, body_of
 from strands_robots.mesh import session, topics
 from strands_robots.mesh.camera import CameraFeed
 from strands_robots.mesh.children import Children
@@ -188,7 +188,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
     caller = Caller(context)
     safety = FleetSafety(context, door, caller, lanes.resumes, robot=robot is not None)
-    teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, _body(robot), source, device), lanes)
+    teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, body_of(robot), source, device), lanes)
     inputs: dict[str, dict[str, Any]] = {}
 
     def halt(reason: str) -> StopVerdict:
@@ -266,10 +266,6 @@ def identity_of(transport: Transport) -> Identity:
     if posture is not None:
         return Identity.from_settings(posture.credentials)
     return Identity.from_settings(TlsCredentials.from_settings() if signature_policy() == "1" else None)
-
-
-def _body(robot: Any) -> Any:
-    return getattr(robot, "wrapped", robot)
 
 
 def _can_resume() -> bool:

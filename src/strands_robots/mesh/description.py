@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from strands_robots.contract import TaskRobot, WorldRobot
+from strands_robots.contract import TaskRobot, WorldRobot, body_of
 from strands_robots.envelope import is_error, text_of
 from strands_robots.mesh.dispatch import Robot
 
@@ -38,7 +38,7 @@ class Description:
             facts.update(self._part("task_status", lambda: _world_task(robot)))
             facts.update(self._part("features", lambda: _world_features(_told(robot.get_features()))))
             return facts
-        body = getattr(robot, "wrapped", robot)
+        body = body_of(robot)
         facts.update(self._part("task_status", lambda: _task(robot)))
         facts.update(self._part("features", lambda: _features(_told(robot.get_features()))))
         facts.update(self._part("connected", lambda: _typed(body, "connected", "is_connected", bool)))

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots import settings
+from strands_robots.contract import body_of
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lane
@@ -153,7 +154,7 @@ class SensorLoopsMixin:
 
     def add_robot_sensors(self) -> None:
         """Publish every sensor the robot itself can read, and the health of its host."""
-        body = getattr(self.robot, "wrapped", self.robot)
+        body = body_of(self.robot)
         own = getattr(body, "get_health", None)
         self.add_sensor("health", partial(health, _Contained(own, self._context.peer_id) if callable(own) else None))
         for name, kind in KINDS.items():

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from strands_robots.contract import WorldRobot
+from strands_robots.contract import WorldRobot, body_of
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 QUALITY = 80
@@ -41,7 +41,7 @@ def frames_of(robot: Any) -> Frames | None:
     A robot's own ``camera_frames()`` comes first, then a simulation's ``render``, then the pictures in a device's
     ``get_observation()``. A camera ``arm/wrist`` is called ``arm.wrist`` on the wire, which allows no slash.
     """
-    body = getattr(robot, "wrapped", robot)
+    body = body_of(robot)
     own, render, observe = (getattr(body, verb, None) for verb in ("camera_frames", "render", "get_observation"))
     if callable(own):
         given: Frames = own

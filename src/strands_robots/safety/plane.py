@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.audit import log_safety_event
-from strands_robots.contract import Haltable
+from strands_robots.contract import Haltable, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceDesk
@@ -152,7 +152,7 @@ class SafetyPlane:
         with self._registering:
             known = self._robots.get(robot_id)
             if known is not None:
-                if _body(known.robot) is not _body(robot):
+                if body_of(known.robot) is not body_of(robot):
                     raise ValidationError(f"robot_id {shown(robot_id)} is taken by another robot of this process.")
                 known.users += 1
                 if robot.gate not in known.gates:
@@ -384,11 +384,6 @@ class SafetyPlane:
     def _look(self) -> None:
         if any(entry.locked for entry in self._robots.values()):
             self._desk.look()
-
-
-def _body(robot: Stoppable) -> object:
-    """The robot itself, where ``contract.adapt`` wrapped it anew for each of its networks."""
-    return getattr(robot, "wrapped", robot)
 
 
 _PLANE = SafetyPlane()
