@@ -12,7 +12,7 @@ import weakref
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.policies.actions import numbers
+from strands_robots.policies.base import numbers
 
 NESTING_MAX = 4
 """Wrappers around wrappers that are looked through."""

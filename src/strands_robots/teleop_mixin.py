@@ -11,12 +11,10 @@ from functools import cached_property, partial
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.policies.rollout import STOP_JOIN_S, Body, Observers, Rollout
+from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout, RolloutObservers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, Waiting
 from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
-
-_LATE = "the loop still waits for its leader; it sends no action any more"
 
 METHODS = ("arm", "gamepad", "keyboard", "phone")
 
@@ -42,7 +40,7 @@ class TeleopMixin:
 
     gate: MotionGate
     starting: AbstractContextManager[Any]
-    observers: Observers
+    observers: RolloutObservers
     """Who is told of teleoperations, as of tasks."""
     input_sink: InputSink | None = None
     """Where frames go when ``publish`` is asked for; a network that carries input streams sets it."""
@@ -168,7 +166,7 @@ class TeleopMixin:
         running = self.teleoperating()
         for session in running.values():
             session.request_stop()
-        return {f"teleoperation {name}": partial(_ended, session, deadline) for name, session in running.items()}
+        return {f"teleoperation {name}": partial(session.ended_by, deadline) for name, session in running.items()}
 
     @cached_property
     def _teleop_leaders(self) -> dict[str, Attachment]:
@@ -233,9 +231,3 @@ class TeleopMixin:
                 "hz_actual": round(rollout.step_count / rollout.elapsed_s, 2) if rollout.elapsed_s > 0 else 0.0,
             }
         return rows
-
-
-def _ended(session: Rollout, deadline: float) -> Envelope:
-    if session.join(max(0.0, deadline - time.monotonic())):
-        return success("Stopped.", stopped=True)
-    return error(_LATE, stopped=False)

@@ -12,7 +12,7 @@ from fixtures.bodies import RecordingBody, ScriptedPolicy, StepClock
 from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
-from strands_robots.policies.rollout import Clock, Observers, Rollout, loop_options
+from strands_robots.policies.rollout import Clock, Rollout, RolloutObservers, rollout_options
 from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError
 
@@ -51,9 +51,10 @@ def test_a_rollout_ends_after_the_steps_it_was_asked_for() -> None:
 
 def test_the_rate_and_the_steps_are_taken_from_the_options_of_a_policy() -> None:
     options = {"control_frequency": 20, "n_steps": 7, "policy_port": 5000}
-    assert loop_options(options, 50.0) == (20.0, 7)
+    task = {"instruction": "wave", "duration": 3.0}
+    assert rollout_options("wave", 3, options, 50.0) == {**task, "hz": 20.0, "steps": 7}
     assert options == {"policy_port": 5000}
-    assert loop_options({}, 50.0) == (50.0, None)
+    assert rollout_options("wave", 3, {}, 50.0) == {**task, "hz": 50.0, "steps": None}
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_the_rate_and_the_steps_are_taken_from_the_options_of_a_policy() -> None
 )
 def test_a_rate_above_the_robots_own_and_steps_that_are_none_are_refused(option: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(option))):
-        loop_options(option, 50.0)
+        rollout_options("wave", 3, option, 50.0)
 
 
 def test_ticks_are_at_absolute_times_and_missed_ones_are_dropped() -> None:
@@ -152,7 +153,7 @@ def test_a_hold_that_fails_is_an_error_that_says_so() -> None:
 
 def test_observers_are_told_started_each_step_and_finished() -> None:
     seen: list[RolloutEvent] = []
-    observers = Observers()
+    observers = RolloutObservers()
     observers.subscribe(seen.append)
     run(ScriptedPolicy([{"a": 0.1}, {"a": 0.2}]), observers=observers, policy_name="scripted")
     assert [event.kind for event in seen] == ["started", "step", "step", "finished"]
@@ -167,7 +168,7 @@ def test_an_observer_that_raises_harms_neither_the_loop_nor_the_others(caplog: p
         raise RuntimeError("observer broke")
 
     seen: list[RolloutEvent] = []
-    observers = Observers()
+    observers = RolloutObservers()
     observers.subscribe(broken)
     observers.subscribe(seen.append)
     one, _ = run(ScriptedPolicy([{"a": 0.1}] * 5), observers=observers)
@@ -178,14 +179,14 @@ def test_an_observer_that_raises_harms_neither_the_loop_nor_the_others(caplog: p
 
 def test_an_observer_that_unsubscribed_is_told_no_more() -> None:
     seen: list[RolloutEvent] = []
-    observers = Observers()
+    observers = RolloutObservers()
     first, second = observers.subscribe(seen.append), observers.subscribe(seen.append)
     first()
     first()
-    observers.tell(RolloutEvent("started", "r", "i", "p"))
+    observers.notify(RolloutEvent("started", "r", "i", "p"))
     assert len(seen) == 1
     second()
-    observers.tell(RolloutEvent("started", "r", "i", "p"))
+    observers.notify(RolloutEvent("started", "r", "i", "p"))
     assert len(seen) == 1
 
 
@@ -274,7 +275,7 @@ def test_the_thread_carries_the_robots_name() -> None:
 
 
 def test_an_observer_that_stops_its_own_rollout_does_not_deadlock() -> None:
-    observers = Observers()
+    observers = RolloutObservers()
     body = RecordingBody()
     one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), observers=observers)
     said: list[bool] = []

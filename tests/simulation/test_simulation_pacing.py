@@ -13,7 +13,7 @@ from fixtures.waiting import eventually
 from strands_robots.safety.gate import MotionGate, PermitVoidError
 from strands_robots.simulation import Simulation
 from strands_robots.simulation.catalog import find
-from strands_robots.simulation.pacing import Clock
+from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.physics import Physics
 from strands_robots.simulation.stage import Plan, RobotPlan, compile_stage
 
@@ -59,7 +59,7 @@ def test_whoever_steps_by_hand_owns_the_clock(world: Simulation) -> None:
 
 
 def test_simulated_time_keeps_to_real_time(physics: Physics) -> None:
-    clock = Clock(physics)
+    clock = WorldClock(physics)
     began = time.monotonic()
     with clock.running():
         for passed in (0.05, 0.55):
@@ -151,7 +151,7 @@ def test_a_halt_stops_the_rover() -> None:
 
 
 def test_a_world_that_was_held_up_catches_up_within_a_second_and_lets_the_rest_go(physics: Physics) -> None:
-    clock = Clock(physics)
+    clock = WorldClock(physics)
     now = time.monotonic()
     clock.tick(now)
     for _ in range(200):

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.cli.mesh import joined, own_id
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.envelope import is_error, text_of
-from strands_robots.policies.actions import numbers
-from strands_robots.policies.base import Ranges
+from strands_robots.policies.base import Ranges, numbers
 from strands_robots.teleoperators.leader import LeaderPolicy
 from strands_robots.utils import ValidationError, number
 

@@ -9,8 +9,7 @@ from typing import Any
 from strands_robots.cli.far import LEADER, SILENT_S, Wait, found, leads, reason_of
 from strands_robots.cli.mesh import joined
 from strands_robots.cli.output import Exit, Failure, Screen
-from strands_robots.policies.actions import SpeedLimit, checked_action
-from strands_robots.policies.base import Ranges
+from strands_robots.policies.base import Ranges, SpeedLimit, checked_action
 from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, LeaderDone
 from strands_robots.utils import ValidationError, number
 

@@ -13,8 +13,7 @@ from strands_robots.bus_access import action_ranges, bus_lock, read_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
 from strands_robots.hardware.ports import require_port
-from strands_robots.policies.actions import numbers
-from strands_robots.policies.base import Action
+from strands_robots.policies.base import Action, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.utils import ValidationError, number, shown
 

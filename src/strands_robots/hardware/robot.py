@@ -16,8 +16,8 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
 from strands_robots.hardware.motors import joint_units, tells_temperature, temperatures
-from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks, ended
-from strands_robots.policies.actions import checked_action
+from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks
+from strands_robots.policies.base import checked_action
 from strands_robots.recording.cameras import Shots
 from strands_robots.safety.gate import MotionRefused, Permit, PermitVoidError
 from strands_robots.safety.persistence import hardware_key
@@ -193,7 +193,7 @@ class HardwareRobot(Tasks):
         task = self._task
         if task is not None and task.running:
             task.request_stop()
-            sources["task"] = partial(ended, task, deadline)
+            sources["task"] = partial(task.ended_by, deadline)
         sources.update(self.teleop_stops(deadline))
         if sending:
             sources["send_action"] = lambda: success("Sent.", stopped=True)

@@ -13,15 +13,12 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import DeviceBody
 from strands_robots.hardware.freezer import Freezer, NoAnswerError
 from strands_robots.policies.registry import create_policy, resolve_provider
-from strands_robots.policies.rollout import Observers, Rollout, loop_options
+from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
 from strands_robots.safety.gate import MotionGate, MotionRefused, Waiting
 from strands_robots.teleop_mixin import TeleopMixin
-from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
+from strands_robots.utils import MissingExtraError, ValidationError
 
 logger = logging.getLogger(__name__)
-
-DURATION_MAX_S = 86_400.0
-"""Longest task: a day."""
 
 WIND_DOWN_S = 5.0
 """How much longer than its duration :meth:`Tasks.run_task` waits for a task to end."""
@@ -40,7 +37,7 @@ class Tasks(TeleopMixin):
         self.starting = threading.RLock()
         self._body = body
         self._freezer = Freezer(body)
-        self.observers = Observers()
+        self.observers = RolloutObservers()
         self._task: Rollout | None = None
         self._waiting = Waiting()
 
@@ -111,7 +108,7 @@ class Tasks(TeleopMixin):
         deadline = time.monotonic() + ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
         task.request_stop()
         frozen = self._freeze(deadline)
-        answer = ended(task, deadline)
+        answer = task.ended_by(deadline)
         stopped = frozen is None and answer["status"] == "success"
         fields = {"stopped": stopped, "was_running": True, **self._task_fields()}
         if stopped:
@@ -138,11 +135,8 @@ class Tasks(TeleopMixin):
             return error(str(exc))
 
     def _begin(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
-        task = text("instruction", instruction)
-        seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
-        whole("policy_port", options["policy_port"], low=0, high=65535)
+        chosen = rollout_options(instruction, duration, options, self.control_hz)
         name = resolve_provider(provider)
-        hz, steps = loop_options(options, self.control_hz)
         # Before the line for the robot: a stop that comes while this waits, connects or loads is newer.
         permit = self.gate.permit("start_task")
         with self._waiting.until_begun(permit), self.starting:
@@ -158,12 +152,9 @@ class Tasks(TeleopMixin):
                 self._body,
                 policy,
                 permit=permit,
-                instruction=task,
                 policy_name=name,
-                duration=seconds,
-                steps=steps,
-                hz=hz,
                 observers=self.observers,
+                **chosen,
             )
             self._task = rollout
             rollout.start()
@@ -207,12 +198,3 @@ class Tasks(TeleopMixin):
             "duration": 0.0 if task is None else round(task.elapsed_s, 3),
             "error": "" if task is None else task.error,
         }
-
-
-def ended(rollout: Rollout, deadline: float) -> Envelope:
-    """Whether a loop that was asked to end has done so by ``deadline``, on the monotonic clock."""
-    if rollout.join(max(0.0, deadline - time.monotonic())):
-        return success("Stopped.", stopped=True)
-    return error(
-        f"its {rollout.policy_name} has not returned yet; the robot is frozen and takes no action of it", stopped=False
-    )

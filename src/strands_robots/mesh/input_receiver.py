@@ -16,7 +16,7 @@ from strands_robots.mesh import topics, wire
 from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, validate_mesh_identifier
 from strands_robots.mesh.transport import Sample
-from strands_robots.policies.actions import numbers
+from strands_robots.policies.base import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.utils import ValidationError
 

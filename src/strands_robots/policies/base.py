@@ -1,19 +1,23 @@
-"""What a policy is: it sees an observation and says which action comes next."""
+"""The policy protocol, and the check of the actions that policies and leaders ask of a robot."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
+
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.utils import ValidationError, mapping, number, shown
 
 Action = dict[str, float]
 """Targets by action key, in the robot's own units."""
 
 Ranges = Mapping[str, tuple[float, float]]
-"""Lowest and highest target of every action key the body has; infinite where the body declares none."""
+"""Lowest and highest target of every action key of a body; infinite where the body declares none."""
 
 
-class PolicyError(RuntimeError):
-    """A policy cannot go on, for a reason that its sentence tells in full: no traceback is needed."""
+class PolicyError(StrandsRobotsError, RuntimeError):
+    """A policy cannot go on; its message is complete, so it is logged without a traceback."""
 
 
 @runtime_checkable
@@ -29,14 +33,73 @@ class Policy(Protocol):
         """Prepare for a task: load, connect, seed. Raises whatever makes the task impossible."""
 
     def act(self, observation: Mapping[str, Any]) -> Action | Sequence[Action] | None:
-        """The next action, or a chunk of them played one a control step; None when the task is done.
+        """Return the next action, or a chunk of them played one a control step; None when the task is done.
 
-        An empty chunk lets this control step pass without a command. Only the numbers of a robot's own action keys
-        are accepted; the rollout ends with an error and a hold on anything else.
+        An empty chunk lets this control step pass without a command. Only numbers under the robot's own action keys
+        are accepted; anything else ends the rollout with an error, and the body keeps its last position.
         """
 
     def interrupt(self) -> None:
-        """The rollout is to end: a ``reset`` or ``act`` that waits shall give up. From another thread; never waits."""
+        """Make a waiting ``reset`` or ``act`` give up. Called from another thread; never waits."""
 
     def close(self) -> None:
-        """Free what the policy holds. Called once, whatever happened, also after a failed reset."""
+        """Free the policy's resources. Called once, whatever happened, also after a failed reset."""
+
+
+def checked_action(action: object, ranges: Ranges) -> Action:
+    """Return ``action`` with every value clamped to the range of its key.
+
+    Raises:
+        ValidationError: not a mapping, an unknown key, or a value that is no finite number.
+    """
+    checked: Action = {}
+    for key, value in mapping("action", action).items():
+        if key not in ranges:
+            raise ValidationError(f"action has no key {shown(key)}; the robot has {', '.join(ranges)}.")
+        low, high = ranges[key]
+        checked[key] = min(max(number(f"action[{key!r}]", _plain(value)), low), high)
+    return checked
+
+
+def numbers(observation: Mapping[str, object]) -> dict[str, float]:
+    """Return the finite numbers of an observation, without images, flags and text."""
+    finite: dict[str, float] = {}
+    for key, value in observation.items():
+        scalar = _plain(value)
+        if isinstance(scalar, int | float) and not isinstance(scalar, bool) and math.isfinite(scalar):
+            finite[key] = float(scalar)
+    return finite
+
+
+def _plain(value: object) -> object:
+    """Unwrap a scalar of an array package to a Python number; return anything else unchanged."""
+    item = getattr(value, "item", None)
+    return item() if callable(item) and getattr(value, "ndim", None) == 0 else value
+
+
+class SpeedLimit:
+    """Bound on how fast each target may change, in units a second of its key.
+
+    Args:
+        ranges: a key with a finite range may cross it ``full_ranges_per_s`` times a second.
+        full_ranges_per_s: above 0.
+        unbounded_per_s: bound of a key without a range, in its unit a second.
+    """
+
+    def __init__(self, ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> None:
+        self._per_s = {
+            key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
+            for key, (low, high) in ranges.items()
+        }
+
+    def limit(self, target: Action, last: Mapping[str, float], dt: float) -> Action:
+        """Return ``target``, moved no further from ``last`` than ``dt`` seconds allow.
+
+        A key without a last value is not limited.
+        """
+        limited: Action = {}
+        for key, value in target.items():
+            reach = self._per_s[key] * dt
+            before = last.get(key, value)
+            limited[key] = min(max(value, before - reach), before + reach)
+        return limited

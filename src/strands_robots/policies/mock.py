@@ -9,8 +9,7 @@ import random
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.policies.actions import numbers
-from strands_robots.policies.base import Action, Ranges
+from strands_robots.policies.base import Action, Ranges, numbers
 from strands_robots.utils import ValidationError, number, whole
 
 logger = logging.getLogger(__name__)

@@ -24,8 +24,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NoReturn
 
-from strands_robots.policies.actions import checked_action, numbers
-from strands_robots.policies.base import Action, PolicyError, Ranges
+from strands_robots.policies.base import Action, PolicyError, Ranges, checked_action, numbers
 from strands_robots.utils import ValidationError, choice, dial_host_error, flag, missing_extra, number, shown, whole
 
 DEFAULT_PORT = 8765

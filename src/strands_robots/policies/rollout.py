@@ -1,9 +1,8 @@
-"""One control loop: a policy drives a body at a steady rate until its time is over, it is done, or it is stopped.
+"""The control loop: a policy drives a body at a steady rate until its time is over, it is done, or it is stopped.
 
-The lock discipline of every write: a body sends an action only while the permit it is given is valid, and looks at
-that under the same lock as the write. Whoever stops a motion voids the permit first and then passes that lock once;
-from then on nothing is written. A rollout that ends in any other way than a halt leaves the body on hold, so the
-last action never goes on by itself.
+The lock discipline of every write: a body sends an action only while its permit is valid, and checks that under the
+same lock as the write. A stop voids the permit first and then passes that lock once; from then on nothing is written.
+A rollout that ends in any other way than a halt makes the body hold its position, so no last action goes on by itself.
 """
 
 from __future__ import annotations
@@ -14,42 +13,61 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypedDict
 
 from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
-from strands_robots.policies.actions import checked_action, numbers
-from strands_robots.policies.base import Action, Policy, PolicyError, Ranges
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.policies.base import Action, Policy, PolicyError, Ranges, checked_action, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
-from strands_robots.utils import ValidationError, number, whole
+from strands_robots.utils import ValidationError, number, text, whole
 
 logger = logging.getLogger(__name__)
 
 State = Literal["idle", "running", "completed", "stopped", "error"]
 
+DURATION_MAX_S = 86_400.0
+"""Longest rollout: a day."""
+
 STEPS_MAX = 10_000_000
-"""Most actions a rollout can be asked for."""
+"""Most actions of one rollout."""
 
 STOP_JOIN_S = 2.0
 """How long :meth:`Rollout.stop` waits for the loop by default."""
 
 
-def loop_options(options: dict[str, Any], hz: float) -> tuple[float, int | None]:
-    """Take from a policy's ``options`` what is the loop's own: its rate in Hz and how many actions end it.
+class RolloutOptions(TypedDict):
+    """The arguments of :class:`Rollout` that a caller chooses."""
+
+    instruction: str
+    duration: float
+    hz: float
+    steps: int | None
+
+
+def rollout_options(instruction: object, duration: object, policy: dict[str, Any], hz: float) -> RolloutOptions:
+    """Check a request for a rollout.
 
     Args:
-        options: ``control_frequency``, 0.1 to ``hz``, and ``n_steps``, 1 to 10,000,000; each is taken out, where it is.
+        instruction: the task, 1 to 2000 characters.
+        duration: seconds, above 0 up to :data:`DURATION_MAX_S`.
+        policy: options of the policy. Those of the loop itself are taken out: ``control_frequency``, 0.1 to ``hz``,
+            and ``n_steps``, 1 to 10,000,000.
         hz: the robot's own rate.
 
     Raises:
         ValidationError: a value outside its domain.
     """
-    rate = number("control_frequency", options.pop("control_frequency", hz), low=min(0.1, hz), high=hz)
-    steps = options.pop("n_steps", None)
-    return rate, None if steps is None else whole("n_steps", steps, low=1, high=STEPS_MAX)
+    task = text("instruction", instruction)
+    seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
+    whole("policy_port", policy.get("policy_port", 0), low=0, high=65535)
+    rate = number("control_frequency", policy.pop("control_frequency", hz), low=min(0.1, hz), high=hz)
+    steps = policy.pop("n_steps", None)
+    count = None if steps is None else whole("n_steps", steps, low=1, high=STEPS_MAX)
+    return {"instruction": task, "duration": seconds, "hz": rate, "steps": count}
 
 
 class Body(Protocol):
-    """What a rollout or a teleoperation drives: one arm, one base."""
+    """One arm or one base that a rollout or a teleoperation drives."""
 
     name: str
 
@@ -58,27 +76,27 @@ class Body(Protocol):
         """Range of every action key, in the body's own units."""
 
     def get_observation(self) -> dict[str, Any]:
-        """Everything the body sees; may hold images."""
+        """Return the numbers and images that the body observes."""
 
     def get_joints(self) -> dict[str, float]:
-        """The numbers of an observation, read without touching a camera."""
+        """Return the numbers of an observation, read without touching a camera."""
 
     def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
-        """Write ``action``; the answer is what was really sent.
+        """Write ``action`` and return what was really sent.
 
         Raises:
-            PermitVoidError: ``permit`` is void, looked at under the write's own lock; nothing was written.
+            PermitVoidError: ``permit`` is void, which is checked under the lock of the write; nothing was written.
         """
 
     def hold(self, permit: Permit | None = None) -> None:
-        """Freeze where it is now; nothing when ``permit`` was revoked, for then the halt freezes it."""
+        """Freeze the body where it is; do nothing when ``permit`` was revoked, because that halt freezes it."""
 
     def running(self) -> AbstractContextManager[None]:
-        """Held while a loop drives the body."""
+        """Return a context that is entered while a loop drives the body."""
 
 
 class Clock:
-    """Monotonic time, and waiting until a moment of it; a test gives its own."""
+    """Monotonic time, and waiting until a moment of it. Tests replace it."""
 
     def now(self) -> float:
         return time.monotonic()
@@ -90,8 +108,8 @@ class Clock:
             stop.wait(left)
 
 
-class Observers:
-    """Who is told of rollout events. One that raises is logged, once for each kind of error, and stays."""
+class RolloutObservers:
+    """Observers of rollout events. One that raises stays subscribed and is logged once for each kind of error."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -99,7 +117,7 @@ class Observers:
         self._logged: set[tuple[int, str]] = set()
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Tell ``observer`` of every event until the returned callable is called; a second call of it does nothing."""
+        """Call ``observer`` with every event until the returned callable is called, which may be called twice."""
         with self._lock:
             self._observers = (*self._observers, observer)
         once = threading.Lock()
@@ -113,32 +131,32 @@ class Observers:
 
         return unsubscribe
 
-    def tell(self, event: RolloutEvent) -> None:
-        """Tell everybody, in the calling thread."""
+    def notify(self, event: RolloutEvent) -> None:
+        """Call every observer, in the calling thread."""
         for observer in self._observers:
             try:
                 observer(event)
             except Exception as exc:
-                mark = (id(observer), type(exc).__name__)
-                if mark not in self._logged:
-                    self._logged.add(mark)
-                    logger.exception("An observer of %s raised and goes on being told.", event.robot)
+                failure = (id(observer), type(exc).__name__)
+                if failure not in self._logged:
+                    self._logged.add(failure)
+                    logger.exception("An observer of %s raised; it stays subscribed.", event.robot)
 
 
 class Rollout:
-    """One run of one policy on one body, on a thread of its own. It is used once.
+    """One run of one policy on one body, on its own thread. A rollout is used once.
 
     Args:
-        body: what is driven.
-        policy: who decides; closed at the end.
-        permit: leave to move. Revoked by a halt, withdrawn by :meth:`stop`.
-        instruction: what the policy is told.
-        policy_name: how the policy is called in events and answers.
+        body: driven by the policy.
+        policy: decides the actions; closed at the end.
+        permit: permission to move, revoked by a halt and withdrawn by :meth:`stop`.
+        instruction: the task, passed to the policy.
+        policy_name: the policy's name in events and answers.
         duration: seconds, or None for no end.
         steps: actions, or None for no end.
-        hz: control rate. Ticks are at absolute times; one that is missed is dropped, never made up in a burst.
-        observers: who is told of events.
-        clock: the time the loop keeps.
+        hz: control rate. Ticks are at absolute times; a missed tick is dropped, never made up later.
+        observers: called with the rollout's events.
+        clock: the loop's time.
     """
 
     def __init__(
@@ -152,7 +170,7 @@ class Rollout:
         duration: float | None = None,
         steps: int | None = None,
         hz: float = 50.0,
-        observers: Observers | None = None,
+        observers: RolloutObservers | None = None,
         clock: Clock | None = None,
     ) -> None:
         self.instruction = instruction
@@ -167,32 +185,32 @@ class Rollout:
         self._policy = policy
         self._permit = permit
         self._period = 1 / hz
-        self._observers = observers or Observers()
+        self._observers = observers or RolloutObservers()
         self._clock = clock or Clock()
-        self._ending = threading.Event()
-        self._began: float | None = None
-        self._ended: float | None = None
+        self._stop_requested = threading.Event()
+        self._started_at: float | None = None
+        self._ended_at: float | None = None
         self._thread = threading.Thread(target=self.run, name=f"rollout-{body.name}", daemon=True)
 
     @property
     def robot(self) -> str:
-        """The name of the body."""
+        """Name of the body."""
         return self._body.name
 
     @property
     def running(self) -> bool:
-        """True from :meth:`start` until the loop's thread has ended, whatever it was told."""
+        """True from :meth:`start` until the loop's thread has ended, even after a stop was requested."""
         return self.state == "running" or self._thread.is_alive()
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds since it began, or that it took."""
-        if self._began is None:
+        """Seconds since the start, or the time it took."""
+        if self._started_at is None:
             return 0.0
-        return (self._clock.now() if self._ended is None else self._ended) - self._began
+        return (self._clock.now() if self._ended_at is None else self._ended_at) - self._started_at
 
     def row(self) -> dict[str, Any]:
-        """The rollout as a row of ``list_policies_running``."""
+        """Return the rollout as a row of ``list_policies_running``."""
         return {
             "robot": self.robot,
             "instruction": self.instruction,
@@ -207,7 +225,7 @@ class Rollout:
         self._thread.start()
 
     def join(self, timeout: float | None = None) -> bool:
-        """Wait for the end; True when the loop has ended."""
+        """Wait for the end and return True when the loop has ended."""
         if self._thread.ident is not None and threading.current_thread() is not self._thread:
             self._thread.join(timeout)
         return not self.running
@@ -215,39 +233,47 @@ class Rollout:
     def request_stop(self) -> None:
         """Void the permit, wake the loop and tell the policy; returns at once."""
         self._permit.withdraw()
-        self._ending.set()
+        self._stop_requested.set()
         try:
             self._policy.interrupt()
         except Exception:
             logger.exception("The policy %s of %s raised when interrupted.", self.policy_name, self.robot)
 
     def stop(self, timeout: float = STOP_JOIN_S) -> bool:
-        """Stop, and tell the truth: False when the loop has not ended within ``timeout`` seconds.
+        """Stop, and return False when the loop has not ended within ``timeout`` seconds.
 
         A loop that outlives it, in a policy that computes or on a bus that hangs, sends no action any more.
         """
         self.request_stop()
         return self.join(timeout)
 
+    def ended_by(self, deadline: float) -> Envelope:
+        """Answer a stop: wait for the requested end until ``deadline`` on the monotonic clock."""
+        if self.join(max(0.0, deadline - time.monotonic())):
+            return success("Stopped.", stopped=True)
+        return error(
+            f"the loop of its {self.policy_name} has not returned yet; it sends no action any more", stopped=False
+        )
+
     def run(self) -> None:
-        """The loop, in the calling thread."""
+        """Run the loop in the calling thread."""
         self.state = "running"
-        self._began = self._clock.now()
+        self._started_at = self._clock.now()
         state: State = "stopped"
         try:
             with self._body.running():
-                self._tell("started")
+                self._notify("started")
                 try:
                     bounds = dict(self._body.bounds)
                     self._policy.reset(self.instruction, bounds)
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"
-                except BaseException as exc:  # noqa: BLE001 - whatever a policy raises, SystemExit too, is told and held
-                    # What was told to stop may give up in any way it likes.
+                except BaseException as exc:  # noqa: BLE001 - whatever a policy raises, SystemExit too, is reported
+                    # A policy that was asked to stop may give up with any exception.
                     if self._permit.valid:
                         state, self.error = "error", f"{type(exc).__name__}: {exc}"
-                        self._lament(exc)
+                        self._log_failure(exc)
                 state = self._hold(state)
         except Exception as exc:
             state, self.error = "error", f"{type(exc).__name__}: {exc}"
@@ -255,35 +281,33 @@ class Rollout:
         finally:
             self._finish(state)
 
-    def _lament(self, exc: BaseException) -> None:
-        what = "The rollout of %s on %s failed; it holds: %s"
-        if isinstance(exc, PolicyError | OSError | ValidationError):
-            logger.error(what, self.policy_name, self.robot, exc)
-        else:
-            logger.error(what, self.policy_name, self.robot, exc, exc_info=exc)
+    def _log_failure(self, exc: BaseException) -> None:
+        expected = isinstance(exc, PolicyError | OSError | ValidationError)
+        message = "The rollout of %s on %s failed and the robot holds its position: %s"
+        logger.error(message, self.policy_name, self.robot, exc, exc_info=None if expected else exc)
 
     def _loop(self, bounds: Ranges) -> State:
         started = self._clock.now()
         chunk: deque[Action] = deque()
         tick = 0
         while self._permit.valid:
-            # A duration begins with the first tick: loading a policy is not part of it.
+            # The duration starts with the first tick: loading a policy is not part of it.
             if self.duration is not None and self._clock.now() - started >= self.duration:
                 return "completed"
             if self._steps is not None and self.step_count >= self._steps:
                 return "completed"
             observation = self._observe()
             if not chunk:
-                decided = self._policy.act(observation)
-                if decided is None:
+                actions = self._policy.act(observation)
+                if actions is None:
                     return "completed"
-                chunk.extend([decided] if isinstance(decided, Mapping) else decided)
+                chunk.extend([actions] if isinstance(actions, Mapping) else actions)
             if chunk:
                 sent = self._body.send_action(checked_action(chunk.popleft(), bounds), self._permit)
                 self.step_count += 1
-                self._tell("step", observation=numbers(observation), action=numbers(sent))
+                self._notify("step", observation=numbers(observation), action=numbers(sent))
             tick = self._next(tick, started)
-            self._clock.wait(started + tick * self._period, self._ending)
+            self._clock.wait(started + tick * self._period, self._stop_requested)
         return "stopped"
 
     def _next(self, tick: int, started: float) -> int:
@@ -297,8 +321,8 @@ class Rollout:
     def _hold(self, state: State) -> State:
         try:
             self._body.hold(self._permit)
-        except Exception as exc:  # noqa: BLE001 - a body may raise anything; the rollout ends in error and says it
-            logger.critical("%s could not be put on hold after its rollout: %s", self.robot, exc)
+        except Exception as exc:  # noqa: BLE001 - a body may raise anything; the rollout ends in error
+            logger.critical("%s could not hold its position after its rollout: %s", self.robot, exc)
             self.error = f"{self.error + '; ' if self.error else ''}hold failed: {type(exc).__name__}: {exc}"
             return "error"
         return state
@@ -309,12 +333,12 @@ class Rollout:
             self._policy.close()
         except Exception:
             logger.exception("The policy %s of %s raised when closed.", self.policy_name, self.robot)
-        self._ended = self._clock.now()
+        self._ended_at = self._clock.now()
         self.state = state
-        self._tell("finished", state=state, error=self.error)
+        self._notify("finished", state=state, error=self.error)
 
-    def _tell(self, kind: Literal["started", "step", "finished"], **more: Any) -> None:
-        self._observers.tell(
+    def _notify(self, kind: Literal["started", "step", "finished"], **more: Any) -> None:
+        self._observers.notify(
             RolloutEvent(
                 kind=kind,
                 robot=self.robot,

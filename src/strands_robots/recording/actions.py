@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from strands_robots.policies.actions import numbers
-from strands_robots.policies.base import Action
+from strands_robots.policies.base import Action, numbers
 from strands_robots.recording.file import STEP, Entry, Joints, read_items, whose
 from strands_robots.teleoperators.recorded import Frame
 from strands_robots.utils import ValidationError, shown

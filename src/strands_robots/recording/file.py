@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from strands_robots.policies.actions import numbers
+from strands_robots.policies.base import numbers
 from strands_robots.recording import schemas
 from strands_robots.recording._compat import close_chunk
 from strands_robots.recording.schemas import Schema

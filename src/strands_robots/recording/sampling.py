@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot, adapt
 from strands_robots.envelope import text_of
-from strands_robots.policies.actions import numbers
+from strands_robots.policies.base import numbers
 from strands_robots.recording.cameras import Frames, jpeg
 from strands_robots.recording.file import STEP, Recorder
 from strands_robots.utils import number

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from strands_robots.safety.gate import Permit
-from strands_robots.simulation.pacing import Clock
+from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.parts import RobotParts
 from strands_robots.simulation.physics import Physics
 from strands_robots.utils import ValidationError, mapping, number
@@ -16,7 +16,7 @@ from strands_robots.utils import ValidationError, mapping, number
 class RobotBody:
     """Observations and actions of one robot by joint and actuator name, without its prefix in the world."""
 
-    def __init__(self, name: str, physics: Physics, clock: Clock) -> None:
+    def __init__(self, name: str, physics: Physics, clock: WorldClock) -> None:
         self.name = name
         self._physics = physics
         self._clock = clock

@@ -8,7 +8,7 @@ from typing import Any
 
 from strands_robots.safety.gate import MotionGate
 from strands_robots.simulation.body import RobotBody
-from strands_robots.simulation.pacing import Clock
+from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.parts import RobotParts
 from strands_robots.simulation.physics import Physics
 from strands_robots.simulation.stage import Plan, compile_stage
@@ -23,7 +23,7 @@ class WorldCore:
         # Whoever builds the world or starts a motion holds this; whoever stops one never does.
         self.starting: AbstractContextManager[Any] = threading.RLock()
         self._physics = Physics(compile_stage(plan))
-        self._clock = Clock(self._physics, on_command=realtime)
+        self._clock = WorldClock(self._physics, on_command=realtime)
         self._bodies: dict[str, RobotBody] = {}
         self._closed = False
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,19 +11,16 @@ from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.registry import create_policy
-from strands_robots.policies.rollout import STOP_JOIN_S, Observers, Rollout, loop_options
+from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options
 from strands_robots.safety.gate import Waiting
 from strands_robots.simulation.arguments import answered
 from strands_robots.simulation.body import RobotBody
 from strands_robots.simulation.pictures import Pictures
 from strands_robots.simulation.stage import Plan
 from strands_robots.teleop_mixin import TeleopMixin
-from strands_robots.utils import MissingExtraError, ValidationError, number, text, whole
+from strands_robots.utils import MissingExtraError, ValidationError
 
 logger = logging.getLogger(__name__)
-
-DURATION_MAX_S = 86_400.0
-"""Longest rollout: a day."""
 
 TEARDOWN_S = 5.0
 """How much longer than its duration :meth:`Rollouts.run_policy` waits for a rollout to end."""
@@ -35,7 +31,7 @@ class Rollouts(Pictures, TeleopMixin):
 
     def __init__(self, plan: Plan, *, realtime: bool) -> None:
         super().__init__(plan, realtime=realtime)
-        self.observers = Observers()
+        self.observers = RolloutObservers()
         self._rollouts: dict[str, Rollout] = {}
         self._waiting = Waiting()
 
@@ -127,11 +123,7 @@ class Rollouts(Pictures, TeleopMixin):
     def _start_rollout(
         self, robot_name: str, instruction: str, provider: str, duration: float, options: dict[str, Any]
     ) -> Rollout:
-        task = text("instruction", instruction)
-        seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
-        if not whole("policy_port", options.get("policy_port", 0), low=0, high=65535):
-            options.pop("policy_port", None)
-        hz, steps = loop_options(options, settings.number("STRANDS_CONTROL_HZ"))
+        chosen = rollout_options(instruction, duration, options, settings.number("STRANDS_CONTROL_HZ"))
         permit = self.gate.permit("start_policy")
         with self._waiting.until_begun(permit, self.body(robot_name).name):
             try:
@@ -148,12 +140,9 @@ class Rollouts(Pictures, TeleopMixin):
                     body,
                     policy,
                     permit=permit,
-                    instruction=task,
                     policy_name=provider,
-                    duration=seconds,
-                    steps=steps,
-                    hz=hz,
                     observers=self.observers,
+                    **chosen,
                 )
                 self._rollouts[body.name] = rollout
                 rollout.start()
@@ -186,13 +175,8 @@ class Rollouts(Pictures, TeleopMixin):
         running = self._running()
         for rollout in running.values():
             _ask(rollout)
-        waits = {name: partial(self._ended, name, rollout, deadline) for name, rollout in running.items()}
+        waits = {name: partial(rollout.ended_by, deadline) for name, rollout in running.items()}
         return {**waits, **self.teleop_stops(deadline)}
-
-    def _ended(self, name: str, rollout: Rollout, deadline: float) -> Envelope:
-        if rollout.join(max(0.0, deadline - time.monotonic())):
-            return success(f"{name} stopped.", stopped=True)
-        return error(f"frozen, but its policy {rollout.policy_name} has not returned yet", stopped=False)
 
 
 def _ask(rollout: Rollout) -> None:

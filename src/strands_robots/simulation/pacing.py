@@ -2,7 +2,7 @@
 
 Stepping releases the GIL, and thirty worlds that each wake a thread two hundred times a second would spend more
 time handing it round than computing; one thread visits them in turn instead. A world runs while somebody holds a
-:meth:`Clock.running` lease (a rollout, a teleoperation session) or was commanded within the last
+:meth:`WorldClock.running` lease (a rollout, a teleoperation session) or was commanded within the last
 :data:`SETTLE_S`. Whoever steps by hand owns the clock until the next lease: then commands alone start nothing,
 and the same steps give the same numbers.
 """
@@ -38,7 +38,7 @@ VISIT_S = 0.01
 _CHUNK = 16
 
 
-class Clock:
+class WorldClock:
     """Paces one world. ``slipped_s`` is the simulated time that was let go because the machine was too slow."""
 
     def __init__(self, physics: Physics, *, on_command: bool = True) -> None:
@@ -142,10 +142,10 @@ class _Pacer:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._clocks: list[Clock] = []
+        self._clocks: list[WorldClock] = []
         self._thread: threading.Thread | None = None
 
-    def wake(self, clock: Clock) -> None:
+    def wake(self, clock: WorldClock) -> None:
         with self._lock:
             if clock.closed:
                 return
@@ -155,7 +155,7 @@ class _Pacer:
                 self._thread = threading.Thread(target=self._run, name="simulation-pacer", daemon=True)
                 self._thread.start()
 
-    def forget(self, clock: Clock) -> None:
+    def forget(self, clock: WorldClock) -> None:
         """Wait until ``clock`` is visited no more, and until the thread is gone when it was the last."""
         with self._lock:
             thread = self._thread
@@ -177,7 +177,7 @@ class _Pacer:
             due = max(due + TICK_S * max(1.0, len(clocks) / WORLDS_A_TICK), time.monotonic())
             time.sleep(max(0.0, due - time.monotonic()))
 
-    def _visited(self) -> list[Clock]:
+    def _visited(self) -> list[WorldClock]:
         """The clocks that still run; the thread ends when there is none, and says so under the lock."""
         with self._lock:
             for clock in [c for c in self._clocks if not c.wanted]:
@@ -187,7 +187,7 @@ class _Pacer:
                 self._thread = None
             return list(self._clocks)
 
-    def _visit(self, clock: Clock, now: float) -> None:
+    def _visit(self, clock: WorldClock, now: float) -> None:
         try:
             clock.tick(now)
         except Exception:

@@ -13,7 +13,7 @@ from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.rendering import Picture, Renderer, RenderingError
 from strands_robots.simulation.scene import draw_path
 from strands_robots.simulation.stage import Plan
-from strands_robots.simulation.views import OVERVIEW, View, find_camera, look, pose
+from strands_robots.simulation.views import OVERVIEW, CameraView, find_camera, look, pose
 from strands_robots.utils import ValidationError, flag
 
 How = Literal["opengl", "projection"]
@@ -77,7 +77,7 @@ class Pictures(Construction):
             picture = draw_path(picture, self.view(camera).pixels(points, width, height))
         return picture, how
 
-    def view(self, camera: str = OVERVIEW) -> View:
+    def view(self, camera: str = OVERVIEW) -> CameraView:
         """Where ``camera`` stands at this moment, to put world points into a picture."""
         snapshot = self._physics.snapshot
         data = mujoco.MjData(snapshot.stage.model)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from strands_robots.simulation.solids import Face, faces_of
 from strands_robots.simulation.stage import Floats, Stage
-from strands_robots.simulation.views import View
+from strands_robots.simulation.views import CameraView
 
 Pixels = NDArray[np.float32]
 
@@ -26,7 +26,7 @@ _FINE = 2
 """Drawn this many times larger and averaged: anti-aliasing."""
 
 
-def draw(stage: Stage, data: Any, view: View, width: int, height: int) -> NDArray[np.uint8]:
+def draw(stage: Stage, data: Any, view: CameraView, width: int, height: int) -> NDArray[np.uint8]:
     """The picture (height, width, 3) that ``view`` has of the pose in ``data``."""
     wide, high = width * _FINE, height * _FINE
     faces, floor = faces_of(stage, data)
@@ -38,7 +38,7 @@ def draw(stage: Stage, data: Any, view: View, width: int, height: int) -> NDArra
     return picture
 
 
-def _fill(image: Pixels, depth: Pixels, face: Face, view: View) -> None:
+def _fill(image: Pixels, depth: Pixels, face: Face, view: CameraView) -> None:
     """Draw one convex face where it is nearer than what is there."""
     towards = view.position - face.points[0]
     if float(face.normal @ towards) <= 0:
@@ -78,7 +78,7 @@ def _shade(face: Face, towards: Floats) -> Floats:
     return face.colour * (0.30 + 0.16 * sky + 0.58 * lit) + 255.0 * 0.18 * face.shine * gloss * (lit > 0)
 
 
-def _background(view: View, wide: int, high: int, shadow_of: list[Face] | None) -> tuple[Pixels, Pixels]:
+def _background(view: CameraView, wide: int, high: int, shadow_of: list[Face] | None) -> tuple[Pixels, Pixels]:
     """Sky, and the tiled floor with its shadows where there is one; the depth buffer holds one over depth."""
     ramp = np.linspace(0, 1, high, dtype=np.float32)[:, None, None]
     image = np.broadcast_to(_SKY_TOP * (1 - ramp) + _SKY_LOW * ramp, (high, wide, 3)).astype(np.float32)

@@ -18,7 +18,7 @@ from strands_robots.simulation import gl
 from strands_robots.simulation.engine import BACKEND, mujoco
 from strands_robots.simulation.physics import Snapshot
 from strands_robots.simulation.stage import Stage
-from strands_robots.simulation.views import View, find_camera, look, pose
+from strands_robots.simulation.views import CameraView, find_camera, look, pose
 
 Picture = NDArray[np.uint8]
 
@@ -98,7 +98,7 @@ def _free(contexts: dict[tuple[int, int, bool], Any]) -> None:
         contexts.popitem()[1].close()
 
 
-def _mujoco_camera(view: View) -> Any:
+def _mujoco_camera(view: CameraView) -> Any:
     if view.lookat is None:
         return view.camera
     camera = mujoco.MjvCamera()

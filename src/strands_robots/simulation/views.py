@@ -18,7 +18,7 @@ AZIMUTH, ELEVATION = 128.0, -20.0
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """A camera: ``position`` in metres, ``rotation`` with its right, up and backward axes as columns, ``fovy`` in
     degrees of the picture's height. ``lookat`` and ``distance`` are those of the overview, else None and 0."""
 
@@ -61,11 +61,11 @@ def find_camera(stage: Stage, name: object) -> str:
     raise ValidationError(f"camera must be one of {', '.join(names)}, not {shown(name)}.")
 
 
-def look(stage: Stage, data: Any, name: str) -> View:
+def look(stage: Stage, data: Any, name: str) -> CameraView:
     """The view of ``name`` (a full name) in the pose that ``data`` holds."""
     if name != OVERVIEW:
         index = stage.model.camera(name).id
-        return View(
+        return CameraView(
             name,
             data.cam_xpos[index].copy(),
             data.cam_xmat[index].reshape(3, 3).copy(),
@@ -76,7 +76,9 @@ def look(stage: Stage, data: Any, name: str) -> View:
     forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     rotation = np.stack([right, np.cross(right, forward), -forward], axis=1)
-    return View(name, lookat - distance * forward, rotation, float(stage.model.vis.global_.fovy), lookat, distance)
+    return CameraView(
+        name, lookat - distance * forward, rotation, float(stage.model.vis.global_.fovy), lookat, distance
+    )
 
 
 def _fit(stage: Stage, data: Any) -> tuple[Floats, float]:

@@ -13,8 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from strands_robots.policies.actions import SpeedLimit, checked_action, numbers
-from strands_robots.policies.base import Action, Ranges
+from strands_robots.policies.base import Action, Ranges, SpeedLimit, checked_action, numbers
 from strands_robots.utils import ValidationError, mapping, number
 
 logger = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from strands_robots.policies.actions import SpeedLimit, checked_action, numbers
+from strands_robots.policies.base import SpeedLimit, checked_action, numbers
 from strands_robots.utils import ValidationError
 
 RANGES = {"a": (-1.0, 1.0), "b": (-math.inf, math.inf)}
