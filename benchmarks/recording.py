@@ -16,7 +16,14 @@ from mcap.writer import Writer
 
 from benchmarks.table import Row
 from strands_robots.hardware import HardwareRobot
-from strands_robots.recording import Entry, Joints, Picture, Recorder, RobotRecording, read_items
+from strands_robots.recording import (
+    RecordedEvent,
+    RecordedJoints,
+    RecordedPicture,
+    Recorder,
+    RobotRecording,
+    read_items,
+)
 from strands_robots.recording.cameras import jpeg
 
 ARMS, HZ, CAMERA_HZ = 8, 50.0, 15.0
@@ -75,9 +82,9 @@ def recorded(folder: Path, seconds: float) -> Row:
     for robot in robots:
         robot.cleanup()
     items = list(read_items(path))
-    told = sum(isinstance(item, Entry) and item.event == "streamStep" for item in items)
-    joints = sum(isinstance(item, Joints) for item in items)
-    pictures = sum(isinstance(item, Picture) for item in items)
+    told = sum(isinstance(item, RecordedEvent) and item.event == "streamStep" for item in items)
+    joints = sum(isinstance(item, RecordedJoints) for item in items)
+    pictures = sum(isinstance(item, RecordedPicture) for item in items)
     sent = int(seconds * HZ) * ARMS
     bare = bare_share(folder / "bare.mcap", seconds, camera)
     skipped = sum((sampling.skipped for sampling in samplings), Counter[str]())

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.teleoperators.leader import BoundedLeader, LeaderDone, LeaderPolicy
+from strands_robots.teleoperators.leader import BoundedLeader, LeaderFinished, LeaderPolicy
 from strands_robots.utils import ValidationError
 
 RANGES = {"pan.pos": (-100.0, 100.0)}
@@ -39,7 +39,7 @@ def test_targets_are_clamped_and_keys_that_the_follower_has_not_are_counted_unus
 def test_after_the_end_the_last_frame_is_held() -> None:
     def gives() -> dict[str, float]:
         if gave:
-            raise LeaderDone("over")
+            raise LeaderFinished("over")
         gave.append(1)
         return {"pan.pos": 1.0}
 

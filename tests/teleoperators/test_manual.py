@@ -13,7 +13,7 @@ from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.teleoperators.leader import LeaderDone
+from strands_robots.teleoperators.leader import LeaderFinished
 from strands_robots.teleoperators.manual import GamepadLeader, KeyboardLeader
 from strands_robots.teleoperators.recorded import RecordedLeader, read_frames, write_csv
 from strands_robots.utils import ValidationError
@@ -41,7 +41,7 @@ def test_a_recording_is_played_at_its_own_times_and_ends() -> None:
     watch.seconds += 1.0
     assert leader.get_action() == {"a": 10.0, "b": 3.0}
     watch.seconds += 0.01
-    with pytest.raises(LeaderDone):
+    with pytest.raises(LeaderFinished):
         leader.get_action()
     assert (leader.duration, leader.position, leader.keys) == (3.0, 3.0, ("a", "b"))
 
@@ -123,7 +123,7 @@ def test_keys_push_joints_inside_their_ranges_and_escape_ends(terminal: tuple[in
         os.write(person, b"s" * 60)
         eventually(lambda: leader.get_action()["grip.pos"] == 0.0)
         os.write(person, b"\x1b")
-        with pytest.raises(LeaderDone):
+        with pytest.raises(LeaderFinished):
             eventually(lambda: leader.get_action() is None)
     assert not leader.is_connected
 
@@ -155,7 +155,7 @@ def test_sticks_push_joints_and_a_button_ends(tmp_path: Path) -> None:
         watch.seconds += 60
         assert leader.get_action()["pan.pos"] == pytest.approx(6.0), "a pause is not saved up"
         pad.write(event(1, 1, 1))
-        with pytest.raises(LeaderDone):
+        with pytest.raises(LeaderFinished):
             leader.get_action()
         assert leader.get_teleop_events() == {"button_1": True}
     with pytest.raises(ValidationError, match="cannot be opened"):

@@ -10,7 +10,7 @@ from strands_robots.cli.far import LEADER, SILENT_S, Wait, found, leads, reason_
 from strands_robots.cli.mesh import joined
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.policies.base import Ranges, SpeedLimit, checked_action
-from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, LeaderDone
+from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, LeaderFinished
 from strands_robots.utils import ValidationError, number
 
 NOBODY = "none"
@@ -100,7 +100,7 @@ class _Ending:
     def get_action(self) -> dict[str, Any]:
         try:
             return dict(self._leader.get_action())
-        except LeaderDone:
+        except LeaderFinished:
             self.done = True
             raise
 

@@ -10,28 +10,28 @@
 
 from __future__ import annotations
 
-from strands_robots.recording.actions import recorded_actions
 from strands_robots.recording.file import (
     CHUNK_BYTES,
     STEP,
-    Entry,
-    Joints,
-    Picture,
+    RecordedEvent,
+    RecordedJoints,
+    RecordedPicture,
     Recorder,
-    read_entries,
+    read_events,
     read_items,
+    recorded_actions,
 )
 from strands_robots.recording.sampling import RobotRecording
 
 __all__ = [
     "CHUNK_BYTES",
     "STEP",
-    "Entry",
-    "Joints",
-    "Picture",
+    "RecordedEvent",
+    "RecordedJoints",
+    "RecordedPicture",
     "Recorder",
     "RobotRecording",
-    "read_entries",
+    "read_events",
     "read_items",
     "recorded_actions",
 ]

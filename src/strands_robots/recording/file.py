@@ -1,4 +1,4 @@
-"""The file of a recording: MCAP (mcap.dev/spec), written in small chunks, readable to its last whole chunk."""
+"""MCAP files of recordings (mcap.dev/spec), written in small chunks and readable up to the last whole chunk."""
 
 from __future__ import annotations
 
@@ -13,46 +13,52 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from strands_robots.policies.base import numbers
+from strands_robots.policies.base import Action, numbers
 from strands_robots.recording import schemas
 from strands_robots.recording._compat import close_chunk
 from strands_robots.recording.schemas import Schema
+from strands_robots.teleoperators.recorded import Frame
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 CHUNK_BYTES = 16_384
-"""At most so much is lost of a file that was cut off."""
+"""Largest chunk: at most this much is lost of a file that was cut off."""
 
 CHUNK_S = 1.0
-"""And at most what came in so many seconds; an event at no steady rate is in the file at once."""
+"""Longest time a chunk stays open, in seconds; an event that is not steady closes it at once."""
 
-WAITING_MAX = 50_000
-"""What may wait to be written; what comes on top is counted as lost."""
+PENDING_MAX = 50_000
+"""Most items that wait to be written; further ones are dropped and counted in ``Recorder.lost``."""
 
-PICTURES_WAITING_BYTES = 64_000_000
-"""How much of it pictures may be."""
+PENDING_PICTURE_BYTES = 64_000_000
+"""Most bytes of pictures among them."""
 
 STEP = "streamStep"
-"""The event that carries a robot's actions."""
+"""Event that carries a robot's actions."""
 
 STEADY = frozenset({STEP, "observationUpdate", "stateUpdate", "state"})
 """Events at a steady rate, which write no log line."""
 
 JOINTS, CAMERA, LOG = "joint_states", "camera", "log"
-"""What channels other than those of events are called, behind the device."""
+"""Channel names, after the device, of everything that is not an event."""
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """One recorded event: seconds since the epoch when it came, whose, which, and what it carried."""
+class RecordedEvent:
+    """One event of a device; ``at`` is its time of arrival in seconds since the epoch."""
 
     at: float
     device: str
     event: str
     payload: Mapping[str, Any]
 
+    @property
+    def robot(self) -> str:
+        """The device, or ``WORLD/ROBOT`` for a robot of a simulated world."""
+        return "/".join(part for part in (self.device, str(self.payload.get("robot_name") or "")) if part)
+
 
 @dataclass(frozen=True, slots=True)
-class Joints:
+class RecordedJoints:
     """Positions by joint, in the robot's own units; ``device`` may be ``WORLD/ROBOT``."""
 
     at: float
@@ -61,7 +67,7 @@ class Joints:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class RecordedPicture:
     """One picture of a camera as JPEG."""
 
     at: float
@@ -70,11 +76,11 @@ class Picture:
     jpeg: bytes
 
 
-Item = Entry | Joints | Picture
+RecordedItem = RecordedEvent | RecordedJoints | RecordedPicture
 
 
 class Recorder:
-    """Writes what it is given on a thread of its own, while it is entered as a context.
+    """Writer of one recording; it works on a thread of its own while it is entered as a context.
 
     Args:
         path: a new ``.mcap`` file.
@@ -82,7 +88,7 @@ class Recorder:
 
     Raises:
         MissingExtraError: the [record] extra is not installed.
-        ValidationError: another kind of file, or one that is there already.
+        ValidationError: another kind of file, or one that exists already.
     """
 
     def __init__(self, path: Path, *, joints_of_events: bool = True) -> None:
@@ -95,13 +101,13 @@ class Recorder:
         self.lost = 0
         self.counts: Counter[str] = Counter()
         self._joints_of_events = joints_of_events
-        self._waiting: queue.Queue[Item | None] = queue.Queue(WAITING_MAX)
-        self._pictures = 0
+        self._pending: queue.Queue[RecordedItem | None] = queue.Queue(PENDING_MAX)
+        self._picture_bytes = 0
         self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
         self._failure: Exception | None = None
 
     def __enter__(self) -> Self:
-        # Opened here, so that a folder that is not there is told to who asked.
+        # The file is opened here so that the caller gets the error of a folder that does not exist.
         try:
             self._file = self.path.open("xb")
         except OSError as exc:
@@ -110,30 +116,30 @@ class Recorder:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._waiting.put(None)
+        self._pending.put(None)
         self._thread.join()
         if self._failure is not None:
             raise self._failure
 
     def take(self, device: str, event: str, payload: Mapping[str, Any]) -> None:
-        """Keep one event; returns at once."""
-        self._put(Entry(time.time(), device, event, payload))
+        """Record one event; returns at once."""
+        self._put(RecordedEvent(time.time(), device, event, payload))
 
     def take_joints(self, device: str, joints: Mapping[str, float]) -> None:
-        """Keep the joints of this moment; returns at once."""
-        self._put(Joints(time.time(), device, joints))
+        """Record the joints of this moment; returns at once."""
+        self._put(RecordedJoints(time.time(), device, joints))
 
     def take_picture(self, device: str, camera: str, jpeg: bytes) -> None:
-        """Keep a picture; returns at once."""
-        if self._pictures > PICTURES_WAITING_BYTES:
+        """Record a picture; returns at once."""
+        if self._picture_bytes > PENDING_PICTURE_BYTES:
             self.lost += 1
             return
-        self._pictures += len(jpeg)
-        self._put(Picture(time.time(), device, camera, jpeg))
+        self._picture_bytes += len(jpeg)
+        self._put(RecordedPicture(time.time(), device, camera, jpeg))
 
-    def _put(self, item: Item) -> None:
+    def _put(self, item: RecordedItem) -> None:
         try:
-            self._waiting.put_nowait(item)
+            self._pending.put_nowait(item)
         except queue.Full:
             self.lost += 1
 
@@ -142,43 +148,44 @@ class Recorder:
             with self._file as file:
                 channels = _Channels(file, self.counts)
                 while (item := self._next(channels)) is not None:
-                    if isinstance(item, Entry):
-                        self._event(channels, item)
-                    elif isinstance(item, Joints):
-                        _joints(channels, item.at, item.device, item.joints)
+                    if isinstance(item, RecordedEvent):
+                        self._write_event(channels, item)
+                    elif isinstance(item, RecordedJoints):
+                        channels.write_joints(item.at, item.device, item.joints)
                     else:
-                        self._pictures -= len(item.jpeg)
-                        at = _ns(item.at)
-                        data = schemas.compressed_image(at, item.camera, item.jpeg)
-                        channels.write(f"/{item.device}/{CAMERA}/{item.camera}", schemas.IMAGE, at, data)
+                        self._picture_bytes -= len(item.jpeg)
+                        data = schemas.compressed_image(_ns(item.at), item.camera, item.jpeg)
+                        channels.write(f"/{item.device}/{CAMERA}/{item.camera}", schemas.IMAGE, item.at, data)
                 channels.finish()
-        except Exception as exc:  # noqa: BLE001 - told to whoever ends the recording
+        except Exception as exc:  # noqa: BLE001 - raised to the caller that ends the recording
             self._failure = exc
 
-    def _next(self, channels: _Channels) -> Item | None:
+    def _next(self, channels: _Channels) -> RecordedItem | None:
         while True:
             try:
-                return self._waiting.get(timeout=channels.due_s)
+                return self._pending.get(timeout=channels.due_s)
             except queue.Empty:
                 channels.close_chunk()
 
-    def _event(self, channels: _Channels, entry: Entry) -> None:
-        at = _ns(entry.at)
-        data = json.dumps(entry.payload, default=str)
-        channels.write(f"/{entry.device}/{entry.event}", schemas.EVENT, at, data.encode())
-        if entry.event not in STEADY:
-            words = f"{entry.event} {data}" if entry.payload else entry.event
-            line = schemas.log_line(at, _level(entry), entry.device, words)
-            channels.write(f"/{entry.device}/{LOG}", schemas.LOG, at, line)
+    def _write_event(self, channels: _Channels, item: RecordedEvent) -> None:
+        data = json.dumps(item.payload, default=str)
+        channels.write(f"/{item.device}/{item.event}", schemas.EVENT, item.at, data.encode())
+        if item.event not in STEADY:
+            message = f"{item.event} {data}" if item.payload else item.event
+            line = schemas.log_line(_ns(item.at), _level(item), item.device, message)
+            channels.write(f"/{item.device}/{LOG}", schemas.LOG, item.at, line)
             channels.close_chunk()
         elif self._joints_of_events:
-            joints = entry.payload.get("joints") or entry.payload.get("observation")
+            joints = item.payload.get("joints") or item.payload.get("observation")
             if isinstance(joints, Mapping):
-                _joints(channels, entry.at, whose(entry), numbers({key: _position(at) for key, at in joints.items()}))
+                positions = {
+                    key: joint.get("position") if isinstance(joint, Mapping) else joint for key, joint in joints.items()
+                }
+                channels.write_joints(item.at, item.robot, numbers(positions))
 
 
 class _Channels:
-    """The channels of a file that is being written, each made with its first message."""
+    """Channels of a file that is being written, each registered with its first message."""
 
     def __init__(self, file: Any, counts: Counter[str]) -> None:
         self._file = file
@@ -189,8 +196,8 @@ class _Channels:
         self._channels: dict[str, int] = {}
         self._counts = counts
 
-    def write(self, topic: str, schema: Schema, at: int, data: bytes) -> None:
-        """Write one message; ``at`` in nanoseconds since the epoch."""
+    def write(self, topic: str, schema: Schema, at: float, data: bytes) -> None:
+        """Write one message; ``at`` in seconds since the epoch."""
         channel = self._channels.get(topic)
         if channel is None:
             if schema.name not in self._schemas:
@@ -198,32 +205,37 @@ class _Channels:
                 self._schemas[schema.name] = registered
             channel = self._writer.register_channel(topic, schema.messages, self._schemas[schema.name])
             self._channels[topic] = channel
-        self._writer.add_message(channel, log_time=at, data=data, publish_time=at)
+        self._writer.add_message(channel, log_time=_ns(at), data=data, publish_time=_ns(at))
         self._counts[topic] += 1
         if self._open_since is None:
             self._open_since = time.monotonic()
         elif self.due_s == 0:
             self.close_chunk()
 
+    def write_joints(self, at: float, device: str, joints: Mapping[str, float]) -> None:
+        """Write a joint state; nothing for a robot without joints."""
+        if joints:
+            self.write(f"/{device}/{JOINTS}", schemas.JOINT_STATE, at, schemas.joint_state(_ns(at), joints))
+
     @property
     def due_s(self) -> float | None:
-        """Seconds until the chunk that is being filled is closed; None where none is."""
+        """Seconds until the open chunk has to be closed; None while none is open."""
         since = self._open_since
         return None if since is None else max(0.0, since + CHUNK_S - time.monotonic())
 
     def close_chunk(self) -> None:
-        """Put what was written so far into the file."""
+        """Put everything written so far into the file."""
         close_chunk(self._writer)
         self._file.flush()
         self._open_since = None
 
     def finish(self) -> None:
-        """Write the index; the file is whole then."""
+        """Write the index, which completes the file."""
         self._writer.finish()
 
 
-def read_items(path: Path) -> Iterator[Item]:
-    """All of a recording in the order in which it was written; of a cut one, all that is whole.
+def read_items(path: Path) -> Iterator[RecordedItem]:
+    """Read a recording in the order in which it was written; of a cut file, all whole chunks.
 
     Raises:
         MissingExtraError: the [record] extra is not installed.
@@ -236,9 +248,9 @@ def read_items(path: Path) -> Iterator[Item]:
     try:
         with path.open("rb") as file:
             for schema, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
-                found = _item(schema.name if schema else "", channel, message)
-                if found is not None:
-                    yield found
+                item = _item(schema.name if schema else "", channel, message)
+                if item is not None:
+                    yield item
     except (EndOfFile, struct.error):
         return
     except OSError as exc:
@@ -247,42 +259,65 @@ def read_items(path: Path) -> Iterator[Item]:
         raise ValidationError(f"{shown(str(path))} is no recording of robots: {exc}.") from exc
 
 
-def read_entries(path: Path) -> Iterator[Entry]:
-    """The events of a recording; raises what :func:`read_items` raises."""
-    return (item for item in read_items(path) if isinstance(item, Entry))
+def read_events(path: Path) -> Iterator[RecordedEvent]:
+    """Read the events of a recording; raises as :func:`read_items` does."""
+    return (item for item in read_items(path) if isinstance(item, RecordedEvent))
 
 
-def whose(entry: Entry) -> str:
-    """The device of an event, and the robot where it is one of a simulated world."""
-    return "/".join(part for part in (entry.device, str(entry.payload.get("robot_name") or "")) if part)
+def recorded_actions(path: Path, device: str | None = None) -> list[Frame]:
+    """Read the actions of one device as frames for a leader, in seconds since the first.
+
+    The joints serve as actions where the recording has none, as when the robot was moved by hand.
+
+    Args:
+        path: an ``.mcap`` file.
+        device: the device to replay; ``WORLD/ROBOT``, or the world alone, for a robot of a simulated world.
+
+    Raises:
+        ValidationError: no actions or joints at all, or those of several devices and none named.
+    """
+    actions: dict[str, list[Frame]] = {}
+    joints: dict[str, list[Frame]] = {}
+    for item in read_items(path):
+        if isinstance(item, RecordedJoints):
+            _append(joints.setdefault(item.device, []), item.at, dict(item.joints))
+        elif isinstance(item, RecordedEvent) and item.event == STEP:
+            _append(actions.setdefault(item.robot, []), item.at, numbers(item.payload.get("action") or {}))
+    usable = {**joints, **{robot: frames for robot, frames in actions.items() if frames}}
+    if not usable:
+        raise ValidationError(f"{path.name} has neither actions nor joints: nothing in it can lead.")
+    named = {
+        robot: each for robot, each in usable.items() if device is None or device in (robot, robot.partition("/")[0])
+    }
+    chosen = {robot: frames for robot, frames in named.items() if actions.get(robot)} or named
+    if len(chosen) != 1:
+        known = ", ".join(usable)
+        raise ValidationError(f"device must be one of those that were recorded ({known}), not {shown(device)}.")
+    (frames,) = chosen.values()
+    return [(at - frames[0][0], action) for at, action in frames]
 
 
-def _item(schema: str, channel: Any, message: Any) -> Item | None:
+def _append(frames: list[Frame], at: float, action: Action) -> None:
+    if action and (not frames or at > frames[-1][0]):
+        frames.append((at, action))
+
+
+def _item(schema: str, channel: Any, message: Any) -> RecordedItem | None:
     at = message.log_time / 1e9
     device, _, last = channel.topic.strip("/").rpartition("/")
     if schema == schemas.JOINT_STATE.name:
-        return Joints(at, device, schemas.read_joint_state(message.data))
+        return RecordedJoints(at, device, schemas.read_joint_state(message.data))
     if schema == schemas.IMAGE.name:
-        return Picture(at, device.removesuffix(f"/{CAMERA}"), last, schemas.read_compressed_image(message.data))
+        return RecordedPicture(at, device.removesuffix(f"/{CAMERA}"), last, schemas.read_compressed_image(message.data))
     if channel.message_encoding != schemas.EVENT.messages:
         return None
-    return Entry(at, device, last, json.loads(message.data))
+    return RecordedEvent(at, device, last, json.loads(message.data))
 
 
-def _joints(channels: _Channels, at: float, device: str, joints: Mapping[str, float]) -> None:
-    if joints:
-        channels.write(f"/{device}/{JOINTS}", schemas.JOINT_STATE, _ns(at), schemas.joint_state(_ns(at), joints))
-
-
-def _position(joint: Any) -> Any:
-    """A joint that is told with its velocity counts by its position."""
-    return joint.get("position") if isinstance(joint, Mapping) else joint
-
-
-def _level(entry: Entry) -> int:
-    if entry.payload.get("state") == "error" or entry.payload.get("error"):
+def _level(item: RecordedEvent) -> int:
+    if item.payload.get("state") == "error" or item.payload.get("error"):
         return schemas.ERROR
-    return schemas.WARNING if entry.event.lower().startswith(("emergency", "halted", "locked")) else schemas.INFO
+    return schemas.WARNING if item.event.lower().startswith(("emergency", "halted", "locked")) else schemas.INFO
 
 
 def _ns(seconds: float) -> int:

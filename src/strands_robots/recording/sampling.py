@@ -1,4 +1,4 @@
-"""Recording a robot in the process that serves it: joints also while it stands, pictures, tasks, halts and locks."""
+"""Recording of a robot in the process that serves it: joints also while it stands, pictures, tasks, halts and locks."""
 
 from __future__ import annotations
 
@@ -19,25 +19,24 @@ from strands_robots.utils import number
 
 logger = logging.getLogger(__name__)
 
-JOINTS_HZ, CAMERAS_HZ, LOOKS_HZ = 50.0, 15.0, 20.0
-"""How often joints are read, pictures taken, and the gate is looked at for halts and locks."""
-
+JOINTS_HZ, CAMERAS_HZ, GATE_HZ = 50.0, 15.0, 20.0
+"""Rates at which joints are read, pictures are taken, and the gate is checked for halts and locks."""
 
 PATIENCE_S = 0.5
-"""How long something may fail before it is told: a busy bus is a beat that is missed, not a fault."""
+"""A source that fails for this long is reported; a busy bus costs a sample, it is not a fault."""
 
 
 class RobotRecording:
-    """Writes what a robot does to ``recorder`` while it is entered as a context.
+    """Samples a robot into ``recorder`` while it is entered as a context.
 
-    What cannot be read for half a second is told once in the log and once in the recording, as the event
-    ``notRecorded``, and is asked for again at every beat; a camera that fails costs no other its picture. A beat that
-    is missed is left out.
+    A source that cannot be read for half a second is reported once in the log and once in the recording, as the event
+    ``notRecorded``, and is still read at every beat. Each camera fails on its own. A beat that is missed is left out
+    and counted in the event ``samplesSkipped``.
 
     Args:
         robot: behind the contract, or an object that :func:`~strands_robots.contract.adapt` makes fit.
         recorder: entered, made with ``joints_of_events=False``.
-        device: what the robot is called in the recording.
+        device: name of the robot in the recording.
         frames: takes its pictures; None for none.
         joints_hz: 1 to 200.
         cameras_hz: 0.1 to 60.
@@ -60,107 +59,109 @@ class RobotRecording:
         self._recorder = recorder
         self._device = device
         self._frames = frames
-        self._ending = threading.Event()
+        self._stopping = threading.Event()
         self.skipped: Counter[str] = Counter()
-        """Beats of joints, cameras and looks at the gate that came too late, by that; told in the recording's end."""
+        """Beats that came too late, by source: joints, cameras, gate."""
         self._failing: dict[str, tuple[float, bool]] = {}
         self._generation = self._robot.gate.generation
         self._lock = ""
-        works: list[tuple[str, float, Callable[[], None]]] = [
-            ("joints", number("joints_hz", joints_hz, low=1, high=200), self._joints),
-            ("gate", LOOKS_HZ, self._look),
+        sources: list[tuple[str, float, Callable[[], None]]] = [
+            ("joints", number("joints_hz", joints_hz, low=1, high=200), self._sample_joints),
+            ("gate", GATE_HZ, self._check_gate),
         ]
         if frames is not None:
-            works.append(("cameras", number("cameras_hz", cameras_hz, low=0.1, high=60), self._pictures))
+            hz = number("cameras_hz", cameras_hz, low=0.1, high=60)
+            sources.append(("cameras", hz, self._sample_pictures))
         self._threads = [
-            threading.Thread(target=partial(self._paced, name, hz, work), name=f"record-{name}", daemon=True)
-            for name, hz, work in works
+            threading.Thread(target=self._paced, args=source, name=f"record-{source[0]}", daemon=True)
+            for source in sources
         ]
         self._unsubscribe: Unsubscribe = lambda: None
 
     def __enter__(self) -> Self:
-        self._unsubscribe = self._robot.subscribe(self._tell)
+        self._unsubscribe = self._robot.subscribe(self._record)
         for thread in self._threads:
             thread.start()
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._ending.set()
+        self._stopping.set()
         for thread in self._threads:
             thread.join()
-        # After the thread that looks has ended: of two looks at a time each would tell of the same halt.
-        self._attempt("gate", self._look)
+        # The gate's own thread has ended; two checks at a time would record the same halt twice.
+        self._attempt("gate", self._check_gate)
         self._unsubscribe()
         if self.skipped:
-            self._recorder.take(self._device, "samplesSkipped", dict(self.skipped))
+            self._take("samplesSkipped", dict(self.skipped))
 
-    def _paced(self, what: str, hz: float, work: Callable[[], None]) -> None:
-        began, beat = time.monotonic(), 0
-        while not self._ending.wait(max(0.0, began + beat / hz - time.monotonic())):
-            self._attempt(what, work)
-            due = max(beat + 1, int((time.monotonic() - began) * hz))
+    def _take(self, event: str, payload: Mapping[str, Any]) -> None:
+        self._recorder.take(self._device, event, payload)
+
+    def _paced(self, source: str, hz: float, sample: Callable[[], None]) -> None:
+        started, beat = time.monotonic(), 0
+        while not self._stopping.wait(max(0.0, started + beat / hz - time.monotonic())):
+            self._attempt(source, sample)
+            due = max(beat + 1, int((time.monotonic() - started) * hz))
             if due > beat + 1:
-                self.skipped[what] += due - beat - 1
+                self.skipped[source] += due - beat - 1
             beat = due
 
-    def _attempt(self, what: str, work: Callable[[], None]) -> None:
+    def _attempt(self, source: str, sample: Callable[[], None]) -> None:
         try:
-            work()
-        except Exception as exc:  # noqa: BLE001 - a robot's read raises what it likes; the recording goes on
-            self._note(what, f"{type(exc).__name__}: {exc}")
+            sample()
+        except Exception as exc:  # noqa: BLE001 - a robot's read may raise anything; the recording goes on
+            self._report(source, f"{type(exc).__name__}: {exc}")
         else:
-            self._failing.pop(what, None)
+            self._failing.pop(source, None)
 
-    def _joints(self) -> None:
-        told = self._robot.get_state()
+    def _report(self, source: str, problem: str) -> None:
+        now = time.monotonic()
+        since, reported = self._failing.setdefault(source, (now, False))
+        if reported or now - since < PATIENCE_S:
+            return
+        self._failing[source] = (since, True)
+        logger.warning("%s: its %s are not recorded: %s", self._device, source, problem)
+        self._take("notRecorded", {"what": source, "error": problem})
+
+    def _sample_joints(self) -> None:
+        state = self._robot.get_state()
         if isinstance(self._robot, WorldRobot):
-            for name, joints in (told.get("robots") or {}).items():
+            for name, joints in (state.get("robots") or {}).items():
                 self._recorder.take_joints(f"{self._device}/{name}", numbers(joints))
             return
-        if told.get("joints_error"):
-            raise ConnectionError(told["joints_error"])
-        self._recorder.take_joints(self._device, numbers(told.get("joints") or {}))
+        if state.get("joints_error"):
+            raise ConnectionError(state["joints_error"])
+        self._recorder.take_joints(self._device, numbers(state.get("joints") or {}))
 
-    def _pictures(self) -> None:
-        seen = self._frames() if self._frames is not None else {}
-        for camera in seen:
-            self._attempt(f"pictures of {camera}", partial(self._picture, seen, camera))
+    def _sample_pictures(self) -> None:
+        frames = self._frames() if self._frames is not None else {}
+        for camera in frames:
+            self._attempt(f"pictures of {camera}", partial(self._take_picture, frames, camera))
 
-    def _picture(self, seen: Mapping[str, Any], camera: str) -> None:
-        self._recorder.take_picture(self._device, camera, jpeg(camera, seen[camera]))
+    def _take_picture(self, frames: Mapping[str, Any], camera: str) -> None:
+        self._recorder.take_picture(self._device, camera, jpeg(camera, frames[camera]))
 
-    def _look(self) -> None:
+    def _check_gate(self) -> None:
         gate = self._robot.gate
         if gate.generation != self._generation:
             self._generation = gate.generation
-            self._recorder.take(self._device, "halted", {})
+            self._take("halted", {})
         refusal = gate.refusal("motion")
         lock = "" if refusal is None else text_of(refusal)
         if lock != self._lock:
             self._lock = lock
-            self._recorder.take(self._device, "locked" if lock else "unlocked", {"reason": lock} if lock else {})
+            self._take("locked" if lock else "unlocked", {"reason": lock} if lock else {})
 
-    def _note(self, what: str, problem: str) -> None:
-        now = time.monotonic()
-        since, told = self._failing.setdefault(what, (now, False))
-        if told or now - since < PATIENCE_S:
-            return
-        self._failing[what] = (since, True)
-        logger.warning("%s: its %s are not recorded: %s", self._device, what, problem)
-        self._recorder.take(self._device, "notRecorded", {"what": what, "error": problem})
-
-    def _tell(self, event: RolloutEvent) -> None:
-        """Under the names and with the fields that the events of a device have on Device Connect."""
+    def _record(self, event: RolloutEvent) -> None:
+        """Record a rollout's event under the name and with the fields that it has on Device Connect."""
         world = isinstance(self._robot, WorldRobot)
-        whose = {"robot_name": event.robot} if world else {}
+        robot = {"robot_name": event.robot} if world else {}
         kind = "policy" if world else "task"
         if event.kind == "step":
-            told = {"step": event.step, "observation": dict(event.observation), "action": dict(event.action)}
-            self._recorder.take(self._device, STEP, {**told, **whose})
+            step = {"step": event.step, "observation": dict(event.observation), "action": dict(event.action)}
+            self._take(STEP, {**step, **robot})
         elif event.kind == "started":
-            told = {"instruction": event.instruction, "policy_provider": event.policy}
-            self._recorder.take(self._device, f"{kind}Started", {**told, **whose})
+            self._take(f"{kind}Started", {"instruction": event.instruction, "policy_provider": event.policy, **robot})
         else:
-            told = {"instruction": event.instruction, "steps": event.step, "duration": event.elapsed_s}
-            told |= {"state": event.state, "error": event.error}
-            self._recorder.take(self._device, f"{kind}Complete", {**told, **whose})
+            end = {"instruction": event.instruction, "steps": event.step, "duration": event.elapsed_s}
+            self._take(f"{kind}Complete", {**end, "state": event.state, "error": event.error, **robot})

@@ -1,7 +1,7 @@
 """Leaders: what a follower is teleoperated by, made to look like a policy, and a scripted one for machines without.
 
 A leader is any object with ``get_action() -> dict`` of targets by action key (a LeRobot teleoperator, a gamepad). It
-may have ``is_connected`` and ``get_teleop_events()``, and raises :class:`LeaderDone` when it has led to the end.
+may have ``is_connected`` and ``get_teleop_events()``, and raises :class:`LeaderFinished` when it has led to the end.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.policies.base import Action, Ranges, SpeedLimit, checked_action, numbers
 from strands_robots.utils import ValidationError, mapping, number
 
@@ -31,8 +32,8 @@ MAGNITUDE_MAX = 720.0
 """Largest target of a joint without a range, in its unit."""
 
 
-class LeaderDone(Exception):  # noqa: N818 - an end, not a fault
-    """A leader has no more to say: raised by its ``get_action``, it completes the teleoperation."""
+class LeaderFinished(StrandsRobotsError):  # noqa: N818 - an end, not a fault
+    """The leader has no further action; raised by its ``get_action``, it completes the teleoperation."""
 
 
 class InputSink(Protocol):
@@ -137,7 +138,7 @@ class LeaderPolicy:
         try:
             frame = mapping("leader action", self._leader.get_action())
             target = checked_action({self._keys.get(key, key): value for key, value in frame.items()}, self._ranges)
-        except LeaderDone:
+        except LeaderFinished:
             return None
         except Exception as exc:
             self.errors += 1

@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from strands_robots.policies.base import Action, Ranges
-from strands_robots.teleoperators.leader import LeaderDone
+from strands_robots.teleoperators.leader import LeaderFinished
 from strands_robots.utils import ValidationError
 
 SHARE_PER_S = 0.25
@@ -124,7 +124,7 @@ class KeyboardLeader:
         """Every target, after the keys that were pressed since.
 
         Raises:
-            LeaderDone: Escape or Ctrl-D was pressed.
+            LeaderFinished: Escape or Ctrl-D was pressed.
         """
         while select.select([self._fd], [], [], 0)[0]:
             pressed = os.read(self._fd, 64).decode("ascii", "ignore")
@@ -132,7 +132,7 @@ class KeyboardLeader:
                 break
             for char in pressed:
                 if char in _END:
-                    raise LeaderDone("the keyboard ended it")
+                    raise LeaderFinished("the keyboard ended it")
                 if char.lower() in self._pushes:
                     key, push = self._pushes[char.lower()]
                     self._jog.move(key, push, STEP_S)
@@ -188,12 +188,12 @@ class GamepadLeader:
         """Every target, pushed by the sticks for the time since the last call, of which at most 0.1 s counts.
 
         Raises:
-            LeaderDone: button 1 was pressed.
+            LeaderFinished: button 1 was pressed.
             OSError: the gamepad was unplugged.
         """
         self._read()
         if self._buttons.get(_END_BUTTON):
-            raise LeaderDone("the gamepad ended it")
+            raise LeaderFinished("the gamepad ended it")
         now = self._now()
         seconds = 0.0 if self._at is None else min(now - self._at, _GAP_MAX_S)
         self._at = now

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots.policies.base import Action
-from strands_robots.teleoperators.leader import LeaderDone
+from strands_robots.teleoperators.leader import LeaderFinished
 from strands_robots.utils import ValidationError, missing_extra, number, shown
 
 Frame = tuple[float, Action]
@@ -69,12 +69,12 @@ class RecordedLeader:
         """The targets of this moment.
 
         Raises:
-            LeaderDone: the recording is over.
+            LeaderFinished: the recording is over.
         """
         self._began = self._now() if self._began is None else self._began
         seconds = (self._now() - self._began) * self._speed
         if seconds > self._times[-1]:
-            raise LeaderDone("the recording is over")
+            raise LeaderFinished("the recording is over")
         at = bisect.bisect_right(self._times, seconds) - 1
         before = self._actions[at]
         if at + 1 == len(self._times):

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
-from strands_robots.recording import Entry, read_entries, read_items, recorded_actions
+from strands_robots.recording import RecordedEvent, read_events, read_items, recorded_actions
 from strands_robots.simulation import Simulation
 
 pytest.importorskip("mcap")
@@ -40,7 +40,7 @@ def test_what_an_arm_did_is_recorded_and_done_again(tmp_path: Path, monkeypatch:
     told = json.loads(done.stdout.splitlines()[-1])
     assert told["lost"] == 0
     assert told["messages"]["/sim-1/streamStep"] > 20
-    assert {"streamStep", "observationUpdate"} <= {entry.event for entry in read_entries(run)}
+    assert {"streamStep", "observationUpdate"} <= {entry.event for entry in read_events(run)}
     again = CliRunner().invoke(build(), ["replay", str(run), "--to", "so100", "--speed", "2", "--json"])
     assert again.exit_code == 0, again.output
     told = json.loads(again.stdout.splitlines()[-1])
@@ -70,7 +70,7 @@ def test_who_serves_an_arm_records_it_also_while_it_stands(tmp_path: Path) -> No
     assert told["messages"]["/sim-1/policyStarted"] == 1
     assert told["messages"]["/sim-1/halted"] >= 1
     items = list(read_items(run))
-    ended = [item for item in items if isinstance(item, Entry) and item.event == "policyComplete"]
+    ended = [item for item in items if isinstance(item, RecordedEvent) and item.event == "policyComplete"]
     assert [entry.payload["state"] for entry in ended] == ["stopped"]
     assert recorded_actions(run)
 

@@ -10,7 +10,14 @@ import pytest
 from fixtures.feetech_bus import FeetechBus
 from fixtures.waiting import eventually
 
-from strands_robots.recording import Entry, Joints, Recorder, RobotRecording, read_items, recorded_actions
+from strands_robots.recording import (
+    RecordedEvent,
+    RecordedJoints,
+    Recorder,
+    RobotRecording,
+    read_items,
+    recorded_actions,
+)
 
 pytestmark = pytest.mark.system
 
@@ -33,7 +40,7 @@ def test_an_arm_is_recorded_at_rest_in_motion_and_without_its_cable(
         eventually(lambda: recorder.counts["/arm-1/joint_states"] > before + 5)
     assert recorder.lost == 0
     items = list(read_items(path))
-    assert {len(item.joints) for item in items if isinstance(item, Joints)} == {6}
-    ended = next(item for item in items if isinstance(item, Entry) and item.event == "taskComplete")
+    assert {len(item.joints) for item in items if isinstance(item, RecordedJoints)} == {6}
+    ended = next(item for item in items if isinstance(item, RecordedEvent) and item.event == "taskComplete")
     assert ended.payload["state"] == "stopped"
     assert len(recorded_actions(path)) >= 20

@@ -14,7 +14,7 @@ import pytest
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
 
-from strands_robots.recording import Entry, Joints, Picture, read_items
+from strands_robots.recording import RecordedEvent, RecordedJoints, RecordedPicture, read_items
 
 pytest.importorskip("mcap")
 
@@ -31,7 +31,7 @@ def settings(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 def seen(run: Path) -> set[str]:
     """The cameras whose pictures are in the recording so far."""
-    return {item.camera for item in read_items(run) if isinstance(item, Picture)}
+    return {item.camera for item in read_items(run) if isinstance(item, RecordedPicture)}
 
 
 def started(*words: str) -> Any:
@@ -52,7 +52,9 @@ def test_states_pictures_and_stops_of_a_served_world_are_recorded(
         try:
             eventually(lambda: run.exists() and run.stat().st_size > 20_000 and seen(run) >= CAMERAS)
             console.ask("estop")
-            eventually(lambda: "emergencyStop" in {item.event for item in read_items(run) if isinstance(item, Entry)})
+            eventually(
+                lambda: "emergencyStop" in {item.event for item in read_items(run) if isinstance(item, RecordedEvent)}
+            )
             recording.send_signal(signal.SIGINT)
             out = recording.communicate(timeout=60)[0]
         finally:
@@ -64,10 +66,10 @@ def test_states_pictures_and_stops_of_a_served_world_are_recorded(
     assert recording.returncode == 0, out
     assert json.loads(out.splitlines()[-1])["lost"] == 0
     items = list(read_items(run))
-    joints = next(item for item in items if isinstance(item, Joints))
+    joints = next(item for item in items if isinstance(item, RecordedJoints))
     assert joints.device == "arm-1"
     assert "shoulder_pan" in joints.joints
-    pictures = [item for item in items if isinstance(item, Picture)]
+    pictures = [item for item in items if isinstance(item, RecordedPicture)]
     assert seen(run) == CAMERAS
     assert all(item.jpeg[:2] == b"\xff\xd8" for item in pictures)
-    assert "emergencyStop" in {item.event for item in items if isinstance(item, Entry)}
+    assert "emergencyStop" in {item.event for item in items if isinstance(item, RecordedEvent)}

@@ -1,4 +1,4 @@
-"""A served robot is recorded where it is served: while it stands, while it moves, halted and locked."""
+"""Recording of a served robot: idle, moving, halted and locked."""
 
 from __future__ import annotations
 
@@ -14,7 +14,15 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.hardware import HardwareRobot
-from strands_robots.recording import Entry, Joints, Picture, Recorder, RobotRecording, read_entries, read_items
+from strands_robots.recording import (
+    RecordedEvent,
+    RecordedJoints,
+    RecordedPicture,
+    Recorder,
+    RobotRecording,
+    read_events,
+    read_items,
+)
 from strands_robots.recording.cameras import chosen_frames, frames_of
 from strands_robots.simulation import Simulation
 from strands_robots.teleoperators.leader import ScriptedLeader
@@ -28,13 +36,13 @@ class Camera:
 
     def __init__(self) -> None:
         self.broken = False
-        self.looks = 0
+        self.reads = 0
 
     def read_latest(self) -> Any:
-        self.looks += 1
+        self.reads += 1
         if self.broken:
             raise TimeoutError("no frame in 200 ms")
-        return np.full((24, 32, 3), self.looks % 256, dtype=np.uint8)
+        return np.full((24, 32, 3), self.reads % 256, dtype=np.uint8)
 
 
 class SeeingDevice(RecordingDevice):
@@ -43,7 +51,7 @@ class SeeingDevice(RecordingDevice):
         self.cameras = {"front": Camera()}
 
 
-class Latch:
+class FakeLockout:
     def __init__(self) -> None:
         self.locked = False
 
@@ -60,11 +68,11 @@ def arm(patient_halts: None) -> Any:
 
 
 def events(path: Path) -> list[str]:
-    # A busy machine may skip a beat, which is told at the end.
-    return [entry.event for entry in read_entries(path) if entry.event != "samplesSkipped"]
+    # A busy machine may skip a beat, which the recording reports at its end.
+    return [event.event for event in read_events(path) if event.event != "samplesSkipped"]
 
 
-def test_an_idle_arm_gives_joints_and_pictures(arm: HardwareRobot, tmp_path: Path) -> None:
+def test_idle_arm_is_recorded_with_joints_and_pictures(arm: HardwareRobot, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with (
         Recorder(path, joints_of_events=False) as recorder,
@@ -73,51 +81,51 @@ def test_an_idle_arm_gives_joints_and_pictures(arm: HardwareRobot, tmp_path: Pat
         eventually(lambda: recorder.counts["/arm-1/joint_states"] >= 25)
         eventually(lambda: recorder.counts["/arm-1/camera/front"] >= 5)
     items = list(read_items(path))
-    assert next(item for item in items if isinstance(item, Joints)).joints == arm.get_state()["joints"]
-    assert next(item for item in items if isinstance(item, Picture)).jpeg[:2] == b"\xff\xd8"
+    assert next(item for item in items if isinstance(item, RecordedJoints)).joints == arm.get_state()["joints"]
+    assert next(item for item in items if isinstance(item, RecordedPicture)).jpeg[:2] == b"\xff\xd8"
     assert events(path) == []
 
 
-def test_a_task_its_halt_and_the_lock_are_told_in_their_order(arm: HardwareRobot, tmp_path: Path) -> None:
-    path, latch = tmp_path / "run.mcap", Latch()
-    arm.gate.attach(latch)
+def test_task_halt_and_lock_are_recorded_in_their_order(arm: HardwareRobot, tmp_path: Path) -> None:
+    path, lockout = tmp_path / "run.mcap", FakeLockout()
+    arm.gate.attach(lockout)
     with Recorder(path, joints_of_events=False) as recorder, RobotRecording(arm, recorder, "arm-1"):
         arm.start_task("wave", duration=120)
         eventually(lambda: recorder.counts["/arm-1/streamStep"] > 5)
-        latch.locked = True
+        lockout.locked = True
         arm.halt("test")
         eventually(lambda: recorder.counts["/arm-1/locked"] == 1)
-        latch.locked = False
+        lockout.locked = False
         eventually(lambda: recorder.counts["/arm-1/unlocked"] == 1)
-    told = [event for event in events(path) if event != "streamStep"]
-    assert told[0] == "taskStarted"
-    assert set(told[1:-1]) == {"taskComplete", "halted", "locked"}
-    assert told[-1] == "unlocked"
+    names = [event for event in events(path) if event != "streamStep"]
+    assert names[0] == "taskStarted"
+    assert set(names[1:-1]) == {"taskComplete", "halted", "locked"}
+    assert names[-1] == "unlocked"
 
 
-def test_a_teleoperation_is_recorded_as_a_task_is(arm: HardwareRobot, tmp_path: Path) -> None:
+def test_teleoperation_is_recorded_like_a_task(arm: HardwareRobot, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path, joints_of_events=False) as recorder, RobotRecording(arm, recorder, "arm-1"):
         arm.attach_teleop(ScriptedLeader({"pan.pos": (0.0, 10.0, 1.0)}))
         assert arm.teleoperate(duration=0.3)["status"] == "success"
         eventually(lambda: recorder.counts["/arm-1/taskComplete"] == 1)
-    first = next(item for item in read_items(path) if isinstance(item, Entry) and item.event == "streamStep")
+    first = next(item for item in read_items(path) if isinstance(item, RecordedEvent) and item.event == "streamStep")
     assert set(first.payload["action"]) == {"pan.pos"}
 
 
-def test_a_camera_that_fails_is_told_once_and_the_joints_go_on(arm: HardwareRobot, tmp_path: Path) -> None:
+def test_failing_camera_is_reported_once_and_joints_go_on(arm: HardwareRobot, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     arm.device.cameras["front"].broken = True
     with (
         Recorder(path, joints_of_events=False) as recorder,
         RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
     ):
-        eventually(lambda: arm.device.cameras["front"].looks > 15)
+        eventually(lambda: arm.device.cameras["front"].reads > 15)
         eventually(lambda: recorder.counts["/arm-1/joint_states"] >= 10)
     assert events(path) == ["notRecorded"]
 
 
-def test_a_camera_that_fails_costs_the_ones_behind_it_nothing(arm: HardwareRobot, tmp_path: Path) -> None:
+def test_failing_camera_does_not_affect_the_other_cameras(arm: HardwareRobot, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     arm.device.cameras["wrist"] = Camera()
     arm.device.cameras["front"].broken = True
@@ -127,19 +135,19 @@ def test_a_camera_that_fails_costs_the_ones_behind_it_nothing(arm: HardwareRobot
     ):
         eventually(lambda: recorder.counts["/arm-1/notRecorded"] == 1)
         eventually(lambda: recorder.counts["/arm-1/camera/wrist"] >= 15)
-    (told,) = [entry.payload for entry in read_entries(path) if entry.event == "notRecorded"]
-    assert told["what"] == "pictures of front"
+    (payload,) = [event.payload for event in read_events(path) if event.event == "notRecorded"]
+    assert payload["what"] == "pictures of front"
 
 
-def test_only_the_chosen_cameras_are_looked_at(arm: HardwareRobot) -> None:
+def test_only_the_chosen_cameras_are_read(arm: HardwareRobot) -> None:
     arm.device.cameras["wrist"] = Camera()
     frames = chosen_frames(arm, ["wrist", "nowhere"])
     assert frames is not None
     assert {name: picture.shape for name, picture in frames().items()} == {"wrist": (24, 32, 3)}
-    assert arm.device.cameras["front"].looks == 0
+    assert arm.device.cameras["front"].reads == 0
 
 
-def test_a_world_records_each_of_its_robots(tmp_path: Path) -> None:
+def test_each_robot_of_a_world_is_recorded(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     world = Simulation("bench")
     world.add_robot("left", "so100")
@@ -158,39 +166,39 @@ def test_a_world_records_each_of_its_robots(tmp_path: Path) -> None:
         world.cleanup()
 
 
-def test_a_recording_whose_last_look_fails_still_leaves_the_robot_and_tells_what_it_skipped(
+def test_recording_whose_last_gate_check_fails_still_unsubscribes_and_reports_skipped_beats(
     arm: HardwareRobot, tmp_path: Path
 ) -> None:
-    class Unreadable(Latch):
+    class Unreadable(FakeLockout):
         def refusal(self, verb: str) -> Envelope | None:
             if self.locked:
                 raise OSError("the lockout cannot be read")
             return None
 
-    path, latch = tmp_path / "run.mcap", Unreadable()
-    arm.gate.attach(latch)
+    path, lockout = tmp_path / "run.mcap", Unreadable()
+    arm.gate.attach(lockout)
     with Recorder(path, joints_of_events=False) as recorder:
         with RobotRecording(arm, recorder, "arm-1") as sampling:
             sampling.skipped["joints"] += 1
-            latch.locked = True
-        latch.locked = False
+            lockout.locked = True
+        lockout.locked = False
         arm.start_task("wave", duration=0.05)
         eventually(lambda: arm.get_task_status()["task_status"] != "running")
-    assert [entry.event for entry in read_entries(path)] == ["samplesSkipped"]
+    assert [event.event for event in read_events(path)] == ["samplesSkipped"]
 
 
-def test_beats_that_a_slow_camera_skips_are_counted_and_told(arm: HardwareRobot, tmp_path: Path) -> None:
-    path, looked = tmp_path / "run.mcap", threading.Event()
+def test_beats_skipped_by_a_slow_camera_are_counted_and_recorded(arm: HardwareRobot, tmp_path: Path) -> None:
+    path, was_read = tmp_path / "run.mcap", threading.Event()
 
     def slow() -> dict[str, Any]:
         time.sleep(0.2)
-        looked.set()
+        was_read.set()
         return {}
 
     with Recorder(path, joints_of_events=False) as recorder:
         with RobotRecording(arm, recorder, "arm-1", frames=slow, cameras_hz=50) as sampling:
-            assert looked.wait(20)
+            assert was_read.wait(20)
             eventually(lambda: sampling.skipped["cameras"] >= 8)
         skipped = sampling.skipped["cameras"]
-    (told,) = [entry.payload for entry in read_entries(path) if entry.event == "samplesSkipped"]
-    assert told["cameras"] == skipped
+    (payload,) = [event.payload for event in read_events(path) if event.event == "samplesSkipped"]
+    assert payload["cameras"] == skipped
