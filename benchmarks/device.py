@@ -25,7 +25,7 @@ from fixtures.zenoh_router import ZenohRouter
 
 from benchmarks.table import Row
 from strands_robots.device_connect import FleetClient, LinkConfig, init_device_connect_sync, stop_device_connect
-from strands_robots.device_connect.client import NoAnswerError
+from strands_robots.device_connect.client import DeviceTimeoutError
 
 ROOT = Path(__file__).parent.parent
 IN_ONE_PROCESS = 32
@@ -233,7 +233,7 @@ def _stops_while_blocked(kind: str, blocks: int) -> list[float]:
                 fleet.call("slow", "stop")
                 took.append(time.perf_counter() - began)
             blocked.join()
-            with contextlib.suppress(NoAnswerError):
+            with contextlib.suppress(DeviceTimeoutError):
                 fleet.call("slow", "stop")
     return took
 

@@ -7,9 +7,16 @@ agents read the content, programs read the keys.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
+from strands_robots.utils import shown
+
 Envelope = dict[str, Any]
+
+DEPTH_MAX = 12
+"""Levels of nesting that an answer may have on a wire; a deeper value is named, not sent."""
 
 
 def success(text: str, **fields: Any) -> Envelope:
@@ -33,6 +40,37 @@ def text_of(answer: Envelope) -> str:
         if isinstance(block, dict) and isinstance(block.get("text"), str):
             return str(block["text"])
     return str(answer.get("reason", ""))
+
+
+def fields_of(answer: object) -> dict[str, Any]:
+    """The facts of an envelope in one flat mapping: its keys over those of its json blocks."""
+    if not isinstance(answer, Mapping):
+        return {}
+    fields: dict[str, Any] = {}
+    content = answer.get("content")
+    for block in content if isinstance(content, list) else ():
+        inner = block.get("json") if isinstance(block, Mapping) else None
+        if isinstance(inner, Mapping):
+            fields.update(inner)
+    return {**fields, **{key: value for key, value in answer.items() if key != "content"}}
+
+
+def jsonable(value: object, depth: int = DEPTH_MAX) -> Any:
+    """``value`` in JSON's own types: NaN and infinities become null, a foreign object its short ``repr``."""
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, int):
+        return int(value) if value.bit_length() <= 256 else shown(value)
+    if depth == 0:
+        return shown(value)
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item, depth - 1) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [jsonable(item, depth - 1) for item in value]
+    plain = getattr(value, "tolist", None)  # numpy's scalars and arrays
+    return jsonable(plain(), depth - 1) if callable(plain) else shown(value)
 
 
 def _content(text: str, fields: dict[str, Any]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from click.testing import Result
 from strands_robots.cli import fleet
 from strands_robots.cli.fleet import verdict
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.device_connect.client import CallRefusedError, NoAnswerError, NoSuchDeviceError, Peer
+from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError, Peer
 from strands_robots.envelope import Envelope, error, success
 
 Run = Callable[..., Result]
@@ -99,7 +99,7 @@ def test_a_call_sends_typed_values(run: Run, fake: FakeFleet) -> None:
         (error("not allowed"), 1),
         (CallRefusedError("Unknown method: x", -32601), 1),
         (NoSuchDeviceError("No device 'arm-1' in tenant 'default'."), 3),
-        (NoAnswerError("arm-1 is announced and did not answer within 4 s."), 3),
+        (DeviceTimeoutError("arm-1 is announced and did not answer within 4 s."), 3),
     ],
 )
 def test_a_call_that_fails_says_why_and_exits_accordingly(

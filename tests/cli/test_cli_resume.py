@@ -13,7 +13,7 @@ from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.cli import resume
 from strands_robots.cli.output import Exit, Failure
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.device_connect.client import NoAnswerError, Peer
+from strands_robots.device_connect.client import DeviceTimeoutError, Peer
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.lockout import OVERFLOW, Hold, LockoutState
@@ -39,7 +39,7 @@ class FakeFleet:
 
     def call(self, device: str, function: str, params: dict[str, Any], timeout: float) -> Envelope:
         if device in self.mute:
-            raise NoAnswerError(f"{device} is announced and did not answer.")
+            raise DeviceTimeoutError(f"{device} is announced and did not answer.")
         held = self.held[device]
         if function == "getStatus":
             holds = [{"epoch": each, "source": "desk", "reason": "a hand", "since": 0.0} for each in held]

@@ -8,11 +8,11 @@ from rich.console import Console
 
 from strands_robots.cli.output import Exit, Failure, Screen
 from strands_robots.cli.watch import View, in_lines, task_of, until
-from strands_robots.device_connect.client import Event
+from strands_robots.device_connect.client import DeviceEvent
 
 
-def event(name: str, **payload: Any) -> Event:
-    return Event("arm-1", name, payload)
+def event(name: str, **payload: Any) -> DeviceEvent:
+    return DeviceEvent("arm-1", name, payload)
 
 
 @pytest.mark.parametrize(
@@ -28,7 +28,7 @@ def event(name: str, **payload: Any) -> Event:
         (event("observationUpdate", joints={}), ""),
     ],
 )
-def test_an_event_says_what_the_device_does(seen: Event, told: str) -> None:
+def test_an_event_says_what_the_device_does(seen: DeviceEvent, told: str) -> None:
     assert task_of(seen) == told
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
-from strands_robots.device_connect.declare import rpc
+from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 

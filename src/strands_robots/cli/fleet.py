@@ -143,13 +143,13 @@ def asked(fleet: FleetClient, device: str, function: str, params: Mapping[str, A
     """One call, with its failures told as what they mean for a script."""
     from strands_robots.device_connect.client import (  # noqa: PLC0415 - as above
         CallRefusedError,
-        NoAnswerError,
+        DeviceTimeoutError,
         NoSuchDeviceError,
     )
 
     try:
         return fleet.call(device, function, params, seconds)
-    except (NoSuchDeviceError, NoAnswerError) as exc:
+    except (NoSuchDeviceError, DeviceTimeoutError) as exc:
         raise Failure(plain(exc.args[0], 2000), Exit.SILENT) from exc
     except CallRefusedError as exc:
         raise Failure(plain(str(exc), 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc

@@ -82,7 +82,7 @@ def acl(
 
 def serve_on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> None:
     """Put ``body`` on the native mesh until Ctrl-C or SIGTERM, which stops the robot first."""
-    from strands_robots.device_connect.signals import StopSignal  # noqa: PLC0415 - loads nothing of the framework
+    from strands_robots.device_connect.shutdown import StopSignal  # noqa: PLC0415 - loads nothing of the framework
 
     with StopSignal() as asked, joined(body, peer_id, mode) as mesh:
         screen.data({"event": "serving", "peer_id": mesh.peer_id, "network": "mesh", "pid": os.getpid()})

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from strands_robots.cli.bars import Range
     from strands_robots.device_connect import FleetClient
-    from strands_robots.device_connect.client import Event
+    from strands_robots.device_connect.client import DeviceEvent
 
 SILENCE_S = 5.0
 """Without an event for this long a device counts as silent; it tells its state once a second."""
@@ -72,7 +72,7 @@ class View:
             if isinstance(joints, Mapping):
                 self._joints[str(name)] = joints
 
-    def take(self, event: Event) -> None:
+    def take(self, event: DeviceEvent) -> None:
         """Learn from one event."""
         robot = str(event.payload.get("robot_name", ""))
         joints = event.payload.get("joints" if event.name == "observationUpdate" else "observation")
@@ -94,7 +94,7 @@ class View:
         return Group(*parts)
 
 
-def task_of(event: Event) -> str:
+def task_of(event: DeviceEvent) -> str:
     """What an event says of the device's task in a few words; empty where it says nothing."""
     said = event.payload
     if event.name in ("taskStarted", "policyStarted"):
@@ -123,7 +123,7 @@ def _limits(features: Mapping[str, Any]) -> dict[str, Range]:
     return ranges(features)
 
 
-def until(events: Iterator[Event], longest: float | None, device: str) -> Iterator[Event]:
+def until(events: Iterator[DeviceEvent], longest: float | None, device: str) -> Iterator[DeviceEvent]:
     """Events until ``longest`` seconds are over. Raises :class:`Failure` when the device falls silent."""
     ends = None if longest is None else time.monotonic() + longest
     for event in events:
@@ -143,7 +143,7 @@ def _first_view(fleet: FleetClient, device: str, limits: Mapping[str, Range]) ->
     return view
 
 
-def _live(screen: Screen, view: View, events: Iterator[Event]) -> None:
+def _live(screen: Screen, view: View, events: Iterator[DeviceEvent]) -> None:
     from rich.live import Live  # noqa: PLC0415 - Rich is loaded when something is shown
 
     with Live(view.draw(), console=screen.out, refresh_per_second=15) as live:
@@ -152,7 +152,7 @@ def _live(screen: Screen, view: View, events: Iterator[Event]) -> None:
             live.update(view.draw())
 
 
-def in_lines(screen: Screen, events: Iterator[Event]) -> None:
+def in_lines(screen: Screen, events: Iterator[DeviceEvent]) -> None:
     last = ""
     for event in events:
         told = task_of(event)

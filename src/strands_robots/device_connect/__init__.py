@@ -17,22 +17,22 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.device_connect.limits import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
+from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
 
 if TYPE_CHECKING:
     from device_connect_edge import DeviceRuntime
 
     from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
     from strands_robots.device_connect.bringup import (
+        DuplicateDeviceError,
         init_device_connect,
         init_device_connect_sync,
         stop_device_connect,
     )
     from strands_robots.device_connect.client import FleetClient
-    from strands_robots.device_connect.duplicates import DuplicateDeviceError
     from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
     from strands_robots.device_connect.robot_driver import RobotDeviceDriver
-    from strands_robots.device_connect.signals import StopSignal
+    from strands_robots.device_connect.shutdown import StopSignal
     from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 
 __all__ = [

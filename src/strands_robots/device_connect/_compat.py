@@ -8,12 +8,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import inspect
 import logging
 from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from device_connect_edge import device as framework
+from device_connect_edge import drivers
 from device_connect_edge.device import DeviceRuntime
 from device_connect_edge.drivers import DeviceDriver, decorators
 from device_connect_edge.messaging.exceptions import AuthenticationError, MessagingError, NotConnectedError
@@ -56,7 +58,31 @@ CONNECT_AGAIN_S = 1.0
 MAX_REFUSALS = 3
 """Attempts with credentials that the server refuses; then the start ends with its reason."""
 
+F = TypeVar("F", bound=Callable[..., Any])
+Labels = dict[str, str | list[str]]
+
 _log = logging.getLogger(__name__)
+
+
+def rpc(labels: Labels | None = None) -> Callable[[F], F]:
+    """Declare a function that agents may call; its name, hints and docstring become the schema they read."""
+    return cast(Callable[[F], F], drivers.rpc(labels=labels))
+
+
+def emit(labels: Labels | None = None) -> Callable[[F], F]:
+    """Declare an event: calling the method emits it."""
+
+    def declared(method: F) -> F:
+        # The framework asks for the signature at every emission; a stated one costs nothing to find.
+        vars(method)["__signature__"] = inspect.signature(method)
+        return cast(F, drivers.emit(labels=labels)(method))
+
+    return declared
+
+
+def on(event_name: str) -> Callable[[F], F]:
+    """Declare a handler of an event of every device of the tenant, this one included."""
+    return cast(Callable[[F], F], drivers.on(event_name=event_name))
 
 
 class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type information

@@ -18,12 +18,11 @@ from device_connect_edge.drivers.decorators import get_rpc_source_device
 
 from strands_robots import settings
 from strands_robots.contract import TaskRobot, WorldRobot
-from strands_robots.device_connect.declare import emit, on, rpc
+from strands_robots.device_connect._compat import emit, on, rpc
 from strands_robots.device_connect.live_driver import READ_DEADLINE_S, LiveDriver
 from strands_robots.device_connect.safety_seat import SafetySeat
-from strands_robots.device_connect.wire import jsonable
 from strands_robots.device_connect.workers import Lane, LaneFullError
-from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.envelope import Envelope, error, is_error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.gate import Asked, MotionRefused

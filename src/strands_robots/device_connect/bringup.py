@@ -17,26 +17,43 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.messaging import MessagingError
 
 from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.backends.errors import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
-from strands_robots.device_connect.duplicates import refuse_duplicate
-from strands_robots.device_connect.limits import (
-    BRINGUP_TIMEOUT_S,
-    LEAVE_TIMEOUT_S,
-    LOOP_JOIN_TIMEOUT_S,
-)
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.safety_seat import SafetySeat, take_seat
+from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.device_connect.workers import Lane
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, choice, device_id
 
 logger = logging.getLogger(__name__)
+
+BRINGUP_TIMEOUT_S = 20.0
+"""Seconds in which a device has to be callable and announced; a broker that is starting has time to come up."""
+
+PROBE_TIMEOUT_S = 1.0
+"""Seconds in which a device that already has the wanted id has to answer."""
+
+PROBES, PROBE_EVERY_S = 3, 0.05
+"""Number of times that a peer asks for its own id before the id counts as free, and the seconds between them."""
+
+PRESENCE_WAIT_S = 0.25
+"""Seconds in which a live device has announced itself after a probe, where access rules forbid to call it."""
+
+LEAVE_TIMEOUT_S = 15.0
+"""Seconds that a device's end waits for the link of its e-stop listener to close."""
+
+
+class DuplicateDeviceError(StrandsRobotsError, RuntimeError):
+    """A device with the wanted id is live on this network and answered."""
 
 
 @dataclass(slots=True)
@@ -287,6 +304,60 @@ def announceable(driver: DeviceDriver) -> None:
         f"{type(driver).__name__} cannot be announced, because JSON cannot carry a default or a label of "
         f"{', '.join(faults) or 'the device itself'}."
     )
+
+
+async def refuse_duplicate(name: str, link: LinkConfig, messaging: Any) -> None:
+    """Refuse an id that a live device on this network has.
+
+    Raises:
+        DuplicateDeviceError: a device with this id answered a probe. One that crashed does not answer.
+    """
+    taken = await (_announced(name, link, messaging) if link.authenticated else _answers(name, link, messaging))
+    if taken:
+        raise DuplicateDeviceError(
+            f"A device {name!r} is live in tenant {link.tenant!r} and answered; give this one another peer_id."
+        )
+
+
+async def _announced(name: str, link: LinkConfig, messaging: Any) -> bool:
+    """Return True when a device of this id announces itself on a probe.
+
+    On an authenticated link access rules let no device call another one, or itself.
+    """
+    present = asyncio.Event()
+
+    async def on_presence(data: bytes, reply: str | None) -> None:
+        if b'"departing"' not in data:
+            present.set()
+
+    root = f"device-connect.{link.tenant}"
+    subscription = await messaging.subscribe(f"{root}.{name}.presence", on_presence, subscribe_only=True)
+    try:
+        await messaging.publish(f"{root}.discovery.probe", b'{"probe": true}')
+        async with asyncio.timeout(PRESENCE_WAIT_S):
+            return await present.wait()
+    except TimeoutError:
+        return False
+    finally:
+        await subscription.unsubscribe()
+
+
+async def _answers(name: str, link: LinkConfig, messaging: Any) -> bool:
+    """Return True when a device of this id answers a call; an unserved id is known at once."""
+    request = {"jsonrpc": "2.0", "id": "probe", "method": "requestRegistration", "params": {}}
+    if link.is_peer:
+        # At a meeting point peers learn of one another one by one; any other open link knows all its peers.
+        messaging.configure_d2d_retry(retries=PROBES if link.meet_port else 1, delay=PROBE_EVERY_S)
+    try:
+        await messaging.request(
+            f"device-connect.{link.tenant}.{name}.cmd", json.dumps(request).encode(), timeout=PROBE_TIMEOUT_S
+        )
+    except NoResponderError:
+        return False
+    except MessagingError as exc:
+        logger.warning("A device %r is known on this network and does not answer (%s); taking its place.", name, exc)
+        return False
+    return True
 
 
 async def _put_down(runtime: Runtime, task: asyncio.Task[None]) -> None:

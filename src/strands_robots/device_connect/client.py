@@ -1,4 +1,4 @@
-"""A fleet as seen from a program without an event loop: who is there, call, listen, stop.
+"""Client of a fleet for programs without an event loop: find devices, call, follow events, stop.
 
 The command line and the agent tools use it. It says who it is (``source``), as every caller on Device Connect
 only says.
@@ -20,8 +20,9 @@ from typing import Any, Self, TypeVar
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig, open_client
-from strands_robots.device_connect.limits import LOOP_JOIN_TIMEOUT_S
+from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.stopping import Outcome, explain, grade
 from strands_robots.utils import device_id, shown, text
 
@@ -37,15 +38,15 @@ EVENTS_MAX = 10_000
 """Events that wait for a slow reader; then the oldest go."""
 
 
-class NoSuchDeviceError(LookupError):
-    """Nobody on this network answers to that id."""
+class NoSuchDeviceError(StrandsRobotsError, LookupError):
+    """No device on this network has that id."""
 
 
-class NoAnswerError(TimeoutError):
+class DeviceTimeoutError(StrandsRobotsError, TimeoutError):
     """The device is announced and did not answer in time."""
 
 
-class CallRefusedError(RuntimeError):
+class CallRefusedError(StrandsRobotsError, RuntimeError):
     """The device answered with a JSON-RPC error; ``code`` is the protocol's."""
 
     def __init__(self, message: str, code: int = 0) -> None:
@@ -90,7 +91,7 @@ class Peer:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class DeviceEvent:
     """An event as it arrived: whose, which, and what it carries. The sender's name is part of the topic only."""
 
     device: str
@@ -163,7 +164,7 @@ class FleetClient:
 
         Raises:
             NoSuchDeviceError: nobody answers to ``device``.
-            NoAnswerError: it is there and did not answer within ``timeout`` seconds.
+            DeviceTimeoutError: it is there and did not answer within ``timeout`` seconds.
             CallRefusedError: it refused the call as such: an unknown function, a malformed message.
             MessagingError: the network cannot carry the call.
         """
@@ -177,7 +178,7 @@ class FleetClient:
 
     def events(
         self, device: str = "*", timeout: float | None = None, ready: threading.Event | None = None
-    ) -> Generator[Event, None, None]:
+    ) -> Generator[DeviceEvent, None, None]:
         """Events of one device, or of all, as they come.
 
         Args:
@@ -185,7 +186,7 @@ class FleetClient:
             timeout: seconds without an event after which the iteration ends; None waits for ever.
             ready: set once events are heard.
         """
-        arrived: queue.Queue[Event] = queue.Queue(EVENTS_MAX)
+        arrived: queue.Queue[DeviceEvent] = queue.Queue(EVENTS_MAX)
         with self.subscription(device, lambda event: _push(arrived, event)):
             if ready is not None:
                 ready.set()
@@ -195,7 +196,7 @@ class FleetClient:
                 except queue.Empty:
                     return
 
-    def subscription(self, device: str, callback: Callable[[Event], None]) -> Subscription:
+    def subscription(self, device: str, callback: Callable[[DeviceEvent], None]) -> EventSubscription:
         """Tell ``callback`` of every event until the subscription is closed. It runs on the client's own thread:
         it must return at once and may not raise."""
         who = device if device == "*" else device_id("device", device)
@@ -205,7 +206,7 @@ class FleetClient:
             if event is not None:
                 callback(event)
 
-        return Subscription(self, self._wait(self._subscribe(f"{who}.event.*", arrived), 5.0))
+        return EventSubscription(self, self._wait(self._subscribe(f"{who}.event.*", arrived), 5.0))
 
     def stop(self, device: str, timeout: float = 5.0) -> Envelope:
         """Stop a device: ``stop``, or ``stopMotion`` where it has that. Its own envelope, an error when unanswered.
@@ -293,7 +294,7 @@ class FleetClient:
         if not self._messaging.is_connected:
             return exc
         if any(peer.id == device for peer in await self._collect(1.0)):
-            return NoAnswerError(f"{device} is announced and did not answer within {within:g} s ({exc}).")
+            return DeviceTimeoutError(f"{device} is announced and did not answer within {within:g} s ({exc}).")
         return NoSuchDeviceError(f"No device {device!r} in tenant {self.link.tenant!r}.")
 
     async def _stop(self, device: str, within: float) -> Envelope:
@@ -313,7 +314,7 @@ class FleetClient:
         return answer if answer.get("status") == "error" else error(explain(answer), stopped=None, answer=answer)
 
 
-class Subscription:
+class EventSubscription:
     """Events of a device, until closed; a context manager."""
 
     def __init__(self, client: FleetClient, handle: Any) -> None:
@@ -344,17 +345,17 @@ def _parts(subject: str) -> list[str]:
     return found if len(found) > 3 else ["", "", "", ""]
 
 
-def _event(data: bytes, subject: str) -> Event | None:
+def _event(data: bytes, subject: str) -> DeviceEvent | None:
     parts = _parts(subject)
     try:
         said = json.loads(data)
     except ValueError:
         return None
     payload = said.get("params") if isinstance(said, Mapping) else None
-    return Event(parts[2], parts[-1], payload if isinstance(payload, Mapping) else {})
+    return DeviceEvent(parts[2], parts[-1], payload if isinstance(payload, Mapping) else {})
 
 
-def _push(arrived: queue.Queue[Event], event: Event) -> None:
+def _push(arrived: queue.Queue[DeviceEvent], event: DeviceEvent) -> None:
     while True:
         try:
             arrived.put_nowait(event)

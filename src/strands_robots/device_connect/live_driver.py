@@ -18,8 +18,8 @@ from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 from strands_robots import settings
 from strands_robots.contract import RolloutEvent, TaskRobot, Unsubscribe, WorldRobot
 from strands_robots.device_connect.telemetry import RolloutPump, paced
-from strands_robots.device_connect.wire import jsonable
 from strands_robots.device_connect.workers import Lane
+from strands_robots.envelope import jsonable
 
 logger = logging.getLogger(__name__)
 

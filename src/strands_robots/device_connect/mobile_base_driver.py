@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from strands_robots.device_connect._compat import Labels, rpc
 from strands_robots.device_connect.base_driver import Call
-from strands_robots.device_connect.declare import Labels, rpc
 from strands_robots.device_connect.robot_driver import DURATION_MAX_S, RobotDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.gate import Approved

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.base_driver import Call
-from strands_robots.device_connect.declare import rpc
 from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
 from strands_robots.device_connect.robot_driver import DURATION_MAX_S
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot

@@ -11,8 +11,8 @@ from typing import Any, ClassVar, cast
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots.contract import RolloutEvent, TaskRobot
+from strands_robots.device_connect._compat import Labels, emit, rpc
 from strands_robots.device_connect.base_driver import Call, RobotDriver
-from strands_robots.device_connect.declare import Labels, emit, rpc
 from strands_robots.device_connect.live_driver import Activity
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.reachy.catalogue import LIBRARIES

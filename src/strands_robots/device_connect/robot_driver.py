@@ -9,10 +9,11 @@ from device_connect_edge.types import DeviceIdentity
 
 from strands_robots.bus_access import read_joints
 from strands_robots.contract import RUNNING, AdaptedRobot, RolloutEvent, adapt
+from strands_robots.device_connect._compat import Labels, emit, rpc
 from strands_robots.device_connect.base_driver import Call, RobotDriver
-from strands_robots.device_connect.declare import Labels, emit, rpc
 from strands_robots.device_connect.live_driver import Activity
-from strands_robots.device_connect.wire import numbers, record
+from strands_robots.device_connect.telemetry import numbers
+from strands_robots.envelope import fields_of
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.utils import ValidationError, identifier, number, text, whole
@@ -158,7 +159,7 @@ class RobotDeviceDriver(RobotDriver):
 
     def glance(self) -> Activity:
         """The task's state."""
-        facts = record(self.task_robot.get_task_status())
+        facts = fields_of(self.task_robot.get_task_status())
         state = str(facts.get("task_status", "")).lower()
         told = {
             "task_status": state,

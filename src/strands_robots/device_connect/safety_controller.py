@@ -8,8 +8,8 @@ from typing import Any
 from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
+from strands_robots.device_connect._compat import emit, rpc
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.declare import emit, rpc
 from strands_robots.device_connect.links import usual_link
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope, error, success

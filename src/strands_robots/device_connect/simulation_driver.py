@@ -9,13 +9,12 @@ from device_connect_edge.types import DeviceIdentity
 
 from strands_robots import settings
 from strands_robots.contract import RolloutEvent, WorldRobot
+from strands_robots.device_connect._compat import Labels, emit, rpc
 from strands_robots.device_connect.base_driver import Call, RobotDriver
-from strands_robots.device_connect.declare import Labels, emit, rpc
 from strands_robots.device_connect.live_driver import Activity
 from strands_robots.device_connect.robot_driver import task_arguments
-from strands_robots.device_connect.telemetry import paced
-from strands_robots.device_connect.wire import numbers, record
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.device_connect.telemetry import numbers, paced
+from strands_robots.envelope import Envelope, error, fields_of, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.stopping import explain, halt_each
@@ -190,7 +189,7 @@ class SimulationDeviceDriver(RobotDriver):
 
     def glance(self) -> Activity:
         """Time, steps and running policies of the world; keeps the joints for :meth:`observationUpdate`."""
-        facts = record(self.world.get_state())
+        facts = fields_of(self.world.get_state())
         rows = self.world.list_policies_running()
         running = {str(row.get("robot", "")): {k: v for k, v in row.items() if k != "robot"} for row in rows}
         robots = facts.get("robots")

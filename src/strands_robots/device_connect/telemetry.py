@@ -1,4 +1,4 @@
-"""From the robot's control thread and its state to the device's events, each at its own rate."""
+"""Telemetry of a device: the events of a rollout from the control thread to the loop, and periodic updates."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 
 from strands_robots.contract import RolloutEvent
+from strands_robots.policies import actions
 
 logger = logging.getLogger(__name__)
 
@@ -23,6 +24,15 @@ that a simulation makes up for, loses none by catching up."""
 
 FIRST = 2.0
 """Of these, what a loop has when it starts."""
+
+
+def numbers(values: object) -> dict[str, float]:
+    """The finite numbers of a mapping, by name; a joint given as ``{"position": x, ...}`` counts by its position."""
+    if not isinstance(values, Mapping):
+        return {}
+    return actions.numbers(
+        {str(name): value.get("position") if isinstance(value, Mapping) else value for name, value in values.items()}
+    )
 
 
 class Throttle:

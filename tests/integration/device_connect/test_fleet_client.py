@@ -20,7 +20,7 @@ from strands_robots.device_connect import (
     loopback_config,
     stop_device_connect,
 )
-from strands_robots.device_connect.client import CallRefusedError, Event, NoAnswerError, NoSuchDeviceError
+from strands_robots.device_connect.client import CallRefusedError, DeviceEvent, DeviceTimeoutError, NoSuchDeviceError
 from strands_robots.utils import ValidationError
 
 
@@ -103,7 +103,7 @@ def test_nobody_there_and_no_answer_are_two_things(fleet: FleetClient, link: Lin
         fleet.call("arm-9", "getStatus", timeout=60)
     assert time.monotonic() - began < 30
     runtime = init_device_connect_sync(Stubborn(), peer_id="thinker", link=link)
-    with pytest.raises(NoAnswerError, match="thinker"):
+    with pytest.raises(DeviceTimeoutError, match="thinker"):
         fleet.call("thinker", "think", timeout=0.3)
     stop_device_connect(runtime)
 
@@ -121,7 +121,7 @@ def test_an_id_out_of_domain_is_refused_before_it_is_sent(fleet: FleetClient, de
 
 
 def test_events_come_as_they_happen(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
-    heard: list[Event] = []
+    heard: list[DeviceEvent] = []
     with fleet.subscription("arm-2", heard.append):
         fleet.call("arm-2", "execute", {"instruction": "wave", "duration": 0.3})
         eventually(lambda: any(event.name == "policyComplete" for event in heard))

@@ -17,7 +17,7 @@ from strands_robots.device_connect import (
     stop_device_connect,
 )
 from strands_robots.device_connect.bringup import driver_for
-from strands_robots.device_connect.client import Event
+from strands_robots.device_connect.client import DeviceEvent
 from strands_robots.simulation import Simulation
 
 
@@ -67,7 +67,7 @@ def test_physics_is_stepped_and_reset_by_hand(fleet: FleetClient) -> None:
 
 
 def test_an_arm_moves_and_stands_still_after_the_stop(fleet: FleetClient, sim: Simulation) -> None:
-    heard: list[Event] = []
+    heard: list[DeviceEvent] = []
     with fleet.subscription("sim-1", heard.append):
         answer = fleet.call("sim-1", "execute", {"instruction": "wave", "duration": 100})
         assert answer["status"] == "success", answer
@@ -100,7 +100,7 @@ def test_two_robots_move_at_once_and_one_stop_halts_both(fleet: FleetClient) -> 
 
 
 def test_nothing_is_lost_of_a_stream(fleet: FleetClient) -> None:
-    heard: list[Event] = []
+    heard: list[DeviceEvent] = []
     with fleet.subscription("sim-1", heard.append):
         fleet.call("sim-1", "execute", {"instruction": "wave", "duration": 3})
         eventually(lambda: any(event.name == "policyComplete" for event in heard), within=20)
@@ -112,7 +112,7 @@ def test_nothing_is_lost_of_a_stream(fleet: FleetClient) -> None:
 
 
 def joints(fleet: FleetClient) -> dict[str, float]:
-    from strands_robots.device_connect.wire import numbers  # noqa: PLC0415 - beside its only use
+    from strands_robots.device_connect.telemetry import numbers  # noqa: PLC0415 - beside its only use
 
     robots: dict[str, Any] = fleet.call("sim-1", "getStatus")["robots"]
     return numbers(robots["left"].get("joints", robots["left"]))

@@ -18,7 +18,7 @@ from strands_robots.device_connect import (
     loopback_config,
     stop_device_connect,
 )
-from strands_robots.device_connect.client import Event
+from strands_robots.device_connect.client import DeviceEvent
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.safety import ed25519
@@ -108,7 +108,7 @@ def test_a_value_out_of_its_domain_is_refused_by_name(
 def test_a_gesture_does_not_hold_the_line_and_stop_motion_ends_it(
     call: Call, device: ReachyMiniDriver, fleet: FleetClient
 ) -> None:
-    told: list[Event] = []
+    told: list[DeviceEvent] = []
     with fleet.subscription("head-1", told.append):
         assert call("shake")["status"] == "success"
         eventually(lambda: device.reachy.motions.frames_sent > 3, what="frames")

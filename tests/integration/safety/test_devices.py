@@ -25,7 +25,7 @@ from strands_robots.device_connect import (
     stop_device_connect,
 )
 from strands_robots.device_connect.backends import open_client
-from strands_robots.device_connect.client import NoAnswerError, NoSuchDeviceError
+from strands_robots.device_connect.client import DeviceTimeoutError, NoSuchDeviceError
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
@@ -95,7 +95,7 @@ class Floor:
         """The answer of a device; empty while it is not known on the network yet."""
         try:
             return self.agent.call(device, function, params)
-        except (MessagingError, NoSuchDeviceError, NoAnswerError):
+        except (MessagingError, NoSuchDeviceError, DeviceTimeoutError):
             return {}
 
     def move(self) -> None:

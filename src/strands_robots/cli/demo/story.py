@@ -13,7 +13,7 @@ from strands_robots.cli.demo.agent import Agent, Event, Stream
 from strands_robots.cli.demo.child import Child
 from strands_robots.cli.demo.show import Show
 from strands_robots.cli.output import Failure, table
-from strands_robots.device_connect.wire import numbers
+from strands_robots.device_connect.telemetry import numbers
 
 NEEDED = ("execute", "stop", "getStatus", "getFeatures")
 

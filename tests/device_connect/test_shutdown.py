@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as something to wait for."""
+"""StopSignal: SIGINT and SIGTERM end a wait."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import threading
 
 import pytest
 
-from strands_robots.device_connect.signals import StopSignal
+from strands_robots.device_connect.shutdown import StopSignal
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_wait_and_the_handlers_are_as_before(number: signal.Signals) -> None:
+def test_signal_ends_the_wait_and_restores_the_handlers(number: signal.Signals) -> None:
     before = [signal.getsignal(each) for each in StopSignal.SIGNALS]
     with StopSignal() as asked:
         assert asked.wait(0.01) is None
@@ -21,7 +21,7 @@ def test_a_signal_ends_the_wait_and_the_handlers_are_as_before(number: signal.Si
         assert [signal.getsignal(each) for each in StopSignal.SIGNALS] == before
 
 
-def test_leaving_without_a_signal_puts_the_handlers_back() -> None:
+def test_leaving_without_a_signal_restores_the_handlers() -> None:
     before = [signal.getsignal(each) for each in StopSignal.SIGNALS]
     with StopSignal():
         assert [signal.getsignal(each) for each in StopSignal.SIGNALS] != before

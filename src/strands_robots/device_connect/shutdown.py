@@ -1,4 +1,7 @@
-"""SIGINT and SIGTERM as something to wait for, so that a program stops its robot and leaves no ghost."""
+"""The orderly end of a program: a signal to wait for, and how long the end of a device may take.
+
+Importing this module needs no extra.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,9 @@ import signal
 import threading
 from types import FrameType, TracebackType
 from typing import Any, Self
+
+LOOP_JOIN_TIMEOUT_S = 5.0
+"""Seconds that a failed or stopped bring-up, or a client, waits for its thread to end."""
 
 
 class StopSignal:
@@ -15,8 +21,8 @@ class StopSignal:
 
     ::
 
-        with StopSignal() as asked:
-            asked.wait()
+        with StopSignal() as stop:
+            stop.wait()
             robot.halt("the operator ended the program")
             stop_device_connect(runtime)
     """
@@ -24,13 +30,13 @@ class StopSignal:
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self) -> None:
-        self._came = threading.Event()
-        self._before: dict[signal.Signals, Any] = {}
+        self._received = threading.Event()
+        self._previous: dict[signal.Signals, Any] = {}
         self.number: int | None = None
 
     def __enter__(self) -> Self:
         for each in self.SIGNALS:
-            self._before[each] = signal.signal(each, self._note)
+            self._previous[each] = signal.signal(each, self._on_signal)
         return self
 
     def __exit__(
@@ -39,22 +45,22 @@ class StopSignal:
         self._restore()
 
     def wait(self, within: float | None = None) -> int | None:
-        """The number of the signal that came, or None when ``within`` seconds passed without one."""
-        # An untimed wait on a lock is one that a signal handler may not interrupt on every platform.
+        """Return the number of the signal, or None when ``within`` seconds passed without one."""
+        # On some platforms a signal handler does not interrupt an untimed wait on a lock.
         left = within
-        while not self._came.wait(0.2 if left is None else min(0.2, max(left, 0))):
+        while not self._received.wait(0.2 if left is None else min(0.2, max(left, 0))):
             if left is not None:
                 left -= 0.2
                 if left <= 0:
                     return None
         return self.number
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.number = number
         self._restore()
-        self._came.set()
+        self._received.set()
 
     def _restore(self) -> None:
-        before, self._before = self._before, {}
-        for each, handler in before.items():
+        previous, self._previous = self._previous, {}
+        for each, handler in previous.items():
             signal.signal(each, handler)
