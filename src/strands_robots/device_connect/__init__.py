@@ -55,13 +55,13 @@ __all__ = [
 _HERE = "strands_robots.device_connect"
 _HOMES = {
     "DeviceRuntime": "device_connect_edge",
-    "DuplicateDeviceError": f"{_HERE}.duplicates",
+    "DuplicateDeviceError": f"{_HERE}.bringup",
     "FleetClient": f"{_HERE}.client",
     "LinkConfig": f"{_HERE}.backends",
     "ReachyMiniDriver": f"{_HERE}.reachy_mini_driver",
     "RobotDeviceDriver": f"{_HERE}.robot_driver",
     "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
-    "StopSignal": f"{_HERE}.signals",
+    "StopSignal": f"{_HERE}.shutdown",
     "init_device_connect": f"{_HERE}.bringup",
     "init_device_connect_sync": f"{_HERE}.bringup",
     "link_from_environment": f"{_HERE}.backends",

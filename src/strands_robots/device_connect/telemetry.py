@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 
 from strands_robots.contract import RolloutEvent
-from strands_robots.policies import actions
+from strands_robots.policies import base
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ def numbers(values: object) -> dict[str, float]:
     """The finite numbers of a mapping, by name; a joint given as ``{"position": x, ...}`` counts by its position."""
     if not isinstance(values, Mapping):
         return {}
-    return actions.numbers(
+    return base.numbers(
         {str(name): value.get("position") if isinstance(value, Mapping) else value for name, value in values.items()}
     )
 
