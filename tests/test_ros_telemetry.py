@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots.envelope import Envelope, success
-from strands_robots.ros.link import MemoryLink
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.ros_telemetry import RosTelemetryBase
 from strands_robots.utils import ValidationError
 

@@ -6,8 +6,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.dds_security import Credentials, checked_credentials
-from strands_robots.ros.governance import opening
+from strands_robots.ros.dds_security import DdsCredentials, checked_credentials, governance_gap
 from strands_robots.ros_telemetry import RosTelemetryBase, refuse_unsecured
 from strands_robots.utils import missing_extra
 
@@ -70,8 +69,8 @@ class HardwareRtpsBridge(RosTelemetryBase):
             link.close()
             raise
 
-    def _lacking(self, credentials: Credentials | None) -> str | None:
+    def _lacking(self, credentials: DdsCredentials | None) -> str | None:
         if credentials is None:
             return "bare DDS is not secured without dds_security_config."
-        found = opening(credentials.document("governance"), self.domain_id, f"rt{self.command_topic}")
+        found = governance_gap(credentials.document("governance"), self.domain_id, f"rt{self.command_topic}")
         return None if found is None else f"the governance does not close it: {found}."

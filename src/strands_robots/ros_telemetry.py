@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.envelope import is_error, text_of
-from strands_robots.ros.link import Heard, Message, Unwatch
+from strands_robots.ros.link import Message, OnMessage, Unwatch
 from strands_robots.ros.names import node_name as checked_node_name
-from strands_robots.ros.rclpy_link import MAX_QOS_HISTORY_DEPTH, RclpyLink
+from strands_robots.ros.rclpy import MAX_QOS_HISTORY_DEPTH, RclpyLink
 from strands_robots.utils import ValidationError, flag, number, shown, text, whole
 
 __all__ = ["MAX_QOS_HISTORY_DEPTH", "RosTelemetryBase", "RosTelemetryBridge", "checked_limits", "refuse_unsecured"]
@@ -58,10 +58,10 @@ def checked_limits(limits: object) -> Limits:
 class TelemetryLink(Protocol):
     """What a bridge asks of the road to its graph."""
 
-    def tell(self, topic: str, kind: str, fields: Message) -> None:
+    def broadcast(self, topic: str, kind: str, fields: Message) -> None:
         """Publish for whoever cares."""
 
-    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+    def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
         """Tell ``heard`` of every message."""
 
     def close(self) -> None:
@@ -257,7 +257,7 @@ class RosTelemetryBase:
         if link is None:
             logger.warning("Nothing is published on %s: the bridge was shut down.", topic)
         else:
-            link.tell(topic, kind, fields)
+            link.broadcast(topic, kind, fields)
 
     def _publish_on(self, period_s: float, cameras: list[str]) -> None:
         due = time.monotonic() + period_s

@@ -18,7 +18,7 @@ from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import MemoryLink
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.orders import StopOrder

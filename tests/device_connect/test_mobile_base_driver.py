@@ -13,7 +13,7 @@ from strands_robots.device_connect.bringup import driver_for
 from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import MemoryLink
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 

@@ -14,7 +14,8 @@ from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDri
 from strands_robots.device_connect.navigating_base_driver import NavigatingBaseDeviceDriver
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import Goal, MemoryLink
+from strands_robots.ros.link import Goal
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 

@@ -11,8 +11,7 @@ from fixtures.dds_pki import DdsPki, governance
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
 from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.dds_security import REQUIRED, checked_credentials
-from strands_robots.ros.governance import opening
+from strands_robots.ros.dds_security import REQUIRED, checked_credentials, governance_gap
 from strands_robots.utils import ValidationError
 
 DOMAIN = 7
@@ -121,10 +120,10 @@ def signed(tmp_path: Path, laws: str) -> bytes:
 
 
 def test_a_strict_governance_leaves_a_topic_closed(tmp_path: Path) -> None:
-    assert opening(signed(tmp_path, governance(DOMAIN)), DOMAIN, TOPIC) is None
+    assert governance_gap(signed(tmp_path, governance(DOMAIN)), DOMAIN, TOPIC) is None
     ranged = governance(DOMAIN).replace(f"<id>{DOMAIN}</id>", "<id_range><min>3</min><max>9</max></id_range>")
-    assert opening(signed(tmp_path, ranged), DOMAIN, TOPIC) is None
-    assert opening(signed(tmp_path, ranged), 10, TOPIC) == "it has no rule for domain 10"
+    assert governance_gap(signed(tmp_path, ranged), DOMAIN, TOPIC) is None
+    assert governance_gap(signed(tmp_path, ranged), 10, TOPIC) == "it has no rule for domain 10"
 
 
 @pytest.mark.parametrize(
@@ -140,7 +139,7 @@ def test_a_strict_governance_leaves_a_topic_closed(tmp_path: Path) -> None:
     ],
 )
 def test_a_governance_that_leaves_a_topic_open_is_told_with_the_reason(tmp_path: Path, laws: str, why: str) -> None:
-    assert why in (opening(signed(tmp_path, laws), DOMAIN, TOPIC) or "")
+    assert why in (governance_gap(signed(tmp_path, laws), DOMAIN, TOPIC) or "")
 
 
 def test_the_first_topic_rule_that_fits_is_the_one_that_counts(tmp_path: Path) -> None:
@@ -148,6 +147,6 @@ def test_the_first_topic_rule_that_fits_is_the_one_that_counts(tmp_path: Path) -
     start, end = laws.index("<topic_rule>"), laws.index("</topic_access_rules>")
     lax = laws[start:end].replace("<topic_expression>*", "<topic_expression>rt/*_arm/*").replace("true", "false")
     assert "lets everybody write" in str(
-        opening(signed(tmp_path, laws[:start] + lax + laws[start:]), DOMAIN, TOPIC),
+        governance_gap(signed(tmp_path, laws[:start] + lax + laws[start:]), DOMAIN, TOPIC),
     )
-    assert opening(signed(tmp_path, laws[:end] + lax + laws[end:]), DOMAIN, TOPIC) is None
+    assert governance_gap(signed(tmp_path, laws[:end] + lax + laws[end:]), DOMAIN, TOPIC) is None

@@ -11,7 +11,7 @@ import pytest
 from cyclonedds.idl._machinery import BytesMachine
 from rosbags.typesys import Stores, get_typestore
 
-from strands_robots.ros.dds_fields import filled, plain
+from strands_robots.ros.dds import filled, plain
 from strands_robots.ros.dds_types import KINDS, Image, JointState, Odometry, Twist
 from strands_robots.ros.link import RosError
 

@@ -1,4 +1,4 @@
-"""ROS graphs: names, the command gate, and the roads to them. Importing this package loads none of them."""
+"""ROS graphs: names, the command gate, and the links to them. Importing this package loads no link."""
 
 from __future__ import annotations
 

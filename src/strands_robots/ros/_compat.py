@@ -1,4 +1,4 @@
-"""The one place that uses private members of cyclonedds: of 11.0, which is pinned for it, and of 0.10.5."""
+"""Private members of cyclonedds that we use: of 11.0, which is pinned for it, and of 0.10.5."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from cyclonedds.idl._machinery import BytesMachine
 
-# Which of the first two there is depends on the version.
+# The version decides whether there is a v0 or a v1 machine.
 _MACHINES = ("v0_machine", "v1_machine", "v2_machine")
 
 
@@ -27,7 +27,7 @@ def pack_as_bytes(struct: Any, *members: str) -> None:
 
 
 def subscribed(writer: Any) -> bool:
-    """True while a subscription matches this writer, which 0.10.5 can tell in C only."""
+    """Return True while a subscription matches this writer, which 0.10.5 offers in C only."""
     if hasattr(writer, "get_matched_subscriptions"):
         return bool(writer.get_matched_subscriptions())
     return int(writer._dll_handle.dds_get_matched_subscriptions(writer._ref, None, ctypes.c_size_t(0))) > 0

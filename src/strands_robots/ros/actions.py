@@ -1,20 +1,19 @@
-"""``ros_action``: look at a ROS graph, read it and write to it, by rclpy, over bare DDS or a rosbridge server."""
+"""``ros_action``: inspect, read and write a ROS graph by rclpy, over bare DDS or through a rosbridge server."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.goals import run_goal, said
-from strands_robots.ros.link import Message, RosError, RosLink
-from strands_robots.ros.names import graph_name, interface
-from strands_robots.ros.rclpy_link import RclpyLink
-from strands_robots.ros.roads import nearest_backend
+from strands_robots.ros.link import Message, RosError, RosLink, run_goal
+from strands_robots.ros.names import absolute, graph_name, interface
+from strands_robots.ros.rclpy import RclpyLink
+from strands_robots.ros.ros2 import ros2_backend
 from strands_robots.ros.rosbridge import RosbridgeLink
 from strands_robots.utils import MissingExtraError, ValidationError, choice, mapping, number, whole
 
@@ -39,19 +38,19 @@ RATE_MIN_HZ = 1 / TIMEOUT_MAX_S
 
 @runtime_checkable
 class Browsable(Protocol):
-    """A link that can tell what is on its graph."""
+    """A link that can list its graph."""
 
     def topics(self) -> list[dict[str, Any]]:
-        """``topic`` and ``type`` of each topic, with what else the road tells."""
+        """Return ``topic`` and ``type`` of each topic, with what else the link knows of it."""
 
     def nodes(self) -> list[str]:
-        """Names of the nodes."""
+        """Return the names of the nodes."""
 
     def services(self) -> list[str]:
-        """Names of the services."""
+        """Return the names of the services."""
 
     def actions(self) -> list[str]:
-        """Names of the actions."""
+        """Return the names of the actions."""
 
 
 _links: dict[tuple[Any, ...], RosLink] = {}
@@ -59,11 +58,11 @@ _links_lock = threading.Lock()
 
 
 def link_for(backend: str, host: str, port: int, domain_id: int | None) -> RosLink:
-    """The process's link to a graph, made at its first use and kept; ``auto`` is the nearest to a ROS 2 graph.
+    """Return the process's link to a graph, made at its first use and kept; ``auto`` asks :func:`ros2_backend`.
 
     Raises:
-        ValidationError: an address or a domain that cannot be.
-        RosError: ``auto``, and there is no road at all.
+        ValidationError: an address or a domain outside its domain.
+        RosError: ``auto``, and neither a ROS 2 nor bare DDS is there.
     """
     makers: dict[str, Callable[[], RosLink]] = {
         "rclpy": lambda: RclpyLink(domain_id),
@@ -71,7 +70,7 @@ def link_for(backend: str, host: str, port: int, domain_id: int | None) -> RosLi
         "rosbridge": lambda: RosbridgeLink(host, port),
     }
     if backend == "auto":
-        backend = nearest_backend()
+        backend = ros2_backend()
     with _links_lock:
         key = (backend, host, port) if backend == "rosbridge" else (backend, domain_id)
         if key not in _links:
@@ -80,7 +79,7 @@ def link_for(backend: str, host: str, port: int, domain_id: int | None) -> RosLi
 
 
 def close_links() -> None:
-    """Let go of every graph that :func:`ros_action` has used."""
+    """Leave every graph that :func:`ros_action` has used."""
     with _links_lock:
         links = list(_links.values())
         _links.clear()
@@ -107,13 +106,13 @@ def ros_action(
     """Do one thing on a ROS graph; every refusal and failure is an error envelope.
 
     A publish, a service call and a goal on a command surface ask the command gate first. They are single commands:
-    no lockout holds them and no halt ends what they began, so a robot is driven by its own class.
+    no lockout refuses them and no halt ends what they began, so drive a robot by its own class.
 
     Args:
         action: one of :data:`ACTIONS`.
         name: topic, service or action, where the action needs one.
-        type: its interface; what is published, called or sent as a goal needs one.
-        fields: of the message, request or goal; what is left out is zero.
+        type: its interface; publish, service_call and action_goal need one.
+        fields: of the message, request or goal; omitted ones are zero.
         count: messages to read or publish, 1 to 1000. ``rate``: Hz of several, 1/600 to 100.
         timeout: seconds to wait for each message, answer or end, above 0 and at most 600.
         backend: ``rclpy``, ``dds`` (topics alone), ``rosbridge``, or ``auto``: rclpy where a ROS 2 is sourced,
@@ -122,11 +121,11 @@ def ros_action(
     """
     try:
         wanted = choice("action", action, ACTIONS)
-        road = choice("backend", backend, BACKENDS)
+        chosen = choice("backend", backend, BACKENDS)
         seconds = number("timeout", timeout, above=0, high=TIMEOUT_MAX_S)
-        link = link_for(road, host, port, domain_id)
-        if wanted in _LOOKS:
-            return _LOOKS[wanted](link)
+        link = link_for(chosen, host, port, domain_id)
+        if wanted in ("status", *_LISTS):
+            return _listing(_browsable(link), wanted)
         target = graph_name("name", name)
         kind = None if type is None and wanted in ("info", "echo") else interface("type", type)
         messages = whole("count", count, low=1, high=COUNT_MAX)
@@ -143,56 +142,40 @@ def ros_action(
         if wanted == "publish":
             return _publish(link, target, kind, body, messages, rate_hz=hertz)
         if wanted == "service_call":
-            return success(f"{target} answered.", response=_shown(link.call(target, kind, body, seconds)))
+            return success(f"{target} answered.", response=_jsonable(link.call(target, kind, body, seconds)))
         return _goal(link, target, kind, body, seconds)
     except (ValidationError, RosError, MissingExtraError) as exc:
         return error(str(exc))
 
 
-def _status(link: RosLink) -> Envelope:
-    found = _browsable(link).topics()
-    return success(f"{len(found)} topics can be seen.", backend=_named(link), topics=len(found))
-
-
-def _topics(link: RosLink) -> Envelope:
-    found = _browsable(link).topics()
-    return success("\n".join(f"{each['topic']} {each['type']}" for each in found) or "No topics.", topics=found)
-
-
-def _nodes(link: RosLink) -> Envelope:
-    found = _browsable(link).nodes()
-    return success("\n".join(found) or "No nodes.", nodes=found)
-
-
-def _services(link: RosLink) -> Envelope:
-    found = _browsable(link).services()
-    return success("\n".join(found) or "No services.", services=found)
-
-
-def _actions(link: RosLink) -> Envelope:
-    found = _browsable(link).actions()
-    return success("\n".join(found) or "No actions.", actions=found)
-
-
-_LOOKS: dict[str, Callable[[RosLink], Envelope]] = {
-    "status": _status,
-    "list_topics": _topics,
-    "list_nodes": _nodes,
-    "list_services": _services,
-    "list_actions": _actions,
+_LISTS: dict[str, Callable[[Browsable], Sequence[Any]]] = {
+    "list_topics": lambda graph: graph.topics(),
+    "list_nodes": lambda graph: graph.nodes(),
+    "list_services": lambda graph: graph.services(),
+    "list_actions": lambda graph: graph.actions(),
 }
 
 
+def _listing(graph: Browsable, action: str) -> Envelope:
+    if action == "status":
+        count = len(graph.topics())
+        return success(f"{count} topics can be seen.", backend=type(graph).__name__, topics=count)
+    what = action.removeprefix("list_")
+    rows = _LISTS[action](graph)
+    lines = [f"{row['topic']} {row['type']}" if isinstance(row, dict) else row for row in rows]
+    return success("\n".join(lines) or f"No {what}.", **{what: rows})
+
+
 def _info(link: RosLink, topic: str) -> Envelope:
-    wanted = f"/{topic.lstrip('/')}"
-    found = [each for each in _browsable(link).topics() if each["topic"] == wanted]
-    if not found:
+    wanted = absolute(topic)
+    row = next((each for each in _browsable(link).topics() if each["topic"] == wanted), None)
+    if row is None:
         return error(f"{wanted} is not on the graph.", topic=wanted)
-    return success(f"{wanted} carries {found[0]['type']}.", **found[0])
+    return success(f"{wanted} carries {row['type']}.", **row)
 
 
 def _echo(link: RosLink, topic: str, kind: str | None, count: int, within_s: float) -> Envelope:
-    messages = [_shown(link.read(topic, kind, within_s)) for _ in range(count)]
+    messages = [_jsonable(link.read(topic, kind, within_s)) for _ in range(count)]
     return success(f"{len(messages)} messages of {topic}.", topic=topic, messages=messages)
 
 
@@ -209,26 +192,22 @@ def _publish(link: RosLink, topic: str, kind: str, fields: Message, count: int, 
 
 def _goal(link: RosLink, action: str, kind: str, goal: Message, within_s: float) -> Envelope:
     report = run_goal(link, action, kind, goal, within_s)
-    told = {"goal_status": report.status, "goal_state": report.state, "values": _shown(report.values)}
+    fields = {"goal_status": report.status, "goal_state": report.state, "values": _jsonable(report.values)}
     if report.state != "succeeded":
-        return error(f"{action}: {said(report)}", **told)
-    return success(f"{action} succeeded.", **told)
+        return error(f"{action}: {report.sentence()}", **fields)
+    return success(f"{action} succeeded.", **fields)
 
 
 def _browsable(link: RosLink) -> Browsable:
     if not isinstance(link, Browsable):
-        raise RosError(f"A {_named(link)} cannot tell what is on its graph.")
+        raise RosError(f"A {type(link).__name__} cannot tell what is on its graph.")
     return link
 
 
-def _named(link: RosLink) -> str:
-    return link.__class__.__name__
-
-
-def _shown(value: Any) -> Any:
-    """A message as JSON can carry it: bytes are told by their number."""
+def _jsonable(value: Any) -> Any:
+    """Return a message as JSON can carry it: bytes become a sentence with their number."""
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     if isinstance(value, Mapping):
-        return {key: _shown(each) for key, each in value.items()}
-    return [_shown(each) for each in value] if isinstance(value, list | tuple) else value
+        return {key: _jsonable(each) for key, each in value.items()}
+    return [_jsonable(each) for each in value] if isinstance(value, list | tuple) else value

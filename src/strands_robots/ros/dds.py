@@ -1,30 +1,28 @@
-"""A ROS 2 graph over bare DDS: Cyclone DDS from a wheel, no ROS 2 on this side."""
+"""Link to a ROS 2 graph over bare DDS: Cyclone DDS from a wheel, no ROS 2 on this side."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from strands_robots import settings
-from strands_robots.ros.dds_fields import filled, plain
 from strands_robots.ros.dds_security import checked_credentials, policies, presenting
-from strands_robots.ros.link import Heard, Message, RosError, Unwatch, next_message
-from strands_robots.ros.names import bare_kind
-from strands_robots.utils import missing_extra, number, whole
+from strands_robots.ros.link import Message, OnMessage, RosError, Unwatch, next_message
+from strands_robots.ros.names import absolute, bare_kind, domain
+from strands_robots.utils import missing_extra, number, shown
 
 logger = logging.getLogger(__name__)
 
-DOMAIN_MAX = 232
-"""Highest DDS domain: RTPS derives its UDP ports from it, and those of 233 are past 65535."""
-
 DEPTH = 10
 _SLICE_MS = 100
+_POLL_S = 0.02
 
 LOOPBACK_ONLY = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast></General>
@@ -32,7 +30,7 @@ LOOPBACK_ONLY = """<CycloneDDS><Domain Id="any"><General>
 <SPDPInterval>2s</SPDPInterval><Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 """Cyclone DDS on this machine alone, without multicast; for Linux, whose loopback interface is ``lo``.
 
-A participant says every 2 s that it is there, because nobody repeats an announcement that was lost (RTPS 2.5, 8.5.3).
+A participant announces itself every 2 s, because a lost announcement is not repeated sooner (RTPS 2.5, 8.5.3).
 """
 
 _domains: dict[int, Any] = {}
@@ -42,13 +40,13 @@ _domains_lock = threading.Lock()
 class DdsLink:
     """A :class:`~strands_robots.ros.link.RosLink` of topics. Nothing is opened before the first use.
 
-    What is published has to reach somebody: while no subscription matches, a publish waits ``match_s`` and fails.
+    A published message needs a subscription: while no subscription matches, a publish waits ``match_s`` and fails.
 
     Args:
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
         match_s: how long a publish waits for a first subscription, and a read without a type for a publisher.
         dds_security_config: credentials of :func:`~strands_robots.ros.dds_security.checked_credentials`; the
-            participant then presents them or does not come up. Without, it is one that nobody has to believe.
+            participant then presents them or does not come up. Without, the participant proves nothing.
 
     Raises:
         ValidationError: an argument outside its domain, or credentials that the installed library cannot honour.
@@ -62,8 +60,7 @@ class DdsLink:
         match_s: float = 0.5,
         dds_security_config: Mapping[str, str] | None = None,
     ) -> None:
-        stated = settings.integer("ROS_DOMAIN_ID") if domain_id is None else domain_id
-        self.domain_id = whole("domain_id", stated, low=0, high=DOMAIN_MAX)
+        self.domain_id = domain(domain_id)
         self._match_s = number("match_s", match_s, low=0, high=60)
         self._credentials = checked_credentials(dds_security_config)
         self._security = [] if self._credentials is None else policies(_dds("qos"), self._credentials)
@@ -72,12 +69,16 @@ class DdsLink:
         self._writers: dict[tuple[str, str], Any] = {}
         self._unwatch: list[Unwatch] = []
 
-    def open(self) -> None:
-        """Join the domain now, rather than at the first use."""
-        self._open()
+    def open(self) -> Any:
+        """Join the domain now, rather than at the first use; return the participant."""
+        with self._lock:
+            if self._participant is None:
+                with presenting(self.domain_id, self._credentials):
+                    self._participant = self._joined()
+            return self._participant
 
     def advertise(self, topic: str, kind: str) -> None:
-        """Appear on the graph as a publisher of ``topic`` before there is anything to say."""
+        """Appear on the graph as a publisher of ``topic`` before the first message."""
         self._writer(topic, kind)
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
@@ -91,8 +92,8 @@ class DdsLink:
             time.sleep(0.002)
         _write(writer, message, topic, kind)
 
-    def tell(self, topic: str, kind: str, fields: Message) -> None:
-        """Publish what is for whoever cares, such as telemetry: it is no error that nobody subscribes."""
+    def broadcast(self, topic: str, kind: str, fields: Message) -> None:
+        """Publish, such as telemetry, whether or not there is a subscription."""
         message = filled(_struct(kind), fields)
         _write(self._writer(topic, kind), message, topic, kind)
 
@@ -100,17 +101,17 @@ class DdsLink:
         return next_message(self.watch, topic, kind, within_s)
 
     def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
-        """Refused: bare DDS carries topics alone here."""
+        """Refuse: bare DDS carries topics only."""
         del kind, fields, within_s
         raise RosError(f"{service} is a service, and bare DDS carries topics only; use rclpy or rosbridge.")
 
-    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+    def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
         sub, qos, core = _dds("sub"), _dds("qos"), _dds("core")
         struct = _struct(kind or self._kind_of(topic))
         # Best effort takes what a sensor sends so as well as what is sent reliably.
         quality = qos.Qos(qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepLast(DEPTH))
         with self._lock:
-            participant = self._open()
+            participant = self.open()
             try:
                 reader = sub.DataReader(participant, self._topic(topic, struct), qos=quality)
                 waitset = core.WaitSet(participant)
@@ -125,7 +126,7 @@ class DdsLink:
             while not done.is_set():
                 if waitset.wait(slice_ns):
                     for message in _arrived(reader, topic, core.DDSException, done):
-                        _tell(heard, message, topic)
+                        _deliver(on_message, message, topic)
 
         thread = threading.Thread(target=run, name=f"dds-{topic.strip('/')}", daemon=True)
 
@@ -141,7 +142,7 @@ class DdsLink:
         return unwatch
 
     def endpoints(self) -> list[dict[str, str]]:
-        """What the graph has told so far: ``topic``, ``type`` and ``role`` (publisher, subscription) by endpoint."""
+        """Return ``topic``, ``type`` and ``role`` (publisher, subscription) of each endpoint discovered so far."""
         builtin, core = _dds("builtin"), _dds("core")
         sources = {
             "publisher": builtin.BuiltinTopicDcpsPublication,
@@ -150,7 +151,7 @@ class DdsLink:
         alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
         found = []
         # Not under the lock, which a command's first message needs.
-        participant = self._open()
+        participant = self.open()
         for role, source in sources.items():
             try:
                 reader = builtin.BuiltinDataReader(participant, source)
@@ -164,13 +165,13 @@ class DdsLink:
         return found
 
     def topics(self) -> list[dict[str, Any]]:
-        """``topic``, ``type``, and how many ``publishers`` and ``subscriptions`` it has, by topic and type.
+        """Return ``topic``, ``type``, and the number of its ``publishers`` and ``subscriptions``, by topic and type.
 
-        A domain that was joined just now is given ``match_s`` to tell.
+        A domain that was joined just now has ``match_s`` to be discovered.
         """
         deadline = time.monotonic() + self._match_s
         while not (seen := self.endpoints()) and time.monotonic() < deadline:
-            time.sleep(0.02)
+            time.sleep(_POLL_S)
         found: dict[tuple[str, str], dict[str, Any]] = {}
         for each in seen:
             row = {"topic": each["topic"], "type": each["type"], "publishers": 0, "subscriptions": 0}
@@ -178,15 +179,15 @@ class DdsLink:
         return [found[key] for key in sorted(found)]
 
     def nodes(self) -> list[str]:
-        """Refused: nodes are a notion of ROS that bare DDS does not carry here."""
+        """Refuse: bare DDS has no nodes."""
         raise RosError("Bare DDS does not tell of nodes; use rclpy or rosbridge.")
 
     def services(self) -> list[str]:
-        """Refused: bare DDS carries topics alone here."""
+        """Refuse: bare DDS carries topics only."""
         raise RosError("Bare DDS carries topics only; use rclpy or rosbridge for services.")
 
     def actions(self) -> list[str]:
-        """Refused: bare DDS carries topics alone here."""
+        """Refuse: bare DDS carries topics only."""
         raise RosError("Bare DDS carries topics only; use rclpy or rosbridge for actions.")
 
     def close(self) -> None:
@@ -197,18 +198,11 @@ class DdsLink:
             self._writers.clear()
             self._participant = None
 
-    def _open(self) -> Any:
-        with self._lock:
-            if self._participant is None:
-                with presenting(self.domain_id, self._credentials):
-                    self._participant = self._joined()
-            return self._participant
-
     def _joined(self) -> Any:
-        domain = _dds("domain")
+        module = _dds("domain")
         try:
-            confine(domain, self.domain_id)
-            joined = domain.DomainParticipant(self.domain_id, qos=_dds("qos").Qos(*self._security))
+            confine(module, self.domain_id)
+            joined = module.DomainParticipant(self.domain_id, qos=_dds("qos").Qos(*self._security))
         except _dds("core").DDSException as exc:
             secured = " with these credentials" if self._security else ""
             raise RosError(f"DDS domain {self.domain_id} could not be joined{secured}: {exc}") from exc
@@ -218,7 +212,7 @@ class DdsLink:
         return joined
 
     def _topic(self, topic: str, struct: type[Any]) -> Any:
-        return _dds("topic").Topic(self._open(), f"rt/{topic.lstrip('/')}", struct)
+        return _dds("topic").Topic(self.open(), f"rt/{topic.lstrip('/')}", struct)
 
     def _writer(self, topic: str, kind: str) -> Any:
         key = (topic, bare_kind(kind))
@@ -229,14 +223,14 @@ class DdsLink:
                 quality = qos.Qos(reliable, qos.Policy.History.KeepLast(DEPTH))
                 struct = _struct(kind)
                 try:
-                    made = _dds("pub").DataWriter(self._open(), self._topic(topic, struct), qos=quality)
+                    made = _dds("pub").DataWriter(self.open(), self._topic(topic, struct), qos=quality)
                 except _dds("core").DDSException as exc:
                     raise RosError(f"{topic} cannot be published as {bare_kind(kind)}: {exc}") from exc
                 self._writers[key] = made
             return self._writers[key]
 
     def _kind_of(self, topic: str) -> str:
-        wanted = f"/{topic.lstrip('/')}"
+        wanted = absolute(topic)
         deadline = time.monotonic() + self._match_s
         while True:
             for each in self.endpoints():
@@ -244,7 +238,7 @@ class DdsLink:
                     return each["type"]
             if time.monotonic() >= deadline:
                 raise RosError(f"Nobody publishes {topic} in domain {self.domain_id}, so its type is not known.")
-            time.sleep(0.02)
+            time.sleep(_POLL_S)
 
 
 def _write(writer: Any, message: Any, topic: str, kind: str) -> None:
@@ -254,13 +248,13 @@ def _write(writer: Any, message: Any, topic: str, kind: str) -> None:
         raise RosError(f"{topic} did not take a {bare_kind(kind)}: {exc}") from exc
 
 
-def confine(domain: ModuleType, domain_id: int) -> None:
+def confine(module: ModuleType, domain_id: int) -> None:
     """Give the domain its loopback configuration, once a process, where ``ROS_LOCALHOST_ONLY`` asks for it."""
     if settings.is_set("CYCLONEDDS_URI") or not settings.boolean("ROS_LOCALHOST_ONLY", safe=True):
         return
     with _domains_lock:
         if domain_id not in _domains:
-            _domains[domain_id] = domain.Domain(domain_id, LOOPBACK_ONLY)
+            _domains[domain_id] = module.Domain(domain_id, LOOPBACK_ONLY)
 
 
 def _struct(kind: str) -> type[Any]:
@@ -282,7 +276,7 @@ def _dds(module: str) -> ModuleType:
 
 
 def _arrived(reader: Any, topic: str, lost: type[Exception], done: threading.Event) -> Iterator[dict[str, Any]]:
-    """What has arrived, one by one: a message that cannot be read takes no other with it, nor the watcher's thread."""
+    """Take what has arrived, one by one, so that an unreadable message costs neither the others nor the thread."""
     level = logging.WARNING
     while not done.is_set():
         try:
@@ -301,8 +295,80 @@ def _arrived(reader: Any, topic: str, lost: type[Exception], done: threading.Eve
             yield plain(samples[0])
 
 
-def _tell(heard: Heard, message: dict[str, Any], topic: str) -> None:
+def _deliver(on_message: OnMessage, message: dict[str, Any], topic: str) -> None:
     try:
-        heard(message)
+        on_message(message)
     except Exception:
         logger.exception("A watcher of %s failed.", topic)
+
+
+def filled(struct: type[Any], fields: Mapping[str, Any], place: str = "") -> Any:
+    """Return a struct with these fields; what is left out is zero. Raises :class:`RosError` naming the field."""
+    hints = get_type_hints(struct, include_extras=True)
+    message = struct()
+    for name, value in fields.items():
+        if name not in hints:
+            raise RosError(f"{struct.__name__} has no field {place}{name}; it has {', '.join(hints)}.")
+        setattr(message, name, _value(hints[name], getattr(message, name), value, f"{place}{name}"))
+    return message
+
+
+def plain(message: Any) -> dict[str, Any]:
+    """Return the fields of a message as numbers, text, bytes, lists and dictionaries."""
+    return {each.name: _plain(getattr(message, each.name)) for each in dataclasses.fields(message)}
+
+
+def _value(hint: Any, zero: Any, value: Any, place: str) -> Any:
+    if dataclasses.is_dataclass(zero):
+        if not isinstance(value, Mapping):
+            raise RosError(f"{place} must be an object of fields, not {shown(value)}.")
+        return filled(type(zero), value, f"{place}.")
+    if isinstance(zero, bytes):
+        return _bytes(value, place)
+    if isinstance(zero, list):
+        return _items(hint, zero, value, place)
+    if isinstance(zero, bool) or isinstance(value, bool):
+        fits = isinstance(zero, bool) and isinstance(value, bool)
+    elif isinstance(zero, float):
+        fits = isinstance(value, int | float)
+        value = float(value) if fits else value
+    else:
+        fits = isinstance(value, type(zero))
+    if not fits:
+        raise RosError(f"{place} must be a {type(zero).__name__}, not {shown(value)}.")
+    return value
+
+
+def _items(hint: Any, zero: list[Any], value: Any, place: str) -> list[Any]:
+    listed = value.tolist() if callable(getattr(value, "tolist", None)) else value
+    if not isinstance(listed, Sequence) or isinstance(listed, str | bytes):
+        raise RosError(f"{place} must be a list, not {shown(value)}.")
+    if zero and len(listed) != len(zero):
+        raise RosError(f"{place} must have {len(zero)} items, not {len(listed)}.")
+    kind = _item_type(hint)
+    return [_value(kind, kind(), each, f"{place}[{n}]") for n, each in enumerate(listed)]
+
+
+def _item_type(hint: Any) -> Any:
+    inner = get_args(get_args(hint)[0])[0]
+    # A number's type is Annotated[float, "float64"]; that of text and structs is itself.
+    parts = get_args(inner)
+    return parts[0] if parts else inner
+
+
+def _bytes(value: Any, place: str) -> bytes:
+    if isinstance(value, bytes | bytearray):
+        return bytes(value)
+    tobytes = getattr(value, "tobytes", None)
+    if callable(tobytes):
+        return bytes(tobytes())
+    try:
+        return bytes(value) if isinstance(value, list) else bytes([-1])
+    except (TypeError, ValueError):
+        raise RosError(f"{place} must be bytes or a list of them, not {shown(value)}.") from None
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return plain(value)
+    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""DDS Security of a participant: who it is, what it may do, and the plugins of Cyclone DDS that see to both.
+"""DDS Security of a participant: its credentials, the plugins of Cyclone DDS, and the governance of a topic.
 
 The names of the properties are those of the OMG's DDS Security 1.1; the plugins are the ones built with Cyclone DDS.
 """
@@ -11,8 +11,11 @@ import ssl
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from email import message_from_bytes
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from strands_robots.ros.link import RosError
 from strands_robots.utils import ValidationError
@@ -36,24 +39,23 @@ _PLUGINS = (
     ("crypto", "libdds_security_crypto.so", "crypto"),
 )
 
-
-_presented: dict[int, Credentials] = {}
+_presented: dict[int, DdsCredentials] = {}
 _presenting = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
-class Credentials:
+class DdsCredentials:
     """The checked credentials of one participant, as URIs. They may hold a private key and are never printed."""
 
     uris: Mapping[str, str] = field(repr=False)
 
     def document(self, name: str) -> bytes:
-        """What one of them says, such as the signed ``governance``."""
+        """Return the content of one of them, such as the signed ``governance``."""
         uri = self.uris[name]
         return uri.removeprefix(_DATA).encode() if uri.startswith(_DATA) else Path(uri.removeprefix(_FILE)).read_bytes()
 
     def properties(self) -> dict[str, str]:
-        """The properties of a participant that presents them to the plugins of the loaded library.
+        """Return the properties of a participant that presents them to the plugins of the loaded library.
 
         Raises:
             ValidationError: the loaded Cyclone DDS has no DDS Security.
@@ -66,8 +68,8 @@ class Credentials:
         return found
 
 
-def checked_credentials(config: object) -> Credentials | None:
-    """The credentials of a ``dds_security_config``; None where there is none. Touches nothing but the named files.
+def checked_credentials(config: object) -> DdsCredentials | None:
+    """Check a ``dds_security_config`` and return its credentials; None stays None. Opens the named files only.
 
     Values are paths or ``file:`` or ``data:,`` URIs. The permissions CA is the identity CA unless it is given. No
     message shows a value that may be a key.
@@ -90,17 +92,17 @@ def checked_credentials(config: object) -> Credentials | None:
         )
     uris = {key: _uri(f"dds_security_config[{key!r}]", value) for key, value in config.items()}
     uris.setdefault("permissions_ca", uris["identity_ca"])
-    credentials = Credentials(uris)
+    credentials = DdsCredentials(uris)
     _check_key(credentials)
     return credentials
 
 
 @contextlib.contextmanager
-def presenting(domain_id: int, credentials: Credentials | None) -> Iterator[None]:
-    """Join a domain with ``credentials`` inside this, one thread at a time.
+def presenting(domain_id: int, credentials: DdsCredentials | None) -> Iterator[None]:
+    """Join a domain with ``credentials`` inside this context, one thread at a time.
 
     The access control of Cyclone DDS 0.10 keeps the governance and permissions of the first participant of a domain
-    for every later one of the process, so that other ones are refused here rather than not looked at there.
+    for every later one of the process, so this refuses other credentials, which the library would ignore.
 
     Raises:
         RosError: this process has presented other credentials in this domain.
@@ -115,8 +117,8 @@ def presenting(domain_id: int, credentials: Credentials | None) -> Iterator[None
             _presented[domain_id] = credentials
 
 
-def _check_key(credentials: Credentials) -> None:
-    # The plugins take a key that does not fit and then fail with every peer.
+def _check_key(credentials: DdsCredentials) -> None:
+    # The plugins accept a key that does not fit and then fail with every peer.
     with contextlib.ExitStack() as files:
         names = []
         for name in ("certificate", "private_key"):
@@ -134,8 +136,8 @@ def _check_key(credentials: Credentials) -> None:
             ) from exc
 
 
-def policies(qos: Any, credentials: Credentials) -> list[Any]:
-    """The property policies of ``credentials``, made with the ``cyclonedds.qos`` module that is given."""
+def policies(qos: Any, credentials: DdsCredentials) -> list[Any]:
+    """Return the property policies of ``credentials``, made with the given ``cyclonedds.qos`` module."""
     return [qos.Policy.Property(key, value) for key, value in credentials.properties().items()]
 
 
@@ -171,8 +173,68 @@ def _plugin_folder() -> Path:
 
 
 def _loaded_library() -> Path | None:
-    """The file of the Cyclone DDS that is loaded, which its binding finds in several places; for Linux."""
+    """Return the file of the loaded Cyclone DDS, which its binding finds in several places; for Linux."""
     maps = Path("/proc/self/maps")
     lines = maps.read_text().splitlines() if maps.exists() else []
     paths = (Path(line.split(maxsplit=5)[5]) for line in lines if "/libddsc" in line)
     return next((path for path in paths if path.name.startswith("libddsc")), None)
+
+
+def governance_gap(document: bytes, domain_id: int, topic: str) -> str | None:
+    """Return how a signed governance document lets a stranger write ``topic``, or None: it does not.
+
+    The documents are those of DDS Security 1.1, section 9.4.1.2: XML inside S/MIME. The plugins check the signature.
+
+    Args:
+        document: the signed document.
+        domain_id: the DDS domain.
+        topic: the topic's name on the wire, such as ``rt/cmd_vel``.
+    """
+    rule = _domain_rule(document, domain_id)
+    if rule is None:
+        return f"it has no rule for domain {domain_id}"
+    if _flag(rule, "allow_unauthenticated_participants"):
+        return "it allows unauthenticated participants"
+    topics = rule.iterfind("topic_access_rules/topic_rule")
+    # The first rule that fits is the one that counts.
+    fitting = next((each for each in topics if fnmatchcase(topic, _text(each, "topic_expression"))), None)
+    if fitting is None:
+        return f"it has no rule for {topic}"
+    if not _flag(fitting, "enable_write_access_control"):
+        return f"it lets everybody write {topic}"
+    kinds = (_text(rule, "rtps_protection_kind"), _text(fitting, "metadata_protection_kind"))
+    if all(kind in ("", "NONE") for kind in (*kinds, _text(fitting, "data_protection_kind"))):
+        return f"it neither signs nor encrypts {topic}"
+    return None
+
+
+def _domain_rule(document: bytes, domain_id: int) -> ElementTree.Element | None:
+    parts = message_from_bytes(document).walk()
+    signed = next((part for part in parts if part.get_content_type() == "text/plain"), None)
+    content = signed.get_payload(decode=True) if signed is not None else None
+    try:
+        root = ElementTree.fromstring(content if isinstance(content, bytes) else b"")
+    except ElementTree.ParseError:
+        return None
+    rules = root.iterfind("domain_access_rules/domain_rule")
+    return next((each for each in rules if _covers(each.find("domains"), domain_id)), None)
+
+
+def _covers(domains: ElementTree.Element | None, domain_id: int) -> bool:
+    if domains is None:
+        return False
+    if any((each.text or "").strip() == str(domain_id) for each in domains.iterfind("id")):
+        return True
+    for span in domains.iterfind("id_range"):
+        low, high = _text(span, "min") or "0", _text(span, "max") or str(domain_id)
+        if low.isdecimal() and high.isdecimal() and int(low) <= domain_id <= int(high):
+            return True
+    return False
+
+
+def _flag(rule: ElementTree.Element, name: str) -> bool:
+    return _text(rule, name).lower() in ("true", "1")
+
+
+def _text(rule: ElementTree.Element, name: str) -> str:
+    return (rule.findtext(name) or "").strip()

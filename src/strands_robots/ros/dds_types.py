@@ -22,14 +22,9 @@ KINDS: dict[str, type[Any]] = {}
 """The IDL type of each ``pkg/Name`` that this bundle carries."""
 
 
-def wire_type(kind: str) -> str:
-    """The DDS type name of a ``pkg/Name``."""
-    package, _, name = kind.partition("/")
-    return f"{package}::msg::dds_::{name}_"
-
-
 def _typed(kind: str) -> dict[str, str]:
-    return {"typename": wire_type(kind)}
+    package, _, name = kind.partition("/")
+    return {"typename": f"{package}::msg::dds_::{name}_"}
 
 
 def _nine() -> list[float]:
@@ -206,7 +201,7 @@ class CompressedImage(IdlStruct, **_typed("sensor_msgs/CompressedImage")):
 
 
 @dataclass
-class Imu(IdlStruct, **_typed("sensor_msgs/Imu")):
+class ImuMessage(IdlStruct, **_typed("sensor_msgs/Imu")):
     header: Header = field(default_factory=Header)
     orientation: Quaternion = field(default_factory=Quaternion)
     orientation_covariance: Nine = field(default_factory=_nine)
@@ -239,24 +234,7 @@ class BatteryState(IdlStruct, **_typed("sensor_msgs/BatteryState")):
 pack_as_bytes(Image, "data")
 pack_as_bytes(CompressedImage, "data")
 
-for _kind, _struct in {
-    "builtin_interfaces": (Time,),
-    "std_msgs": (Header, String),
-    "geometry_msgs": (
-        Vector3,
-        Point,
-        Quaternion,
-        Twist,
-        TwistStamped,
-        TwistWithCovariance,
-        Pose,
-        PoseStamped,
-        PoseWithCovariance,
-        Transform,
-        TransformStamped,
-    ),
-    "tf2_msgs": (TFMessage,),
-    "nav_msgs": (Odometry,),
-    "sensor_msgs": (JointState, LaserScan, Image, CompressedImage, Imu, BatteryState),
-}.items():
-    KINDS.update({f"{_kind}/{each.__name__}": each for each in _struct})
+for _struct in IdlStruct.__subclasses__():
+    if _struct.__module__ == __name__:
+        _package, _, _, _name = _struct.__idl_typename__.split("::")
+        KINDS[f"{_package}/{_name.removesuffix('_')}"] = _struct

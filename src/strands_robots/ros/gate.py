@@ -1,4 +1,4 @@
-"""The command gate: which ROS topics, services and actions move a robot, and whether the operator approved one.
+"""Command gate: recognizes the ROS topics, services and actions that move a robot, and asks the operator.
 
 A surface is known by a word of its name, such as ``cmd_vel`` in ``/turtle1/cmd_vel``, or by its interface type,
 whatever it is called. The order is: not gated; ``STRANDS_ROS2_COMMAND_ALLOW``; ``BYPASS_TOOL_CONSENT``; the
@@ -56,7 +56,7 @@ SURFACES = frozenset(
         "switch_controller",
     }
 )
-"""Words that name a command surface: velocity and joint commands, goals, modes and motor enables."""
+"""Name parts of a command surface: velocity and joint commands, goals, modes and motor enables."""
 
 COMMAND_KINDS = {
     "geometry_msgs/Twist": "cmd_vel",
@@ -69,17 +69,17 @@ COMMAND_KINDS = {
     "nav2_msgs/NavigateToPose": "navigate_to_pose",
     "nav2_msgs/FollowPath": "follow_path",
 }
-"""Types that are only ever sent to move something, with the surface that they stand for."""
+"""Types that only motion commands have, with the surface that they stand for."""
 
 _SUFFIXES = ("joint_commands", "joint_command", "joint_trajectory")
-"""Surfaces that a prefix tells apart, as the two arms of a robot are: left_joint_command."""
+"""Surfaces that may have a prefix, such as that of one of two arms: left_joint_command."""
 
 _YES = frozenset({"y", "yes", "a", "approve", "approved", "true"})
 
 
 @lru_cache(maxsize=256)
 def surface_of(name: str, kind: str | None = None) -> str | None:
-    """The command surface that a graph name or its type stands for, or None: it moves nothing that we know of."""
+    """Return the command surface that a graph name or its type stands for, or None: it is not known to move a robot."""
     for word in reversed(name.lower().strip("/~").split("/")):
         if word in SURFACES:
             return word
@@ -92,7 +92,7 @@ def surface_of(name: str, kind: str | None = None) -> str | None:
 
 
 class CommandGate:
-    """Asks, for one command at a time, whether it may go out.
+    """Approval of single commands on a ROS graph.
 
     Args:
         read_list: gives the list of a setting by its name.
@@ -108,10 +108,10 @@ class CommandGate:
         self._bypass = bypass
 
     def refusal(self, name: str, kind: str | None, what: str, tool_context: Any = None) -> Envelope | None:
-        """Why ``what`` may not be sent on ``name``, or None.
+        """Return the refusal of ``what`` on ``name``, or None.
 
-        An operator who has to be asked is asked by the framework's interrupt, which leaves the tool by an
-        exception and runs it again with the answer: ask before anything has been done.
+        The framework's interrupt asks the operator: it leaves the tool by an exception and runs it again with the
+        answer. So call this before any side effect.
         """
         surface = surface_of(name, kind)
         if surface is None or self._listed(name, surface) or self._bypass():
@@ -135,9 +135,9 @@ class CommandGate:
 
 
 class Approved:
-    """Stands for the operator where a network has asked for the approval of the verb already."""
+    """Stand-in for the operator where a network has obtained the approval of the verb already."""
 
     def interrupt(self, name: str, reason: Any = None) -> bool:
-        """Yes."""
+        """Approve the command."""
         del name, reason
         return True

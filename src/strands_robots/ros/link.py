@@ -1,33 +1,104 @@
-"""What a robot on a ROS graph asks of the road to it, and an implementation in memory for newcomers and tests."""
+"""The contract of a link to a ROS graph: topics, services, and action goals from their sending to their end."""
 
 from __future__ import annotations
 
 import contextlib
-import copy
-import logging
 import threading
+import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
-logger = logging.getLogger(__name__)
+from strands_robots.errors import StrandsRobotsError
 
 Message = Mapping[str, Any]
-Heard = Callable[[Message], None]
+OnMessage = Callable[[Message], None]
 Unwatch = Callable[[], None]
-GivenUp = Callable[[], bool]
+CancelCheck = Callable[[], bool]
+
+SUCCEEDED = 4
+"""``action_msgs/GoalStatus`` of a goal that was reached."""
+
+STATUS_NAMES = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
+"""The statuses of ``action_msgs/GoalStatus``, in the order of their numbers."""
+
+CANCEL_S = 5.0
+"""Seconds within which a cancelled goal has to end."""
+
+SLICE_S = 0.01
 
 
-class RosError(RuntimeError):
-    """The road to the graph, or the graph, did not do what was asked; the message is one sentence."""
+class RosError(StrandsRobotsError, RuntimeError):
+    """The link or the graph did not do what was asked; the message is one sentence."""
+
+
+class EarlierRefusedError(RosError):
+    """A message was not sent, because the server refused an earlier one of its topic; the next one will be sent."""
 
 
 def never() -> bool:
-    """Nobody gives the goal up."""
+    """Return False: the goal is not cancelled."""
     return False
 
 
+class RosLink(Protocol):
+    """One connection to a ROS graph. Thread-safe; opened by the first use; every verb raises :class:`RosError`."""
+
+    def publish(self, topic: str, kind: str, fields: Message) -> None:
+        """Hand one message to the graph; returns within the link's own time-out."""
+
+    def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
+        """Return the next message of a topic; without ``kind`` the graph is asked for its type."""
+
+    def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
+        """Call a service and return its response."""
+
+    def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
+        """Call ``on_message`` with every message from now on, on the link's thread; it must return at once."""
+
+    def close(self) -> None:
+        """Leave the graph. A later use opens the link anew."""
+
+
+@runtime_checkable
+class UrgentLink(Protocol):
+    """A link with a second connection, for zeros alone, which the traffic of the first cannot hold up."""
+
+    def prepare_urgent(self, topic: str, kind: str) -> None:
+        """Have the second connection ready for ``topic``; returns at once."""
+
+    def publish_urgent(self, topic: str, kind: str, fields: Message) -> None:
+        """Send one message by it. Raises :class:`RosError` where that cannot be done without waiting."""
+
+    def cut(self) -> None:
+        """Drop everything that the first connection has not sent yet, so that none of it arrives later."""
+
+
+@runtime_checkable
+class GoalLink(Protocol):
+    """A link that carries actions."""
+
+    def send_goal(
+        self,
+        action: str,
+        kind: str,
+        goal: Message,
+        within_s: float,
+        *,
+        feedback: OnMessage | None = None,
+        cancelled: CancelCheck = never,
+    ) -> Goal:
+        """Send a goal and return once the server took it, time is over, or ``cancelled`` returns True.
+
+        A goal that is cancelled before the server took it is cancelled once it does.
+
+        Raises:
+            RosError: there is no server, or it refused the goal; nothing began.
+        """
+
+
 class Goal:
-    """A goal that was sent: ``done`` once the server told its end, or once that can no longer be told.
+    """A goal that was sent: ``done`` is set once its end is known, or once it can no longer become known.
 
     Args:
         cancel: asks the server to end it; returns at once, raises :class:`RosError` when it cannot be asked.
@@ -42,91 +113,109 @@ class Goal:
         self.cancel = cancel
 
     def end(self, status: int, values: Any) -> None:
-        """The server told the end: a ``GoalStatus`` and the result's fields."""
+        """Record the end that the server reported: a ``GoalStatus`` and the result's fields."""
         if not self.done.is_set():
             self.status, self.values = status, values
             self.done.set()
 
     def reject(self, problem: str) -> None:
-        """The server did not take it, so that nothing began."""
+        """Record that the server did not take the goal, so that nothing began."""
         self.rejected = True
         self.fail(problem)
 
     def fail(self, problem: str) -> None:
-        """The end will not be told, for this reason; the first one counts."""
+        """Record why the end will not become known; the first reason counts."""
         if not self.done.is_set():
             self.problem = problem
             self.done.set()
 
 
-@runtime_checkable
-class GoalLink(Protocol):
-    """A link that carries actions."""
+@dataclass(frozen=True, slots=True)
+class GoalReport:
+    """Outcome of a goal. ``state``: one of :data:`STATUS_NAMES`, ``rejected``, or ``lost`` where its end is unknown.
 
-    def begin_goal(
-        self,
-        action: str,
-        kind: str,
-        goal: Message,
-        within_s: float,
-        *,
-        feedback: Heard | None = None,
-        given_up: GivenUp = never,
-    ) -> Goal:
-        """Send a goal and return once the server took it, time is over, or ``given_up`` says so.
+    ``over`` is True when the server reported its end, so that nothing goes on; ``ended_by`` names what cut it short,
+    "" nothing; ``lost_goal`` is a lost goal itself, whose end may still come.
+    """
 
-        A goal that is cancelled before the server took it is cancelled once it does.
+    state: str
+    over: bool
+    ended_by: str = ""
+    status: int | None = None
+    values: Any = field(default_factory=dict)
+    problem: str = ""
+    lost_goal: Goal | None = None
 
-        Raises:
-            RosError: there is no server, or it refused the goal; nothing began.
-        """
-
-
-class EarlierRefusedError(RosError):
-    """A message was not sent, because the far end has refused an earlier one of its topic; the next one will be."""
-
-
-class RosLink(Protocol):
-    """One road to a ROS graph. Thread-safe; opened by the first use; every verb raises :class:`RosError`."""
-
-    def publish(self, topic: str, kind: str, fields: Message) -> None:
-        """Hand one message to the graph; returns within the link's own time-out."""
-
-    def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
-        """The next message of a topic; without ``kind`` the graph is asked for its type."""
-
-    def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
-        """Call a service and return its response."""
-
-    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
-        """Tell ``heard`` of every message from now on, on the link's thread; it must return at once."""
-
-    def close(self) -> None:
-        """Let go of the graph. A later use opens it anew."""
+    def sentence(self) -> str:
+        """Return the report in one sentence."""
+        if self.state == "lost":
+            after = f"After {self.ended_by}, " if self.ended_by else ""
+            return f"{after}nobody knows whether the goal still goes on: {self.problem}."
+        if self.state == "rejected":
+            return self.problem
+        after = f" after {self.ended_by} ended it" if self.ended_by else ""
+        return f"the goal {'was ' if self.state in ('canceled', 'aborted') else ''}{self.state}{after}."
 
 
-@runtime_checkable
-class UrgentLink(Protocol):
-    """A link with a second way to the graph, for zeros alone, which the traffic of the first cannot hold up."""
+def run_goal(
+    link: object,
+    action: str,
+    kind: str,
+    goal: Message,
+    within_s: float,
+    *,
+    feedback: OnMessage | None = None,
+    cancelled: CancelCheck = never,
+) -> GoalReport:
+    """Send a goal and wait for its end; cancel it after ``within_s`` seconds or once ``cancelled`` returns True.
 
-    def prepare_urgent(self, topic: str, kind: str) -> None:
-        """Have the second way ready for ``topic``; returns at once."""
+    Raises:
+        RosError: the goal never began.
+    """
+    if not isinstance(link, GoalLink):
+        raise RosError(f"{action} is an action, and bare DDS carries topics only; use rclpy or rosbridge.")
+    deadline = time.monotonic() + within_s
+    sent = link.send_goal(action, kind, goal, within_s, feedback=feedback, cancelled=cancelled)
+    ended_by = ""
+    try:
+        while not ended_by and not sent.done.wait(SLICE_S):
+            if cancelled():
+                ended_by = "a stop"
+            elif time.monotonic() >= deadline:
+                ended_by = f"its time of {within_s:g} s"
+    except BaseException:
+        # A Ctrl-C in the wait must not leave the robot on its way.
+        with contextlib.suppress(RosError):  # what interrupted the wait is what is raised
+            sent.cancel()
+        raise
+    problem = _cancel(sent) if ended_by else ""
+    if sent.rejected:
+        return GoalReport("rejected", True, ended_by, problem=sent.problem)
+    if sent.status is None:
+        return GoalReport("lost", False, ended_by, problem=problem or sent.problem, lost_goal=sent)
+    if not SUCCEEDED <= sent.status < len(STATUS_NAMES):
+        problem = f"its server told status {sent.status}, which ends nothing"
+        return GoalReport("lost", False, ended_by, sent.status, sent.values, problem)
+    return GoalReport(STATUS_NAMES[sent.status], True, ended_by, sent.status, sent.values)
 
-    def publish_urgent(self, topic: str, kind: str, fields: Message) -> None:
-        """Send one message by the second way. Raises :class:`RosError` where that cannot be done without waiting."""
 
-    def cut(self) -> None:
-        """Give up what the first way has not sent yet, so that nothing of it arrives later."""
+def _cancel(sent: Goal) -> str:
+    """Cancel a goal and wait for its end; why it did not come, or ""."""
+    try:
+        sent.cancel()
+    except RosError as exc:
+        return f"it could not be cancelled: {exc}"
+    return "" if sent.done.wait(CANCEL_S) else f"it did not end within {CANCEL_S:g} s of being cancelled"
 
 
 def next_message(
-    watch: Callable[[str, str | None, Heard], Unwatch], topic: str, kind: str | None, within_s: float
+    watch: Callable[[str, str | None, OnMessage], Unwatch], topic: str, kind: str | None, within_s: float
 ) -> dict[str, Any]:
-    """The first message that a link's ``watch`` tells of a topic. Raises :class:`RosError` where none comes in time."""
-    arrived, got = threading.Event(), list[Message]()
+    """Return the first message that a link's ``watch`` delivers. Raises :class:`RosError` where none comes in time."""
+    arrived, messages = threading.Event(), list[Message]()
 
     def keep(message: Message) -> None:
-        got.append(message)
+        messages.append(message)
         arrived.set()
 
     unwatch = watch(topic, kind, keep)
@@ -135,90 +224,4 @@ def next_message(
             raise RosError(f"Nothing arrived on {topic} within {within_s:g} s.")
     finally:
         unwatch()
-    return dict(got[0])
-
-
-MemoryAction = Callable[[Message, Heard, Goal], None]
-
-
-class MemoryLink:
-    """A graph inside this process: what is published is kept in ``sent`` and told to whoever watches.
-
-    Args:
-        services: a callable by service name, which gets the request's fields and returns the response's.
-    """
-
-    def __init__(self, services: Mapping[str, Callable[[Message], dict[str, Any]]] | None = None) -> None:
-        self.sent: list[tuple[str, dict[str, Any]]] = []
-        self.called: list[tuple[str, dict[str, Any]]] = []
-        self._services = dict(services or {})
-        self._actions: dict[str, MemoryAction] = {}
-        self._watchers: dict[str, list[Heard]] = {}
-        self._lock = threading.Lock()
-
-    def offer(self, service: str, answer: Callable[[Message], dict[str, Any]]) -> None:
-        """Offer a service from now on."""
-        self._services[service] = answer
-
-    def serve(self, action: str, begun: MemoryAction) -> None:
-        """Serve an action: ``begun`` gets the goal's fields, the way to tell feedback, and the goal to end."""
-        self._actions[action] = begun
-
-    def begin_goal(
-        self,
-        action: str,
-        kind: str,
-        goal: Message,
-        within_s: float,
-        *,
-        feedback: Heard | None = None,
-        given_up: GivenUp = never,
-    ) -> Goal:
-        del kind, within_s
-        if given_up():
-            raise RosError(f"{action} was given up before its goal was sent.")
-        if action not in self._actions:
-            raise RosError(f"Nobody serves the action {action}.")
-        sent = Goal(lambda: sent.end(5, {}))
-        self._actions[action](copy.deepcopy(dict(goal)), feedback or (lambda message: None), sent)
-        return sent
-
-    def publish(self, topic: str, kind: str, fields: Message) -> None:
-        del kind
-        message = copy.deepcopy(dict(fields))
-        with self._lock:
-            self.sent.append((topic, message))
-            watchers = list(self._watchers.get(topic, ()))
-        for heard in watchers:
-            try:
-                heard(message)
-            except Exception:
-                logger.exception("A watcher of %s failed.", topic)
-
-    def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
-        return next_message(self.watch, topic, kind, within_s)
-
-    def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
-        del kind, within_s
-        if service not in self._services:
-            raise RosError(f"Nobody offers the service {service}.")
-        self.called.append((service, dict(fields)))
-        return self._services[service](fields)
-
-    def tell(self, topic: str, kind: str, fields: Message) -> None:
-        """The same as :meth:`publish`: a graph in memory misses nobody."""
-        self.publish(topic, kind, fields)
-
-    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
-        del kind
-        with self._lock:
-            self._watchers.setdefault(topic, []).append(heard)
-
-        def unwatch() -> None:
-            with self._lock, contextlib.suppress(ValueError):  # a second call has nothing left to take out
-                self._watchers[topic].remove(heard)
-
-        return unwatch
-
-    def close(self) -> None:
-        """Nothing to let go of."""
+    return dict(messages[0])

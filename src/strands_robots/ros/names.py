@@ -1,14 +1,18 @@
-"""Names and types of a ROS graph: topics, services, actions and the interfaces they carry."""
+"""Names, interface types and domains of a ROS graph."""
 
 from __future__ import annotations
 
 import re
 from functools import lru_cache
 
-from strands_robots.utils import ValidationError, shown
+from strands_robots import settings
+from strands_robots.utils import ValidationError, shown, whole
 
 NAME_MAX = 255
 """Longest graph name in characters, the bound of DDS topic names."""
+
+DOMAIN_MAX = 232
+"""Highest DDS domain: RTPS derives its UDP ports from it, and those of 233 are past 65535."""
 
 _NAME = re.compile(r"[/~]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
@@ -16,7 +20,7 @@ _KIND = re.compile(r"([a-z][a-z0-9_]*)/(?:(?:msg|srv|action)/)?([A-Z][A-Za-z0-9]
 
 
 def graph_name(name: str, value: object) -> str:
-    """A topic, service or action: slash-separated words, each starting with a letter or an underscore."""
+    """Check the name of a topic, service or action: words with ``/`` between, none starting with a digit."""
     if not isinstance(value, str) or len(value) > NAME_MAX or not _NAME.match(value) or "__" in value:
         raise ValidationError(
             f"{name} must be a ROS name of letters, digits, '_' and '/', such as /cmd_vel, not {shown(value)}."
@@ -25,7 +29,7 @@ def graph_name(name: str, value: object) -> str:
 
 
 def interface(name: str, value: object) -> str:
-    """An interface type: ``pkg/Name`` as ROS 1 writes it, or with ``msg``, ``srv`` or ``action`` in between."""
+    """Check an interface type: ``pkg/Name`` (ROS 1), or with ``msg``, ``srv`` or ``action`` in between (ROS 2)."""
     if not isinstance(value, str) or len(value) > NAME_MAX or not _KIND.match(value):
         raise ValidationError(
             f"{name} must be a ROS type such as geometry_msgs/msg/Twist or geometry_msgs/Twist, not {shown(value)}."
@@ -35,13 +39,17 @@ def interface(name: str, value: object) -> str:
 
 @lru_cache(maxsize=256)
 def bare_kind(kind: str) -> str:
-    """``pkg/Name`` of either spelling, so that types can be compared."""
+    """Return ``pkg/Name`` for either spelling, so that types can be compared."""
     found = _KIND.match(kind)
     return f"{found[1]}/{found[2]}" if found else kind
 
 
 def class_place(kind: str, section: str) -> tuple[str, str]:
-    """Python module and class of an interface: ``section`` is msg, srv or action. Raises :class:`ValidationError`."""
+    """Return the Python module and class of an interface; ``section`` is msg, srv or action.
+
+    Raises:
+        ValidationError: ``kind`` is no interface type.
+    """
     found = _KIND.match(kind)
     if found is None:
         raise ValidationError(f"type must be a ROS type such as geometry_msgs/msg/Twist, not {shown(kind)}.")
@@ -49,9 +57,20 @@ def class_place(kind: str, section: str) -> tuple[str, str]:
 
 
 def node_name(name: str, value: object) -> str:
-    """A node: letters, digits and underscores, the first no digit."""
+    """Check the name of a node: letters, digits and underscores, the first no digit."""
     if not isinstance(value, str) or len(value) > NAME_MAX or not _NODE.match(value):
         raise ValidationError(
             f"{name} must be a ROS node name of letters, digits and '_', not starting with a digit, not {shown(value)}."
         )
     return value
+
+
+def domain(domain_id: int | None) -> int:
+    """Check a DDS domain, 0 to :data:`DOMAIN_MAX`; None stands for ``ROS_DOMAIN_ID``."""
+    stated = settings.integer("ROS_DOMAIN_ID") if domain_id is None else domain_id
+    return whole("domain_id", stated, low=0, high=DOMAIN_MAX)
+
+
+def absolute(name: str) -> str:
+    """Return a graph name with the leading slash that a caller may leave out; a private ``~`` name stays."""
+    return name if name.startswith(("/", "~")) else f"/{name}"

@@ -1,4 +1,4 @@
-"""A node of our own in the ROS 2 that is sourced: its context, its executor and the thread that spins it."""
+"""Our node in the ROS 2 that is sourced: its context, its executor and the thread that spins it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from strands_robots.ros.link import RosError
 logger = logging.getLogger(__name__)
 
 SPIN_S = 0.1
-"""Longest time in seconds that the executor waits before it looks whether it shall end."""
+"""Longest time in seconds that the executor waits before it checks whether to end."""
 
 NO_RCLPY = (
     "rclpy cannot be imported here: source a ROS 2 installation, Humble or later, "
@@ -25,23 +25,23 @@ NO_RCLPY = (
 
 
 def sourced() -> bool:
-    """A ROS 2 is sourced in this process: its Python client is on the path."""
+    """Return True where a ROS 2 is sourced in this process: its Python client is on the path."""
     return find_spec("rclpy") is not None
 
 
 def ros2(module: str) -> ModuleType:
-    """A module of the ROS 2 client, such as ``rclpy.qos``. Raises :class:`RosError` where none is sourced."""
+    """Import a module of the ROS 2 client, such as ``rclpy.qos``. Raises :class:`RosError` where none is sourced."""
     try:
         return import_module(module)
     except ImportError as exc:
         raise RosError(f"{NO_RCLPY} ({exc})") from exc
 
 
-class Session:
+class RclpySession:
     """One node, spun by a thread of its own from construction to :meth:`close`.
 
-    It has its own context, so that it takes no signal handler, needs no environment variable written for its domain,
-    and neither ends nor is ended by what else in the process uses rclpy.
+    It has its own context: it installs no signal handler, writes no environment variable for its domain, and is
+    independent of any other use of rclpy in the process.
 
     Raises:
         RosError: no ROS 2 is sourced, or its middleware did not start.
@@ -69,18 +69,18 @@ class Session:
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._spin, name=f"rclpy-{name}", daemon=True)
         self._thread.start()
-        # A thread that the interpreter's end finds inside the client library can abort the process.
+        # A thread that is still inside the client library at the interpreter's exit can abort the process.
         atexit.register(self.close)
 
-    def later(self, what: Callable[[], None]) -> None:
-        """Do this on the executor's thread, soon, and log what it raises.
+    def later(self, action: Callable[[], None]) -> None:
+        """Run ``action`` on the executor's thread, soon, and log what it raises.
 
-        Requests go out there: a response that is taken before the request is noted would be lost.
+        Requests go out there: a response that arrives before its request is registered would be lost.
         """
 
         def run() -> None:
             try:
-                what()
+                action()
             except Exception:
                 logger.exception("A request to the ROS 2 graph failed.")
 
@@ -89,10 +89,10 @@ class Session:
     def close(self, parts: Sequence[Any] = ()) -> None:
         """End the thread and take the node off the graph; not to be called by a callback of this node.
 
-        A second call does nothing; at the interpreter's end it is called for every session that is left.
+        A second call does nothing; the interpreter's exit calls it for every session that is still open.
 
         Args:
-            parts: what the node does not destroy by itself, such as its action clients.
+            parts: parts that the node does not destroy by itself, such as its action clients.
         """
         atexit.unregister(self.close)
         if self._done.is_set():

@@ -1,4 +1,4 @@
-"""A ROS 1 or ROS 2 graph behind a rosbridge server, without ROS on this side."""
+"""Link to a ROS 1 or ROS 2 graph behind a rosbridge server, without ROS on this side."""
 
 from __future__ import annotations
 
@@ -10,10 +10,24 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
 
-from strands_robots.ros.link import EarlierRefusedError, GivenUp, Goal, Heard, Message, RosError, Unwatch, never
-from strands_robots.ros.rosbridge_session import Session
-from strands_robots.ros.rosbridge_urgent import UrgentRoad
-from strands_robots.ros.rosbridge_wire import Fragments, decoded, encoded, with_bytes
+from strands_robots.ros.link import (
+    CancelCheck,
+    EarlierRefusedError,
+    Goal,
+    Message,
+    OnMessage,
+    RosError,
+    Unwatch,
+    never,
+)
+from strands_robots.ros.rosbridge_session import (
+    Fragments,
+    RosbridgeSession,
+    UrgentConnection,
+    decoded,
+    encoded,
+    with_bytes,
+)
 from strands_robots.utils import number, shown
 
 logger = logging.getLogger(__name__)
@@ -23,8 +37,8 @@ ROSAPI_S = 5.0
 
 
 @dataclass(slots=True)
-class _Asked:
-    """A request whose answer is awaited."""
+class _Request:
+    """A request that waits for its answer."""
 
     done: threading.Event = field(default_factory=threading.Event)
     answer: dict[str, Any] | None = None
@@ -32,19 +46,19 @@ class _Asked:
 
 
 @dataclass(slots=True)
-class _Watched:
-    """A subscription: one on the wire for all who watch the topic."""
+class _Subscription:
+    """One subscription on the wire for all watchers of the topic."""
 
     id: str
     kind: str | None
-    heard: list[Heard]
+    watchers: list[OnMessage]
     failed: list[Callable[[str], None]]
 
 
 class RosbridgeLink:
     """A :class:`~strands_robots.ros.link.RosLink` over one connection, opened by the first use and kept until closed.
 
-    What is published as urgent has a second connection of its own.
+    Urgent messages have a second connection of their own.
 
     A lost connection is reopened, its subscriptions restored and its topics advertised anew; what is sent meanwhile
     is refused, not queued: a velocity that arrives late is worse than one that does not. A ``status`` error of the
@@ -61,7 +75,7 @@ class RosbridgeLink:
 
     def __init__(self, host: str = "localhost", port: int = 9090, *, connect_s: float = 5.0) -> None:
         seconds = number("connect_s", connect_s, above=0, high=60)
-        self._session = Session(
+        self._session = RosbridgeSession(
             host,
             port,
             connect_s=seconds,
@@ -69,26 +83,26 @@ class RosbridgeLink:
             received=self._received,
             lost=self._lost,
         )
-        self._urgent = UrgentRoad(host, port, seconds)
+        self._urgent = UrgentConnection(host, port, seconds)
         self._numbers = count(1)
         self._lock = threading.RLock()
         self._advertised: dict[str, str] = {}
-        self._watched: dict[str, _Watched] = {}
-        self._asked: dict[str, _Asked] = {}
-        self._goals: dict[str, tuple[Goal, Heard | None]] = {}
-        self._complaints: dict[str, str] = {}
+        self._subscriptions: dict[str, _Subscription] = {}
+        self._requests: dict[str, _Request] = {}
+        self._goals: dict[str, tuple[Goal, OnMessage | None]] = {}
+        self._refusals: dict[str, str] = {}
         self._fragments = Fragments()
 
     @property
     def url(self) -> str:
-        """Where the server is."""
+        """Address of the server."""
         return self._session.url
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
-        complaint = self._complaints.pop(topic, None)
-        if complaint is not None:
+        refusal = self._refusals.pop(topic, None)
+        if refusal is not None:
             self._advertised.pop(topic, None)
-            raise EarlierRefusedError(complaint)
+            raise EarlierRefusedError(refusal)
         frame = encoded("publish", id=self._id("publish", topic), topic=topic, type=kind, msg=fields)
         if self._advertised.get(topic) != kind or not self._session.up:
             self._session.send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))
@@ -105,20 +119,20 @@ class RosbridgeLink:
         self._session.cut()
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
-        asked = _Asked()
+        request = _Request()
 
         def keep(message: Message) -> None:
-            if asked.answer is None:
-                asked.answer = dict(message)
-                asked.done.set()
+            if request.answer is None:
+                request.answer = dict(message)
+                request.done.set()
 
         def fail(problem: str) -> None:
-            asked.problem = problem
-            asked.done.set()
+            request.problem = problem
+            request.done.set()
 
         unwatch = self._watch(topic, kind, keep, fail)
         try:
-            return self._awaited(asked, f"Nothing arrived on {topic}", within_s)
+            return self._awaited(request, f"Nothing arrived on {topic}", within_s)
         finally:
             unwatch()
 
@@ -132,18 +146,18 @@ class RosbridgeLink:
             raise RosError(f"{service} failed: {shown(values)}")
         return values if isinstance(values, dict) else {}
 
-    def begin_goal(
+    def send_goal(
         self,
         action: str,
         kind: str,
         goal: Message,
         within_s: float,
         *,
-        feedback: Heard | None = None,
-        given_up: GivenUp = never,
+        feedback: OnMessage | None = None,
+        cancelled: CancelCheck = never,
     ) -> Goal:
-        """Send an action goal. The protocol tells its end and not its acceptance, so this returns at once."""
-        if given_up():
+        """Send an action goal. The protocol reports its end and not its acceptance, so this returns at once."""
+        if cancelled():
             raise RosError(f"{action} was given up before its goal was sent.")
         del within_s
         key = self._id("send_action_goal", action)
@@ -157,11 +171,11 @@ class RosbridgeLink:
             raise
         return sent
 
-    def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
-        return self._watch(topic, kind, heard, lambda problem: logger.warning("%s: %s", topic, problem))
+    def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
+        return self._watch(topic, kind, on_message, lambda problem: logger.warning("%s: %s", topic, problem))
 
     def topics(self) -> list[dict[str, Any]]:
-        """``topic`` and ``type`` of each topic, as rosapi tells them."""
+        """Return ``topic`` and ``type`` of each topic, by rosapi."""
         answer = self.call("/rosapi/topics", "rosapi/Topics", {}, ROSAPI_S)
         names, kinds = answer.get("topics"), answer.get("types")
         if not isinstance(names, list) or not isinstance(kinds, list) or len(names) != len(kinds):
@@ -169,15 +183,15 @@ class RosbridgeLink:
         return [{"topic": str(name), "type": str(kind)} for name, kind in sorted(zip(names, kinds, strict=True))]
 
     def nodes(self) -> list[str]:
-        """Names of the nodes, as rosapi tells them."""
+        """Return the names of the nodes, by rosapi."""
         return self._names("/rosapi/nodes", "rosapi/Nodes", "nodes")
 
     def services(self) -> list[str]:
-        """Names of the services, as rosapi tells them."""
+        """Return the names of the services, by rosapi."""
         return self._names("/rosapi/services", "rosapi/Services", "services")
 
     def actions(self) -> list[str]:
-        """Names of the actions that somebody serves, as rosapi tells them."""
+        """Return the names of the actions that have a server, by rosapi."""
         return self._names("/rosapi/action_servers", "rosapi/GetActionServers", "action_servers")
 
     def _names(self, service: str, kind: str, key: str) -> list[str]:
@@ -190,62 +204,62 @@ class RosbridgeLink:
         self._urgent.close()
         self._session.close()
         with self._lock:
-            self._watched.clear()
+            self._subscriptions.clear()
             self._advertised.clear()
 
-    def _watch(self, topic: str, kind: str | None, heard: Heard, failed: Callable[[str], None]) -> Unwatch:
+    def _watch(self, topic: str, kind: str | None, on_message: OnMessage, failed: Callable[[str], None]) -> Unwatch:
         self._session.open()
         with self._lock:
-            watched = self._watched.get(topic)
-            if watched is None:
-                watched = self._watched[topic] = _Watched(self._id("subscribe", topic), kind, [], [])
-                frame = self._subscription(topic, watched)
+            subscription = self._subscriptions.get(topic)
+            if subscription is None:
+                subscription = self._subscriptions[topic] = _Subscription(self._id("subscribe", topic), kind, [], [])
+                frame = self._subscription(topic, subscription)
             else:
                 frame = ""
-            watched.heard.append(heard)
-            watched.failed.append(failed)
+            subscription.watchers.append(on_message)
+            subscription.failed.append(failed)
 
         def unwatch() -> None:
             with self._lock:
-                if heard not in watched.heard:
+                if on_message not in subscription.watchers:
                     return
-                watched.heard.remove(heard)
-                watched.failed.remove(failed)
-                last = not watched.heard and self._watched.get(topic) is watched
+                subscription.watchers.remove(on_message)
+                subscription.failed.remove(failed)
+                last = not subscription.watchers and self._subscriptions.get(topic) is subscription
                 if last:
-                    del self._watched[topic]
+                    del self._subscriptions[topic]
             if last and self._session.up:
                 with contextlib.suppress(RosError):  # a connection that just broke has no subscriptions left
-                    self._session.send(encoded("unsubscribe", id=watched.id, topic=topic))
+                    self._session.send(encoded("unsubscribe", id=subscription.id, topic=topic))
 
         if frame:
             try:
                 self._session.send(frame)
             except Exception:
                 with self._lock:
-                    self._watched.pop(topic, None)
+                    self._subscriptions.pop(topic, None)
                 raise
         return unwatch
 
-    def _subscription(self, topic: str, watched: _Watched) -> str:
-        kind = {} if watched.kind is None else {"type": watched.kind}
-        # A queue of one: a robot's state is worth something only while it is the latest.
-        return encoded("subscribe", id=watched.id, topic=topic, queue_length=1, compression="none", **kind)
+    def _subscription(self, topic: str, subscription: _Subscription) -> str:
+        kind = {} if subscription.kind is None else {"type": subscription.kind}
+        # A queue of one: only the latest state of a robot is of use.
+        return encoded("subscribe", id=subscription.id, topic=topic, queue_length=1, compression="none", **kind)
 
     def _request(self, key: str, frame: str, what: str, within_s: float) -> dict[str, Any]:
-        asked = self._asked[key] = _Asked()
+        request = self._requests[key] = _Request()
         try:
             self._session.send(frame)
-            return self._awaited(asked, what, within_s)
+            return self._awaited(request, what, within_s)
         finally:
-            del self._asked[key]
+            del self._requests[key]
 
-    def _awaited(self, asked: _Asked, what: str, within_s: float) -> dict[str, Any]:
-        if not asked.done.wait(within_s):
+    def _awaited(self, request: _Request, what: str, within_s: float) -> dict[str, Any]:
+        if not request.done.wait(within_s):
             raise RosError(f"{what} within {within_s:g} s.")
-        if asked.answer is None:
-            raise RosError(asked.problem)
-        return asked.answer
+        if request.answer is None:
+            raise RosError(request.problem)
+        return request.answer
 
     def _id(self, op: str, name: str) -> str:
         return f"{op}:{name}:{next(self._numbers)}"
@@ -255,16 +269,16 @@ class RosbridgeLink:
     def _restore(self, send: Callable[[str], None]) -> None:
         with self._lock:
             self._fragments = Fragments()
-            # Whoever subscribes meets a new publisher some milliseconds late, so that it is there before its message.
+            # A subscriber discovers a new publisher some milliseconds late, so advertise ahead of the first message.
             for topic, kind in list(self._advertised.items()):
                 send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))
-            for topic, watched in self._watched.items():
-                send(self._subscription(topic, watched))
+            for topic, subscription in self._subscriptions.items():
+                send(self._subscription(topic, subscription))
 
     def _lost(self, why: str) -> None:
-        for asked in list(self._asked.values()):
-            asked.problem = f"The connection to rosbridge at {self.url} was lost: {why}."
-            asked.done.set()
+        for request in list(self._requests.values()):
+            request.problem = f"The connection to rosbridge at {self.url} was lost: {why}."
+            request.done.set()
         while self._goals:
             _, (goal, _) = self._goals.popitem()
             goal.fail(f"the connection to rosbridge at {self.url} was lost: {why}")
@@ -284,16 +298,16 @@ class RosbridgeLink:
         if op == "publish":
             self._published(message)
         elif op in ("action_feedback", "action_result"):
-            self._goal_told(op, key, message)
+            self._goal_event(op, key, message)
         elif op == "service_response":
-            asked = self._asked.get(key) if isinstance(key, str) else None
-            if asked is not None:
-                asked.answer = message
-                asked.done.set()
+            request = self._requests.get(key) if isinstance(key, str) else None
+            if request is not None:
+                request.answer = message
+                request.done.set()
         elif op == "status":
             self._status(message)
 
-    def _goal_told(self, op: str, key: object, message: dict[str, Any]) -> None:
+    def _goal_event(self, op: str, key: object, message: dict[str, Any]) -> None:
         goal, feedback = self._goals.get(key, (None, None)) if isinstance(key, str) else (None, None)
         if goal is None:
             return
@@ -311,12 +325,12 @@ class RosbridgeLink:
     def _published(self, message: dict[str, Any]) -> None:
         topic, body = message.get("topic"), message.get("msg")
         with self._lock:
-            watched = self._watched.get(topic) if isinstance(topic, str) else None
-            heard = list(watched.heard) if watched is not None else []
-        if watched is None or not isinstance(body, dict):
+            subscription = self._subscriptions.get(topic) if isinstance(topic, str) else None
+            watchers = list(subscription.watchers) if subscription is not None else []
+        if subscription is None or not isinstance(body, dict):
             return
-        whole = with_bytes(watched.kind, body)
-        for each in heard:
+        whole = with_bytes(subscription.kind, body)
+        for each in watchers:
             try:
                 each(whole)
             except Exception:
@@ -329,10 +343,10 @@ class RosbridgeLink:
             return
         logger.warning("%s (%s)", said, message.get("id"))
         key = str(message.get("id") or "")
-        asked = self._asked.get(key)
-        if asked is not None:
-            asked.problem = said
-            asked.done.set()
+        request = self._requests.get(key)
+        if request is not None:
+            request.problem = said
+            request.done.set()
             return
         if key in self._goals:
             self._goals.pop(key)[0].fail(said)
@@ -340,10 +354,10 @@ class RosbridgeLink:
         op, _, rest = key.partition(":")
         topic = rest.rpartition(":")[0]
         if op in ("publish", "advertise"):
-            self._complaints[topic] = said
+            self._refusals[topic] = said
         elif op == "subscribe":
             with self._lock:
-                watched = self._watched.get(topic)
-                failed = list(watched.failed) if watched is not None else []
+                subscription = self._subscriptions.get(topic)
+                failed = list(subscription.failed) if subscription is not None else []
             for each in failed:
                 each(said)

@@ -1,19 +1,27 @@
-"""One WebSocket to a rosbridge server, reopened when it is lost: frames out, frames in, on one thread."""
+"""Frames of the rosbridge v2 protocol, and the WebSockets that carry them.
+
+A frame is a JSON object with an ``op``; long ones come in fragments, bytes as base64. Source: ``ROSBRIDGE_PROTOCOL.md``
+of rosbridge_suite. ``status`` is no longer in it, but servers still send it.
+"""
 
 from __future__ import annotations
 
+import base64
+import binascii
 import contextlib
+import json
 import logging
 import struct
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import count
 from socket import SHUT_RDWR, SO_LINGER, SOL_SOCKET
 from typing import Any
 
-from strands_robots.ros.link import RosError
-from strands_robots.ros.rosbridge_wire import FRAME_MAX
-from strands_robots.utils import ValidationError, dial_host_error, missing_extra, port
+from strands_robots.ros.link import Message, RosError
+from strands_robots.ros.names import bare_kind
+from strands_robots.utils import ValidationError, dial_host_error, missing_extra, port, shown
 
 logger = logging.getLogger(__name__)
 
@@ -23,12 +31,107 @@ BACKOFF_S = (0.1, 2.0)
 _PING_S = 2.0
 _CLOSE_S = 0.5
 
+FRAME_MAX = 16 * 2**20
+"""Longest frame and longest reassembled message in bytes: a raw 1080p image in base64 fits."""
 
-class Session:
-    """Keeps one connection. The first attempt has to succeed; later ones go on until :meth:`close`.
+FRAGMENTS_MAX = 10_000
+PARTIAL_MAX = 8
+"""Fragmented messages that may be unfinished at the same time; the oldest is dropped for a newer one."""
+
+BYTE_FIELDS = {
+    "sensor_msgs/Image": "data",
+    "sensor_msgs/CompressedImage": "data",
+    "sensor_msgs/PointCloud2": "data",
+    "std_msgs/UInt8MultiArray": "data",
+}
+"""Where the common messages hold ``uint8[]``, which arrives as base64."""
+
+
+def encoded(op: str, **fields: Any) -> str:
+    """Encode one frame. Raises :class:`RosError` for what JSON cannot carry, NaN and infinities among it."""
+    try:
+        return _encoder.encode({"op": op, **fields})
+    except (TypeError, ValueError, RecursionError) as exc:
+        raise RosError(f"{op} cannot be sent as JSON: {exc}") from exc
+
+
+def decoded(frame: str | bytes) -> dict[str, Any]:
+    """Decode one frame. Raises :class:`RosError` where it is no JSON object with an ``op``."""
+    try:
+        found = json.loads(frame)
+    except (ValueError, RecursionError) as exc:
+        raise RosError(f"a frame is no JSON: {exc}") from exc
+    if not isinstance(found, dict) or not isinstance(found.get("op"), str):
+        raise RosError("a frame is no object with an op")
+    return found
+
+
+def with_bytes(kind: str | None, message: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the message with its ``uint8[]`` as ``bytes``, where its type is known to hold one."""
+    plain = dict(message)
+    field = BYTE_FIELDS.get(bare_kind(kind)) if kind else None
+    if field is not None and field in plain:
+        plain[field] = _as_bytes(plain[field])
+    return plain
+
+
+def _as_bytes(value: object) -> bytes:
+    """Decode a ``uint8[]`` of either spelling, base64 or a list of numbers."""
+    try:
+        if isinstance(value, str):
+            return base64.b64decode(value, validate=True)
+        if isinstance(value, list):
+            return bytes(value)
+    except (binascii.Error, ValueError, TypeError) as exc:
+        raise RosError(f"a uint8[] is neither base64 nor a list of bytes: {exc}") from exc
+    raise RosError("a uint8[] is neither base64 nor a list of bytes")
+
+
+class Fragments:
+    """Reassembly of ``fragment`` operations, bounded in number and size."""
+
+    def __init__(self) -> None:
+        self._partial: dict[str, dict[int, str]] = {}
+
+    def add(self, frame: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Add a fragment; return the whole message once it is complete. Raises :class:`RosError` for nonsense."""
+        key, number, total, data = (frame.get(name) for name in ("id", "num", "total", "data"))
+        numbered = type(number) is int and type(total) is int and 0 <= number < total <= FRAGMENTS_MAX
+        if not (isinstance(key, str) and numbered and isinstance(data, str)):
+            raise RosError("a fragment lacks its id, number, total or data")
+        assert isinstance(number, int)
+        parts = self._partial.setdefault(key, {})
+        parts[number] = data
+        if len(self._partial) > PARTIAL_MAX:
+            del self._partial[next(iter(self._partial))]
+        if sum(map(len, parts.values())) > FRAME_MAX:
+            del self._partial[key]
+            raise RosError(f"the fragments of a message are longer than {FRAME_MAX} characters")
+        if len(parts) != total:
+            return None
+        del self._partial[key]
+        return decoded("".join(parts[index] for index in sorted(parts)))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes | bytearray):
+        return base64.b64encode(value).decode("ascii")
+    listed = getattr(value, "tolist", None)
+    if callable(listed):
+        return listed()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+_encoder = json.JSONEncoder(allow_nan=False, default=_plain)
+
+
+class RosbridgeSession:
+    """One WebSocket, reopened when it is lost; its frames arrive on one thread.
+
+    The first attempt has to succeed; later ones go on until :meth:`close`.
 
     Args:
-        opened: called on the session's thread with each new connection's sender, before anybody else may send.
+        opened: called on the session's thread with each new connection's sender, before any other frame is sent.
         received: called there with every frame.
         lost: called there with the reason whenever a connection ends.
 
@@ -63,12 +166,21 @@ class Session:
 
     @property
     def up(self) -> bool:
-        """A connection stands."""
+        """Whether there is a connection."""
         return self._socket is not None
 
     def start(self) -> None:
         """Begin to connect when nothing was connected yet, and return."""
-        self._start()
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                return
+            client = _websockets_client()
+            self._settled = threading.Event()
+            self._closing = threading.Event()
+            self._thread = threading.Thread(
+                target=self._run, args=(client, self._settled, self._closing), name="rosbridge", daemon=True
+            )
+            self._thread.start()
 
     def cut(self) -> None:
         """Drop the connection with what it holds unsent: a blocked :meth:`send` fails, and nothing stale arrives.
@@ -77,7 +189,7 @@ class Session:
         """
         socket = self._socket
         if socket is not None:
-            with contextlib.suppress(OSError):  # it broke meanwhile, which is what was asked for
+            with contextlib.suppress(OSError):  # it broke meanwhile, which is what the caller wants
                 socket.socket.setsockopt(SOL_SOCKET, SO_LINGER, struct.pack("ii", 1, 0))
                 socket.socket.shutdown(SHUT_RDWR)
 
@@ -100,7 +212,7 @@ class Session:
             self._closing.set()
             socket = self._socket
         if socket is not None:
-            # Saying goodbye needs the turn of a write, which a clogged connection does not give.
+            # The closing handshake is a write, which a clogged connection does not take.
             if self._writing.acquire(timeout=_CLOSE_S):
                 self._writing.release()
             else:
@@ -110,25 +222,13 @@ class Session:
             thread.join(self._connect_s + 2 * _CLOSE_S)
 
     def _current(self) -> Any:
-        self._start()
+        self.start()
         if not self._settled.wait(self._connect_s + _CLOSE_S):
             raise RosError(f"No rosbridge server answers at {self.url} within {self._connect_s:g} s.")
         socket = self._socket
         if socket is None:
             raise RosError(f"No connection to rosbridge at {self.url}: {self._why}.")
         return socket
-
-    def _start(self) -> None:
-        with self._lock:
-            if self._thread is not None and self._thread.is_alive():
-                return
-            client = _websockets_client()
-            self._settled = threading.Event()
-            self._closing = threading.Event()
-            self._thread = threading.Thread(
-                target=self._run, args=(client, self._settled, self._closing), name="rosbridge", daemon=True
-            )
-            self._thread.start()
 
     def _run(self, client: Any, settled: threading.Event, closing: threading.Event) -> None:
         pause = BACKOFF_S[0]
@@ -148,13 +248,13 @@ class Session:
                     self._socket = socket
                     settled.set()
                     pause = BACKOFF_S[0]
-                    # A close that came between two steps of this one must not leave a connection behind.
+                    # A close during the steps above must not leave a connection open.
                     if closing.is_set():
                         return
                     for frame in socket:
                         self._received(frame)
                     self._why = "the server closed it"
-            except Exception as exc:  # noqa: BLE001 - whatever ends a connection is told, and the next one is tried
+            except Exception as exc:  # noqa: BLE001 - whatever ends a connection is reported, and the next attempt follows
                 self._why = str(exc) or type(exc).__name__
             finally:
                 self._socket = None
@@ -172,6 +272,70 @@ class Session:
                 socket.send(frame)
         except Exception as exc:
             raise RosError(f"The connection to rosbridge at {self.url} broke: {exc}") from exc
+
+
+class UrgentConnection:
+    """A second connection, for zeros alone, opened and advertised ahead of need and never waited for.
+
+    Args:
+        host: of the server, with its ``port``.
+        connect_s: how long one attempt to connect may take, in seconds.
+    """
+
+    def __init__(self, host: str, port: int, connect_s: float) -> None:
+        self._session = RosbridgeSession(
+            host, port, connect_s=connect_s, opened=self._opened, received=self._received, lost=self._lost
+        )
+        self._numbers = count(1)
+        self._kinds: dict[str, str] = {}
+        self._complaint = ""
+
+    def prepare(self, topic: str, kind: str) -> None:
+        """Start the connection and the topic's advertisement on it, without waiting for either."""
+        known = self._kinds.get(topic) == kind
+        self._kinds[topic] = kind
+        if self._session.up:
+            if not known:
+                self._session.send(self._advertised(topic, kind))
+        else:
+            self._session.start()
+
+    def publish(self, topic: str, kind: str, fields: Message) -> None:
+        """Send one message now. Raises :class:`RosError` where that cannot be done without waiting."""
+        complaint, self._complaint = self._complaint, ""
+        if complaint:
+            raise RosError(complaint)
+        self.prepare(topic, kind)
+        if not self._session.up:
+            raise RosError(f"The second connection to {self._session.url} is not there.")
+        self._session.send(encoded("publish", id=f"publish:{next(self._numbers)}", topic=topic, type=kind, msg=fields))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._kinds.clear()
+        self._session.close()
+
+    def _advertised(self, topic: str, kind: str) -> str:
+        return encoded("advertise", id=f"advertise:{next(self._numbers)}", topic=topic, type=kind)
+
+    # On the session's thread.
+
+    def _opened(self, send: Callable[[str], None]) -> None:
+        for topic, kind in list(self._kinds.items()):
+            send(self._advertised(topic, kind))
+
+    def _received(self, frame: str | bytes) -> None:
+        try:
+            message = decoded(frame)
+        except RosError as exc:
+            logger.warning("%s sent what cannot be used: %s", self._session.url, exc)
+            return
+        if message["op"] == "status" and message.get("level") == "error":
+            self._complaint = f"rosbridge says: {shown(message.get('msg'))}"
+            logger.warning("%s", self._complaint)
+
+    def _lost(self, why: str) -> None:
+        logger.info("The second connection to %s was lost: %s", self._session.url, why)
 
 
 def _websockets_client() -> Any:

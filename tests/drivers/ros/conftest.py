@@ -10,7 +10,7 @@ from fixtures.ros_bases import OPEN, TOPIC, Made
 
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.drivers.ros.posed_base import PosedBaseRobot
-from strands_robots.ros.link import MemoryLink
+from strands_robots.ros.memory import MemoryLink
 
 
 @pytest.fixture(autouse=True)

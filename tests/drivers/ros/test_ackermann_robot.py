@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import MemoryLink
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
 
 OPEN = CommandGate(lambda _: ("manual_drive", "vehicle_state", "enable_state"), lambda: False)

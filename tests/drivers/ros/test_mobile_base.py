@@ -21,7 +21,8 @@ from strands_robots.drivers.ros.posed_base import PosedBaseRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.drivers.ros.tools import suffix_of
 from strands_robots.envelope import error
-from strands_robots.ros.link import EarlierRefusedError, MemoryLink
+from strands_robots.ros.link import EarlierRefusedError
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
 
 speed = st.floats(min_value=-5, max_value=5)

@@ -12,7 +12,8 @@ import pytest
 from fixtures.ros_bases import TOPIC, FaultyLink, Lock, Made, memory, none_left, velocities
 from fixtures.waiting import eventually
 
-from strands_robots.ros.link import Heard, MemoryLink, RosError, Unwatch
+from strands_robots.ros.link import OnMessage, RosError, Unwatch
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.stopping import Outcome, grade
 
 
@@ -142,7 +143,7 @@ def test_a_graph_that_is_asked_for_a_type_for_seconds_does_not_delay_the_zeros(
         free = threading.Event()
         watchers = 0
 
-        def watch(self, topic: str, kind: str | None, heard: Heard) -> Unwatch:
+        def watch(self, topic: str, kind: str | None, heard: OnMessage) -> Unwatch:
             self.free.wait(60)
             unwatch = super().watch(topic, kind, heard)
             self.watchers += 1

@@ -9,7 +9,7 @@ import pytest
 
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import MemoryLink
+from strands_robots.ros.memory import MemoryLink
 
 OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 

@@ -13,9 +13,9 @@ from strands_robots.contract import TaskRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.envelope import Envelope, error
-from strands_robots.ros import goals, roads
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import Goal, Heard, MemoryLink, Message, RosError
+from strands_robots.ros.link import Goal, Message, OnMessage, RosError
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
 
 NAV = "/navigate_to_pose"
@@ -30,11 +30,11 @@ class Stack:
         self.asked: list[Message] = []
         self.goals: list[Goal] = []
         self.cancels = 0
-        self.feedback: Heard = lambda message: None
+        self.feedback: OnMessage = lambda message: None
         self.obeys = True
         self.at_once: int | None = None
 
-    def begun(self, goal: Message, feedback: Heard, sent: Goal) -> None:
+    def begun(self, goal: Message, feedback: OnMessage, sent: Goal) -> None:
         def cancel() -> None:
             self.cancels += 1
             if self.obeys:
@@ -65,7 +65,7 @@ def stack() -> Stack:
 
 @pytest.fixture
 def made(stack: Stack, monkeypatch: pytest.MonkeyPatch) -> Iterator[Made]:
-    monkeypatch.setattr(goals, "CANCEL_S", 0.2)
+    monkeypatch.setattr("strands_robots.ros.link.CANCEL_S", 0.2)
     robots: list[RosBridgedRobot] = []
 
     def make(**options: Any) -> RosBridgedRobot:
@@ -179,7 +179,7 @@ def test_a_goal_whose_wait_is_cut_off_is_over_and_in_doubt(
         stack.cancels += 1
         raise RosError("the connection is gone")
 
-    def begun_and_cut_off(goal: Message, feedback: Heard, sent: Goal) -> None:
+    def begun_and_cut_off(goal: Message, feedback: OnMessage, sent: Goal) -> None:
         begun(goal, feedback, sent)
         sent.cancel = unreachable
         monkeypatch.setattr(sent.done, "wait", cut_off)
@@ -217,7 +217,7 @@ def test_a_stop_whose_goal_does_not_end_in_time_did_not_stop(
 ) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
     robot, stack.obeys = made(), False
-    monkeypatch.setattr(goals, "CANCEL_S", 60.0)
+    monkeypatch.setattr("strands_robots.ros.link.CANCEL_S", 60.0)
     thread, _ = going(robot, stack)
     verdict = robot.halt("test")
     assert verdict.stopped is False
@@ -327,8 +327,8 @@ def test_a_robot_that_cannot_be_is_refused(options: dict[str, Any], named: str) 
 
 def test_it_is_made_without_any_ros_and_says_what_is_missing_when_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "1")
-    monkeypatch.setattr(roads, "sourced", lambda: False)
-    monkeypatch.setattr(roads, "find_spec", lambda name: None)
+    monkeypatch.setattr("strands_robots.ros.ros2.sourced", lambda: False)
+    monkeypatch.setattr("strands_robots.ros.ros2.find_spec", lambda name: None)
     robot = RosBridgedRobot.from_ros("rover", cmd_vel_topic="/cmd_vel", odom_topic="/odom", command_gate=OPEN)
     assert isinstance(robot, TaskRobot)
     for answer in (robot.drive(0.1), robot.get_pose(), robot.stop()):

@@ -125,7 +125,7 @@ def test_a_picture_goes_both_ways_and_nobody_crashes(peer: DdsPeer, link: DdsLin
     fields = {"height": 240, "width": 320, "encoding": "rgb8", "step": 960, "data": PICTURE}
 
     def shown() -> bool:
-        link.tell("/arm/front/image_raw", "sensor_msgs/msg/Image", fields)
+        link.broadcast("/arm/front/image_raw", "sensor_msgs/msg/Image", fields)
         return f"image 320 240 rgb8 {sum(PICTURE)}" in peer.heard
 
     eventually(shown)

@@ -12,9 +12,9 @@ from fixtures.nav2_process import nav2
 from fixtures.waiting import eventually
 
 from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.goals import run_goal
-from strands_robots.ros.link import Goal, Heard, MemoryLink, Message, RosError, RosLink
-from strands_robots.ros.rclpy_link import RclpyLink
+from strands_robots.ros.link import Goal, Message, OnMessage, RosError, RosLink, run_goal
+from strands_robots.ros.memory import MemoryLink
+from strands_robots.ros.rclpy import RclpyLink
 
 DOMAIN = 95
 TWIST = "geometry_msgs/msg/Twist"
@@ -39,7 +39,7 @@ def ends(request: pytest.FixtureRequest) -> Iterator[tuple[RosLink, RosLink]]:
             each.close()
 
 
-def served(goal: Message, feedback: Heard, sent: Goal) -> None:
+def served(goal: Message, feedback: OnMessage, sent: Goal) -> None:
     """Reaches what is near; what is far takes until it is cancelled."""
     feedback({"distance_remaining": 0.0})
     if goal["pose"]["pose"]["position"]["x"] < 1:
@@ -106,7 +106,7 @@ def test_a_read_gets_the_next_message_and_silence_is_named(ends: tuple[RosLink, 
 
     def talk() -> None:
         while not done.is_set():
-            far.tell("/chatter", "std_msgs/msg/String", {"data": "hi"})  # type: ignore[attr-defined]
+            far.broadcast("/chatter", "std_msgs/msg/String", {"data": "hi"})  # type: ignore[attr-defined]
             done.wait(0.01)
 
     talker = threading.Thread(target=talk)
@@ -144,14 +144,14 @@ def test_a_goal_that_is_reached_tells_its_feedback_and_its_end(stacked: RosLink)
 
 def test_a_goal_is_cancelled_when_its_time_is_over_or_when_it_is_given_up(stacked: RosLink) -> None:
     report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 4.0)
-    assert (report.state, report.over, report.cut) == ("canceled", True, "its time of 4 s")
+    assert (report.state, report.over, report.ended_by) == ("canceled", True, "its time of 4 s")
     felt: list[Message] = []
-    report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 30.0, feedback=felt.append, given_up=lambda: bool(felt))
-    assert (report.state, report.over, report.cut) == ("canceled", True, "a stop")
+    report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 30.0, feedback=felt.append, cancelled=lambda: bool(felt))
+    assert (report.state, report.over, report.ended_by) == ("canceled", True, "a stop")
 
 
 def test_a_goal_that_nobody_serves_or_that_was_given_up_before_never_begins(stacked: RosLink) -> None:
     with pytest.raises(RosError, match="Nobody serves the action /elsewhere"):
         run_goal(stacked, "/elsewhere", NAV_KIND, place(0.0), 0.1)
     with pytest.raises(RosError, match=r"given up before|Nobody serves"):
-        run_goal(stacked, NAV, NAV_KIND, place(0.0), 5.0, given_up=lambda: True)
+        run_goal(stacked, NAV, NAV_KIND, place(0.0), 5.0, cancelled=lambda: True)

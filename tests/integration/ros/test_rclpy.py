@@ -23,7 +23,7 @@ from fixtures.waiting import eventually
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.envelope import Envelope
-from strands_robots.ros import goals, ros_action
+from strands_robots.ros import ros_action
 from strands_robots.ros.actions import close_links
 from strands_robots.ros.dds import confine
 from strands_robots.ros.gate import CommandGate
@@ -118,7 +118,7 @@ def test_a_goal_that_is_not_reached_says_why(
     rover: Rover, manner: str, timeout: float, state: str, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if manner == "deaf":
-        monkeypatch.setattr(goals, "CANCEL_S", 1.0)
+        monkeypatch.setattr("strands_robots.ros.link.CANCEL_S", 1.0)
     with nav2(DOMAIN, manner) as process:
         robot = rover(nav_action="/navigate_to_pose")
         eventually(lambda: ros_action("list_actions", domain_id=DOMAIN)["actions"])

@@ -14,10 +14,8 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.drivers.ros import wire
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
-from strands_robots.ros import goals
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.goals import run_goal
-from strands_robots.ros.link import RosError
+from strands_robots.ros.link import RosError, run_goal
 from strands_robots.ros.rosbridge import RosbridgeLink
 from strands_robots.safety.orders import StopOrder
 from strands_robots.safety.plane import SafetyPlane
@@ -203,16 +201,16 @@ def test_an_action_goal_reports_feedback_and_its_end(server: RosbridgeServer, li
 def test_an_action_goal_that_does_not_end_is_cancelled(
     server: RosbridgeServer, link: RosbridgeLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(goals, "CANCEL_S", 0.1)
+    monkeypatch.setattr("strands_robots.ros.link.CANCEL_S", 0.1)
     assert link.call("/add", "pkg/Add", {"a": 2, "b": 3}, 20.0), "connected, so that the short time is the goal's own"
     report = run_goal(link, "/go", "pkg/action/Go", {}, 0.5)
-    assert (report.state, report.over, report.cut) == ("lost", False, "its time of 0.5 s")
+    assert (report.state, report.over, report.ended_by) == ("lost", False, "its time of 0.5 s")
     cancelled = eventually(lambda: server.seen("cancel_action_goal"))
     assert cancelled[0]["id"] == server.seen("send_action_goal")[0]["id"]
 
 
 def test_a_goal_whose_server_dies_is_lost_and_not_reached(server: RosbridgeServer, link: RosbridgeLink) -> None:
-    sent = link.begin_goal("/go", "pkg/action/Go", {}, 20.0)
+    sent = link.send_goal("/go", "pkg/action/Go", {}, 20.0)
     eventually(lambda: server.seen("send_action_goal"))
     server.stop()
     eventually(sent.done.is_set)

@@ -12,7 +12,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name, interface
-from strands_robots.ros.roads import Ros2Link
+from strands_robots.ros.ros2 import Ros2Link
 from strands_robots.safety.gate import MotionRefused, Permit
 from strands_robots.utils import ValidationError, mapping, number, shown
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.ros.goals import GoalReport, run_goal, said
-from strands_robots.ros.link import Message, RosError, RosLink
+from strands_robots.ros.link import GoalReport, Message, RosError, RosLink, run_goal
 from strands_robots.safety.gate import Permit
 from strands_robots.utils import MissingExtraError
 
@@ -88,21 +87,21 @@ class Navigation:
         report = self.report
         if report is None and self.answer is None:
             return "the goal was interrupted, and nobody knows whether it still goes on"
-        if report is None or report.over or (report.sent is not None and report.sent.status is not None):
+        if report is None or report.over or (report.lost_goal is not None and report.lost_goal.status is not None):
             return None
-        return said(report)
+        return report.sentence()
 
     def wait_until_over(self, within_s: float) -> None:
         """Wait for the end of the goal, a late one of a lost goal too."""
         deadline = time.monotonic() + within_s
         self.ended.wait(within_s)
-        lost = None if self.report is None else self.report.sent
+        lost = None if self.report is None else self.report.lost_goal
         if lost is not None:
             lost.done.wait(max(0.0, deadline - time.monotonic()))
 
     def cancel_again(self) -> None:
         """Ask once more for the end of a goal that nobody knows to be over."""
-        lost = None if self.report is None else self.report.sent
+        lost = None if self.report is None else self.report.lost_goal
         if lost is not None and not lost.done.is_set():
             try:
                 lost.cancel()
@@ -125,7 +124,7 @@ class Navigation:
                 self.to.fields(),
                 self.to.timeout_s,
                 feedback=self._hear,
-                given_up=lambda: not self._permit.valid,
+                cancelled=lambda: not self._permit.valid,
             )
             self.answer = self._answered(self.report)
         except (RosError, MissingExtraError) as exc:
@@ -148,12 +147,12 @@ class Navigation:
             "result": report.values,
             "feedback": list(self.feedback),
             "feedback_count": self.sent,
-            "ended_by": report.cut or None,
+            "ended_by": report.ended_by or None,
         }
         if report.state == "succeeded":
             self.state = "completed"
             return success(f"Arrived at x {self.to.x:g} m, y {self.to.y:g} m in {self.to.frame_id}.", **fields)
-        stopped = report.over and report.cut and not self._permit.valid
+        stopped = report.over and report.ended_by and not self._permit.valid
         self.state = "stopped" if stopped else "error"
-        sentence = said(report)
+        sentence = report.sentence()
         return error(f"{sentence[0].upper()}{sentence[1:]}", **fields)

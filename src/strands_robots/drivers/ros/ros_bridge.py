@@ -17,7 +17,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name, interface
-from strands_robots.ros.roads import Ros2Link
+from strands_robots.ros.ros2 import Ros2Link
 from strands_robots.safety.gate import MotionRefused
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, number, text

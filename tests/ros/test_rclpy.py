@@ -9,10 +9,10 @@ from fixtures import rclpy_stand_in
 from fixtures.rclpy_stand_in.idl import MESSAGES
 from fixtures.rclpy_stand_in.interfaces import message_class, to_idl
 
-from strands_robots.ros import dds_fields
+from strands_robots.ros import dds
 from strands_robots.ros.dds_types import KINDS
 from strands_robots.ros.link import RosError
-from strands_robots.ros.rclpy_fields import filled, interface_class, plain
+from strands_robots.ros.rclpy import filled, interface_class, plain
 from strands_robots.utils import ValidationError
 
 
@@ -28,7 +28,7 @@ def sourced() -> Any:
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_an_empty_message_is_told_alike_over_rclpy_and_over_bare_dds(kind: str) -> None:
-    assert plain(made(kind)) == dds_fields.plain(KINDS[kind]())
+    assert plain(made(kind)) == dds.plain(KINDS[kind]())
 
 
 FILLED: dict[str, dict[str, Any]] = {
@@ -45,8 +45,8 @@ FILLED: dict[str, dict[str, Any]] = {
 def test_a_filled_message_is_told_alike_over_rclpy_and_over_bare_dds(kind: str) -> None:
     fields = FILLED[kind]
     message = filled(made(kind), fields)
-    assert plain(message) == dds_fields.plain(dds_fields.filled(KINDS[kind], fields))
-    assert to_idl(message).serialize() == dds_fields.filled(KINDS[kind], fields).serialize()
+    assert plain(message) == dds.plain(dds.filled(KINDS[kind], fields))
+    assert to_idl(message).serialize() == dds.filled(KINDS[kind], fields).serialize()
 
 
 def test_numpy_arrays_and_lists_of_bytes_are_taken_too() -> None:
