@@ -246,7 +246,7 @@ def _join_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Any:
 
     mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type)
     if mesh is not None and hasattr(robot, "input_sink"):
-        from strands_robots.mesh.input_sink import MeshInputSink  # noqa: PLC0415 - as above
+        from strands_robots.mesh.input import MeshInputSink  # noqa: PLC0415 - as above
 
         robot.input_sink = MeshInputSink(mesh)
     return mesh

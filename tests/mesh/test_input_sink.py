@@ -9,8 +9,7 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.mesh.input_receiver import InputReceiver
-from strands_robots.mesh.input_sink import MeshInputSink
+from strands_robots.mesh.input import InputReceiver, MeshInputSink
 from strands_robots.teleoperators.leader import ScriptedLeader
 
 

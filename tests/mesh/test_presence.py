@@ -14,9 +14,9 @@ from tests.mesh.peers import Clock, Fleet
 from strands_robots.mesh import presence, topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
-from strands_robots.mesh.presence import Herald
-from strands_robots.mesh.recorder import Recorder
+from strands_robots.mesh.presence import PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport import bridge as bridges
 from strands_robots.mesh.transport.bridge import BridgeTransport
@@ -170,15 +170,15 @@ class Linked(MemoryTransport):
         return self.up
 
 
-def watched(bus: MemoryBus) -> tuple[Linked, Herald, PeerRegistry]:
+def watched(bus: MemoryBus) -> tuple[Linked, PresencePublisher, PeerRegistry]:
     """A watcher on such a session that knows arm-1 of session ``aa``."""
     transport, registry = Linked(bus), PeerRegistry()
     transport.connect()
     registry.update("arm-1", "robot", "host", {}, session="aa")
-    context = Context("console", registry, Recorder("console"), Identity(), transport=transport)
-    herald = Herald(context, "robot", dict)
-    herald.start()
-    return transport, herald, registry
+    context = Context("console", registry, AuditThrottle("console"), Identity(), transport=transport)
+    publisher = PresencePublisher(context, "robot", dict)
+    publisher.start()
+    return transport, publisher, registry
 
 
 def reachable(registry: PeerRegistry) -> bool:
@@ -190,34 +190,34 @@ def test_a_token_that_went_with_our_own_link_says_nothing_until_the_link_is_back
 ) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.2)
     monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
-    transport, herald, registry = watched(MemoryBus())
+    transport, publisher, registry = watched(MemoryBus())
     key = topics.token("arm-1", "aa")
     transport.up, transport.lost_link_at = False, time.monotonic()
-    herald.on_token(key, there=False)
-    herald.judge_tokens()
+    publisher.on_token(key, there=False)
+    publisher.judge_tokens()
     transport.up = True
-    herald.judge_tokens()
+    publisher.judge_tokens()
     assert reachable(registry)
-    herald.on_token(key, there=True)
+    publisher.on_token(key, there=True)
     time.sleep(0.25)
-    herald.judge_tokens()
+    publisher.judge_tokens()
     assert reachable(registry)
-    herald.stop()
+    publisher.stop()
 
 
 def test_who_does_not_come_back_with_the_link_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.05)
     monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
-    transport, herald, registry = watched(MemoryBus())
+    transport, publisher, registry = watched(MemoryBus())
     transport.lost_link_at = time.monotonic()
-    herald.on_token(topics.token("arm-1", "aa"), there=False)
-    herald.judge_tokens()
+    publisher.on_token(topics.token("arm-1", "aa"), there=False)
+    publisher.judge_tokens()
     assert reachable(registry)
     time.sleep(0.06)
-    herald.judge_tokens()
+    publisher.judge_tokens()
     assert not reachable(registry)
     assert registry.conflicts("arm-1", "bb") is None
-    herald.stop()
+    publisher.stop()
 
 
 class Late(MemoryTransport):
@@ -242,20 +242,20 @@ def test_a_bridge_whose_local_leg_came_late_shows_who_is_alive_and_watches_the_o
     other.connect()
     other.watch_tokens(topics.token("*", "*"), lambda key, there: shown.append((key, there)))
     registry.update("arm-1", "robot", "host", {}, session="aa")
-    context = Context("console", registry, Recorder("console"), Identity(), transport=both)
-    herald = Herald(context, "robot", dict)
-    herald.start()
-    herald.judge_tokens()
+    context = Context("console", registry, AuditThrottle("console"), Identity(), transport=both)
+    publisher = PresencePublisher(context, "robot", dict)
+    publisher.start()
+    publisher.judge_tokens()
     late.up = True
     eventually(lambda: both.session_id)
     for _ in range(2):
-        herald.judge_tokens()
+        publisher.judge_tokens()
     assert shown == [(topics.token("console", str(both.session_id)), True)]
     other.declare_token(topics.token("arm-1", "aa")).undeclare()
-    herald.judge_tokens(0.0)
+    publisher.judge_tokens(0.0)
     assert not reachable(registry)
     shown.clear()
-    herald.stop()
+    publisher.stop()
     assert [there for _, there in shown] == [False]
     both.close()
 

@@ -13,12 +13,12 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Clock, Fleet
 
-from strands_robots.mesh.camera import frame_message
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.scheduler import Scheduler
-from strands_robots.mesh.sensors import health, pose
+from strands_robots.mesh.sensors import frame_message, health, pose
 from strands_robots.mesh.state import StateReader
-from strands_robots.mesh.stream import Limiter, numbers
+from strands_robots.mesh.stream import numbers
+from strands_robots.mesh.throttle import RateLimiter
 from strands_robots.utils import ValidationError
 
 
@@ -140,13 +140,13 @@ def test_policy_steps_carry_numbers_and_are_thinned_out(peers: Fleet, monkeypatc
 
 def test_a_limiter_keeps_a_steady_source_whole() -> None:
     clock = Clock()
-    limiter = Limiter(50, clock)
+    limiter = RateLimiter(50, clock)
     admitted = 0
     for number in range(500):
         clock.pass_(0.02 + (0.004 if number % 2 else -0.004))
         admitted += limiter.admit()
     assert admitted >= 495
-    assert Limiter(0, clock).admit() is False
+    assert RateLimiter(0, clock).admit() is False
     assert numbers({"a": True, "b": "x", "c": None, 3: 1}) == {"a": True, "3": 1}
 
 

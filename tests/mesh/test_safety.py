@@ -14,9 +14,13 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.mesh import safety
 from strands_robots.mesh.resume_authority import keygen, load_signing_key, main
+from strands_robots.mesh.safety import SafetyAdapter
 from strands_robots.mesh.transport import Sample
+from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore
+from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.resume import sign
+from strands_robots.utils import ValidationError
 
 PASSPHRASE = "Correct-Horse-7-Battery"
 
@@ -264,3 +268,27 @@ def test_keygen_asks_twice_and_prints_the_public_half(tmp_path: Path, capsys: py
     assert path.stat().st_mode & 0o777 == 0o600
     with pytest.raises(ValueError, match="passphrase"):
         load_signing_key(path, "Wrong-Horse-7-Battery")
+
+
+def test_another_robot_under_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
+    plane = SafetyPlane(LockoutStore(tmp_path))
+    adapter = SafetyAdapter("arm-1", Arm("one"), None, plane)
+    with pytest.raises(ValidationError, match="arm-1"):
+        SafetyAdapter("arm-1", Arm("another"), None, plane)
+    adapter.close()
+    SafetyAdapter("arm-1", Arm("another"), None, plane).close()
+
+
+def test_the_same_robot_on_a_second_network_shares_its_lockout(tmp_path: Path) -> None:
+    plane = SafetyPlane(LockoutStore(tmp_path))
+    arm = Arm("one")
+    first = plane.register("arm-1", arm)
+    adapter = SafetyAdapter("arm-1", arm, None, plane)
+    order = StopOrder(new_epoch(), "console", "test", "mesh")
+    verdict = adapter.begin(order)
+    assert verdict is not None
+    assert verdict() is not None
+    assert adapter.epochs() == first.epochs == (order.epoch,)
+    assert len(arm.halts) == 1
+    adapter.close()
+    first.close()

@@ -14,7 +14,7 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.mesh.readings import NoReadingError, from_ros, plain
+from strands_robots.mesh.sensors import NoReadingError, from_ros, plain
 
 ODOMETRY = {
     "header": {"frame_id": "odom"},

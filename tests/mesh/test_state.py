@@ -11,8 +11,7 @@ from fixtures.mesh_robots import Arm, World
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware import HardwareRobot
-from strands_robots.mesh.description import Description
-from strands_robots.mesh.state import StateReader
+from strands_robots.mesh.state import Description, StateReader
 
 
 def read(robot: Any) -> dict[str, Any]:

@@ -12,26 +12,23 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.contract import WorldRobot, body_of
 from strands_robots.mesh import session, topics
-from strands_robots.mesh.camera import CameraFeed
 from strands_robots.mesh.children import Children
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.description import Description
 from strands_robots.mesh.dispatch import Dispatcher
-from strands_robots.mesh.door import PlaneDoor, SafetyDoor
 from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.input_receiver import InputReceiver
-from strands_robots.mesh.presence import DESCRIBE_S, Herald
-from strands_robots.mesh.recorder import AuditSink, Recorder
+from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
-from strands_robots.mesh.rpc import Caller
-from strands_robots.mesh.safety import FleetSafety
+from strands_robots.mesh.rpc import Requester
+from strands_robots.mesh.safety import FleetSafety, SafetyAdapter
 from strands_robots.mesh.scheduler import Scheduler
-from strands_robots.mesh.sensors import SensorDesk
+from strands_robots.mesh.sensors import CameraPublisher, SensorPublisher
 from strands_robots.mesh.serving import Line, MotionDoor, Server
-from strands_robots.mesh.state import StateReader
-from strands_robots.mesh.stream import StepFeed
+from strands_robots.mesh.state import Description, StateReader
+from strands_robots.mesh.stream import StepPublisher
 from strands_robots.mesh.subscriptions import Subscriptions
 from strands_robots.mesh.teleop import TeleopDesk, join
+from strands_robots.mesh.throttle import AuditSink, AuditThrottle
 from strands_robots.mesh.transport import Transport
 from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
 from strands_robots.mesh.wire_identity import Identity, signature_policy
@@ -80,16 +77,16 @@ class Assembled:
     context: Context
     scheduler: Scheduler
     lanes: Lanes
-    door: SafetyDoor
-    caller: Caller
+    door: SafetyAdapter
+    caller: Requester
     server: Server
-    herald: Herald
+    herald: PresencePublisher
     safety: FleetSafety
     state: StateReader
     teleop: TeleopDesk
     subscriptions: Subscriptions
-    steps: StepFeed
-    sensors: SensorDesk
+    steps: StepPublisher
+    sensors: SensorPublisher
     identity_of: Callable[[Transport], Identity]
     inputs: dict[str, dict[str, Any]]
     children: Children | None = None
@@ -123,7 +120,7 @@ class Assembled:
         every("prune", PRUNE_HZ, self._prune, quick=True)
         frames = frames_of(self.mesh.robot)
         if frames is not None:
-            feed = CameraFeed(context, frames)
+            feed = CameraPublisher(context, frames)
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), feed.publish)
         self.scheduler.start()
         self.steps.start()
@@ -178,15 +175,15 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     """The parts of ``mesh``; those of a stay before give their door to the safety plane."""
     peer, robot = mesh.peer_id, mesh.robot
 
-    def recorder(name: str) -> Recorder:
-        return Recorder(name, parts.audit) if parts.audit is not None else Recorder(name)
+    def recorder(name: str) -> AuditThrottle:
+        return AuditThrottle(name, parts.audit) if parts.audit is not None else AuditThrottle(name)
 
     context = Context(peer, parts.registry, recorder(peer), Identity(), parts.clock, parts.monotonic)
     simulated = isinstance(robot, WorldRobot) or mesh.peer_type == "sim"
     lanes = Lanes(peer)
     key = _safety_key(robot, peer, keep=parts.keep)
-    door: SafetyDoor = before.door if before is not None else PlaneDoor(peer, robot, key, parts.plane)
-    caller = Caller(context)
+    door: SafetyAdapter = before.door if before is not None else SafetyAdapter(peer, robot, key, parts.plane)
+    caller = Requester(context)
     safety = FleetSafety(context, door, caller, lanes.resumes, robot=robot is not None)
     teleop = TeleopDesk(lambda source, device: InputReceiver(mesh, body_of(robot), source, device), lanes)
     inputs: dict[str, dict[str, Any]] = {}
@@ -210,7 +207,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     line = Line(None if robot is None else robot.gate)
     approval_door = MotionDoor(context, hardware=robot is not None and not simulated)
     scheduler = Scheduler(f"mesh-{peer}")
-    sensors = SensorDesk(context, scheduler)
+    sensors = SensorPublisher(context, scheduler)
     description = Description(peer, robot)
 
     def facts() -> dict[str, Any]:
@@ -243,13 +240,13 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
         door=door,
         caller=caller,
         server=Server(context, lanes, approval_door, safety.locked, dispatch, line=line, meant=dispatcher.meant),
-        herald=Herald(context, mesh.peer_type, facts),
+        herald=PresencePublisher(context, mesh.peer_type, facts),
         safety=safety,
         state=StateReader(peer, robot, parts.clock),
         teleop=teleop,
         subscriptions=Subscriptions(lanes.delivery),
         sensors=sensors,
-        steps=StepFeed(context, robot, settings.number("STRANDS_MESH_STREAM_HZ")),
+        steps=StepPublisher(context, robot, settings.number("STRANDS_MESH_STREAM_HZ")),
         identity_of=parts.identity or identity_of,
         inputs=inputs,
         children=children,

@@ -19,10 +19,10 @@ from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.dispatch import Dispatcher, stop_one
 from strands_robots.mesh.executor import Lanes
-from strands_robots.mesh.presence import DESCRIBE_S, Herald
-from strands_robots.mesh.recorder import Recorder
+from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.serving import Line, MotionDoor, Server
 from strands_robots.mesh.teleop import TeleopDesk
+from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Handle, LiveTransport, TransportError
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, identifier
@@ -98,7 +98,7 @@ class OneRobot:
 @dataclass(slots=True)
 class _Child:
     context: Context
-    herald: Herald
+    herald: PresencePublisher
     held: list[Handle]
     begun: float
     # In memory a heartbeat is delivered on the thread that announces, and who hears it may leave the mesh there.
@@ -132,7 +132,7 @@ class Children:
         teleop: TeleopDesk,
         locked: Callable[[], bool],
         resume: Resume,
-        audit: Callable[[str], Recorder],
+        audit: Callable[[str], AuditThrottle],
     ) -> None:
         self._context = context
         self._world = world
@@ -214,7 +214,7 @@ class Children:
             context, self._lanes, door, self._locked, dispatch, line=self._line.of(name), meant=dispatcher.meant
         )
         held: list[Handle] = []
-        child = _Child(context, Herald(context, self._kind, robot.facts), held, context.monotonic())
+        child = _Child(context, PresencePublisher(context, self._kind, robot.facts), held, context.monotonic())
         held.append(transport.declare_subscriber(topics.command(peer), server.on_command))
         held.append(transport.declare_subscriber(topics.broadcast(), server.on_command))
         session = transport.session_id

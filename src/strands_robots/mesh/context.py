@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-from strands_robots.mesh.recorder import Recorder
 from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.wire_identity import Identity
 from strands_robots.policies.registry import policy_names
@@ -38,7 +38,7 @@ class Context:
 
     peer_id: str
     registry: PeerRegistry
-    audit: Recorder
+    audit: AuditThrottle
     identity: Identity
     clock: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic

@@ -1,4 +1,4 @@
-"""Teleoperation over the mesh: a leader publishes its actions, a follower applies them.
+"""Teleoperation over the mesh: a leader publishes its actions, and a follower applies them.
 
 A frame on ``strands/PEER/input/DEVICE`` is ``peer_id``, ``device``, ``method``, ``t``, ``seq``, ``action`` (floats by
 joint) and ``events`` (or null).
@@ -24,14 +24,34 @@ from strands_robots.utils import ValidationError, number, shown, teleoperator_co
 if TYPE_CHECKING:
     from strands_robots.mesh.core import Mesh
 
-__all__ = ["INPUT_HZ_DEFAULT", "InputPublisher", "InputReceiver"]
+__all__ = ["INPUT_HZ_DEFAULT", "InputPublisher", "InputReceiver", "MeshInputSink"]
 
 logger = logging.getLogger(__name__)
 
 INPUT_HZ_DEFAULT = 50.0
 _INPUT_JOIN_TIMEOUT_S = 2.0
-"""How long a stop waits for the publishing loop, in seconds."""
+"""Seconds that a stop waits for the publishing loop."""
 LOGGED_ERRORS = 5
+
+
+class MeshInputSink:
+    """Publishes input frames; the sink of ``teleoperate(publish=True)``, for a leader that drives a local robot too."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._mesh = mesh
+
+    def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
+        """Publish one frame. Raises TransportError or WireError; the local follower goes on."""
+        frame = {
+            "peer_id": self._mesh.peer_id,
+            "device": device,
+            "method": method,
+            "t": self._mesh.now(),
+            "seq": self._mesh.next_input(device),
+            "action": dict(action),
+            "events": None if events is None else {str(key): bool(value) for key, value in events.items()},
+        }
+        self._mesh.publish(topics.input_stream(self._mesh.peer_id, device), frame)
 
 
 class InputPublisher:
@@ -54,6 +74,7 @@ class InputPublisher:
         if problem is not None:
             raise ValueError(problem)
         self._mesh = mesh
+        self._sink = MeshInputSink(mesh)
         self._teleoperator = teleoperator
         self._device = validate_mesh_identifier(device_name, "device_name")
         self._method = text("method", method, longest=64)
@@ -76,7 +97,7 @@ class InputPublisher:
 
     @property
     def stats(self) -> dict[str, Any]:
-        """Counters; ``running`` is what was asked for, ``thread_alive`` what is."""
+        """Counters; ``running`` is the requested state, ``thread_alive`` that of the loop."""
         thread = self._thread
         alive = thread is not None and thread.is_alive()
         end = time.monotonic() if self._running else self._ended
@@ -139,17 +160,8 @@ class InputPublisher:
 
     def _publish_one(self) -> None:
         try:
-            action = self._teleoperator.get_action()
-            frame = {
-                "peer_id": self._mesh.peer_id,
-                "device": self._device,
-                "method": self._method,
-                "t": self._mesh.now(),
-                "seq": self._mesh.next_input(self._device),
-                "action": self._normalised(action),
-                "events": self._events(),
-            }
-            self._mesh.publish(self.topic, frame)
+            action = self._normalised(self._teleoperator.get_action())
+            self._sink.publish(self._device, self._method, action, self._events())
         except (TransportError, WireError) as exc:
             self._note(f"not published: {exc}")
         except Exception as exc:  # noqa: BLE001 - a device raises what it likes; the loop counts it and goes on
@@ -161,14 +173,14 @@ class InputPublisher:
         """The action as floats by joint. Raises :class:`ValidationError` when it holds none."""
         if not isinstance(action, Mapping):
             raise ValidationError(f"action must be an object of numbers by joint, not {shown(action)}.")
-        found = {str(key): number for key, value in action.items() if (number := _float(value)) is not None}
-        left_out = sorted(str(key) for key in action if str(key) not in found)
-        if not found:
+        joints = {str(key): number for key, value in action.items() if (number := _float(value)) is not None}
+        left_out = sorted(str(key) for key in action if str(key) not in joints)
+        if not joints:
             raise ValidationError(f"action must hold a finite number for at least one joint, not {shown(action)}.")
         if left_out and left_out != self._left_out:
             logger.warning("%s: no finite numbers, left out of the frames: %s", self.topic, ", ".join(left_out))
             self._left_out = left_out
-        return found
+        return joints
 
     def _events(self) -> dict[str, Any] | None:
         read: Callable[[], Any] | None = getattr(self._teleoperator, "get_teleop_events", None)
@@ -176,8 +188,8 @@ class InputPublisher:
             return None
         try:
             events = read()
-            return None if events is None else {key: bool(value) for key, value in named_events(events).items()}
-        except Exception as exc:  # noqa: BLE001 - counted and told; the action is still good
+            return None if events is None else named_events(events)
+        except Exception as exc:  # noqa: BLE001 - counted and logged; the action is still good
             self._event_errors += 1
             if self._event_errors <= LOGGED_ERRORS:
                 logger.warning("%s: events could not be read: %s: %s", self.topic, type(exc).__name__, exc)
@@ -190,7 +202,7 @@ class InputPublisher:
 
 
 def _float(value: Any) -> float | None:
-    """The finite number that ``value`` is, or holds as the one element of an array; a flag is none."""
+    """Return ``value``, or the one element of an array, as a finite float; None for all else, booleans included."""
     if hasattr(value, "tolist"):
         value = value.tolist()
         while isinstance(value, list) and len(value) == 1:

@@ -1,4 +1,4 @@
-"""Being seen and seeing others: heartbeats, liveliness tokens, and which session speaks for which peer."""
+"""Presence: heartbeats, liveliness tokens, and the binding of a peer to the session that it announces itself from."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from strands_robots.mesh.wire_identity import IdentityError
 logger = logging.getLogger(__name__)
 
 DESCRIBE_S = 0.2
-"""How long the first heartbeat waits for what the peer says of itself."""
+"""Seconds that the first heartbeat waits for the description of the peer."""
 
 TOKEN_PATIENCE_S = 0.3
 SAME_LOSS_S = 0.5
 RETURN_S = 2.0
-"""After our own link is back, within which the tokens of those who live are back as well."""
+"""Seconds after our own link is back, within which the tokens of living peers are back as well."""
 
 LEAVING_MAX = 4096
 
 
-class Herald:
-    """Announces one peer and hears the others.
+class PresencePublisher:
+    """Announces one peer and registers the others.
 
     Args:
-        describe: what this peer says of itself besides id, type, host and time; may read the robot slowly, so it
-            is called by :meth:`refresh` and its last answer is what :meth:`announce` sends.
+        describe: returns the fields of a heartbeat besides id, type, host and time. It may read the robot slowly, so
+            :meth:`refresh` calls it, and :meth:`announce` sends its last result.
     """
 
     def __init__(self, context: Context, peer_type: str, describe: Callable[[], Mapping[str, Any]]) -> None:
@@ -44,41 +44,41 @@ class Herald:
         self._trouble = ""
         self.described = threading.Event()
         self._leaving: dict[tuple[str, str], float] = {}
-        self._judged_later = self._shown = False
+        self._judged_later = self._token_declared = False
         self._anchored_at: float | None = None
-        self._held: list[Handle] = []
+        self._handles: list[Handle] = []
         self._host = socket.gethostname()
 
     def start(self) -> None:
-        """Hear presence, and show and watch liveliness where the transport has it, or as soon as it has."""
+        """Subscribe to presence; declare and watch liveliness tokens as soon as the transport has them."""
         transport = self._context.transport
         if transport is None:
             raise TransportError("the mesh is not running.")
-        self._held.append(transport.declare_subscriber(topics.presence("*"), self.on_presence))
-        self._show()
+        self._handles.append(transport.declare_subscriber(topics.presence("*"), self.on_presence))
+        self._declare_token()
 
-    def _show(self) -> None:
-        """Show our token and watch those of others, once there is a session: that of a bridge may come later."""
+    def _declare_token(self) -> None:
+        """Declare our token and watch those of others, once there is a session: that of a bridge may come later."""
         transport, session = self._context.transport, self._context.session_id()
-        if self._shown or session is None or transport is None or not isinstance(transport, LiveTransport):
+        if self._token_declared or session is None or transport is None or not isinstance(transport, LiveTransport):
             return
-        self._shown = True
-        self._held.append(transport.declare_token(topics.token(self._context.peer_id, session)))
+        self._token_declared = True
+        self._handles.append(transport.declare_token(topics.token(self._context.peer_id, session)))
         # Where a link can be lost, its loss and that of the tokens come in any order.
         self._judged_later = hasattr(transport, "lost_link_at")
-        self._held.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
+        self._handles.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
 
     def stop(self) -> None:
-        held, self._held = self._held, []
-        for each in held:
+        handles, self._handles = self._handles, []
+        for each in handles:
             with contextlib.suppress(TransportError):  # the session may be gone already, and the subscriber with it
                 each.undeclare()
 
     def refresh(self) -> None:
-        """Read anew what this peer says of itself; a robot that cannot be read is announced by its name alone."""
+        """Read the description anew; a robot that cannot be read is announced by its name alone."""
         try:
             self._facts, trouble = dict(self._describe()), ""
-        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises, the peer is there
+        except Exception as exc:  # noqa: BLE001 - a robot that cannot be read is announced all the same
             self._facts, trouble = {}, f"{type(exc).__name__}: {exc}"
         if trouble and trouble != self._trouble:
             logger.warning("%s cannot be described: %s", self._context.peer_id, trouble)
@@ -101,7 +101,7 @@ class Herald:
             logger.warning("%s: presence was not published: %s", context.peer_id, exc)
 
     def on_presence(self, sample: Sample) -> None:
-        """A heartbeat of somebody: into the registry, or dropped and audited."""
+        """Register the sender of a heartbeat, or drop the heartbeat and audit the reason."""
         context = self._context
         try:
             presence = wire.Presence.of(wire.decode(sample.payload, topics.BY_NAME["presence"].max_bytes))
@@ -110,12 +110,12 @@ class Herald:
             return
         peer = presence.robot_id
         if peer == context.peer_id:
-            self._impostor(sample)
+            self._audit_impostor(sample)
             return
         if not wire.fresh(presence.timestamp, context.clock()):
             context.audit("presence_rejected", peer, reason="the timestamp is not fresh")
             return
-        if sample.sessionless and not _speaks_there(sample.key, peer):
+        if sample.sessionless and not _owns_topic(sample.key, peer):
             context.audit("presence_rejected", peer, reason="the topic and the body disagree")
             return
         session, certificate = sample.session, None
@@ -127,10 +127,10 @@ class Herald:
                 if context.identity.required:
                     context.audit("presence_unverified", peer, reason=str(exc))
                     session = None
-        good_enough = certificate is not None or not context.identity.required
-        held = context.registry.conflicts(peer, session, certified=good_enough)
-        if held is not None:
-            context.audit("presence_identity_conflict", peer, held=held, offered=session)
+        certified = certificate is not None or not context.identity.required
+        bound = context.registry.conflicts(peer, session, certified=certified)
+        if bound is not None:
+            context.audit("presence_identity_conflict", peer, held=bound, offered=session)
             return
         facts = presence.facts()
         if context.registry.update(
@@ -139,7 +139,7 @@ class Herald:
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
 
     def on_token(self, key: str, there: bool) -> None:
-        """A liveliness token came or went; one that went is judged a moment later, by :meth:`judge_tokens`."""
+        """Note a token that came or went; :meth:`judge_tokens` decides later about one that went."""
         parts = key.split("/")
         if len(parts) != 4 or parts[1] == self._context.peer_id:
             return
@@ -152,12 +152,13 @@ class Herald:
                 self.judge_tokens(0.0)
 
     def judge_tokens(self, patience: float = TOKEN_PATIENCE_S) -> None:
-        """Take a peer whose token went for gone, unless it went because our own link did.
+        """Mark a peer whose token went as gone, unless the token went because our own link was lost.
 
-        When a hub dies every token goes at once, and none of the sessions need have ended. Those that live show their
-        tokens again on the next hub; what has not come back a while after our own link did is gone.
+        When a hub dies every token goes at once, although the sessions may live on. A living session declares its
+        token again on the next hub; a token that is not back :data:`RETURN_S` after our own link belongs to a peer
+        that is gone.
         """
-        self._show()
+        self._declare_token()
         now, transport = time.monotonic(), self._context.transport
         anchored, lost_link = getattr(transport, "anchored", None), getattr(transport, "lost_link_at", None)
         if callable(anchored) and not anchored():
@@ -173,13 +174,13 @@ class Herald:
             if self._context.registry.lost(*mark):
                 logger.info("%s left.", mark[0])
 
-    def _impostor(self, sample: Sample) -> None:
+    def _audit_impostor(self, sample: Sample) -> None:
         ours = self._context.session_id()
         if sample.session is not None and ours is not None and sample.session != ours:
             self._context.audit("presence_identity_conflict", self._context.peer_id, held=ours, offered=sample.session)
 
 
-def _speaks_there(key: str, peer: str) -> bool:
-    """Without sessions the topic is all that a broker vouches for: the peer's own, or that of its parent."""
+def _owns_topic(key: str, peer: str) -> bool:
+    """Whether a topic is the peer's own or its parent's: without sessions the broker vouches for nothing else."""
     parts = key.split("/")
     return len(parts) > 1 and (peer == parts[1] or peer.startswith(f"{parts[1]}__"))

@@ -1,6 +1,7 @@
-"""Who is there: the peers heard of, bound to the session and the certificate they announced themselves with.
+"""Registry of peers, each bound to the session and the certificate that it announced itself with.
 
-Ages are measured here, on a monotonic clock, never taken from the wire.
+Ages are measured here, on a monotonic clock, never taken from the wire. :func:`attribute` compares the session of a
+message with the one that its stated sender is bound to.
 """
 
 from __future__ import annotations
@@ -9,12 +10,44 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any
+
+from strands_robots.mesh.transport import Sample
 
 PEER_TIMEOUT = 10.0
 """Seconds of silence after which a peer is out of reach."""
 
 PAST_MAX = 1024
+
+
+class Attribution(Enum):
+    """Result of :func:`attribute`."""
+
+    BOUND = "the session the peer announced itself from"
+    PINNED = "no session on this transport; the broker's policy pins the topic"
+    OTHER = "another session than the peer announced itself from"
+    MISSING = "no session, and the peer announced itself from one"
+    UNKNOWN = "the peer was never seen"
+
+    @property
+    def accepted(self) -> bool:
+        """True where a reply counts."""
+        return self in (Attribution.BOUND, Attribution.PINNED)
+
+    @property
+    def proven(self) -> bool:
+        """True where it is good enough to move metal: a topic that anyone may write to proves nothing."""
+        return self is Attribution.BOUND
+
+
+def attribute(bound: str | None, sample: Sample) -> Attribution:
+    """Compare ``bound``, the session that the stated sender announced itself from, with the one on a sample."""
+    if bound is not None:
+        if sample.session == bound:
+            return Attribution.BOUND
+        return Attribution.OTHER if sample.session is not None else Attribution.MISSING
+    return Attribution.PINNED if sample.session is None and sample.sessionless else Attribution.UNKNOWN
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +81,8 @@ class PeerRegistry:
 
     Args:
         clock: monotonic seconds.
-        most: gives the most rows that are kept; the longest silent leaves first.
-        retention: gives the seconds for which a silent peer stays listed as out of reach.
+        most: returns the bound on rows; the longest silent one is dropped first.
+        retention: returns the seconds for which a silent peer stays listed as out of reach.
     """
 
     def __init__(
@@ -77,11 +110,11 @@ class PeerRegistry:
     ) -> bool:
         """Insert or refresh a row; True when the peer is new.
 
-        Who says no session of a living peer leaves it bound as it was, and so it is with its certificate.
+        A living peer that states no session or no certificate keeps the one that it is bound to.
         """
         now = self._clock()
         with self._lock:
-            # Taken out and put in again, so that the order of the rows is the order of their last word.
+            # Taken out and put in again, so that the rows are in the order of their last heartbeat.
             known = self._rows.pop(peer_id, None)
             if known is not None and not known.gone and now - known.seen <= PEER_TIMEOUT:
                 session = session if session is not None else known.session
@@ -94,10 +127,10 @@ class PeerRegistry:
         return known is None
 
     def conflicts(self, peer_id: str, session: str | None, *, certified: bool = False) -> str | None:
-        """What already speaks for the living ``peer_id`` and bars this heartbeat of it, else None.
+        """The binding of the living ``peer_id`` that rules out a heartbeat from ``session``, else None.
 
-        That is its session when it is another than ``session``, or the certificate (SHA-256) that it announced itself
-        with when this heartbeat is not ``certified`` for the peer.
+        That is its session when it is another one, or the certificate (SHA-256) that it announced itself with when
+        the heartbeat is not ``certified`` for the peer.
         """
         row = self._row(peer_id)
         if row is None or row.gone or self._clock() - row.seen > PEER_TIMEOUT:
@@ -150,8 +183,8 @@ class PeerRegistry:
                 del self._past[next(iter(self._past))]
         return gone
 
-    def heard_within(self, seconds: float) -> set[str]:
-        """Every peer heard of in the last ``seconds``, also those that were dropped for their silence."""
+    def seen_within(self, seconds: float) -> set[str]:
+        """Ids of all peers seen in the last ``seconds``, also of those that were dropped since."""
         now = self._clock()
         with self._lock:
             seen = {**self._past, **{peer: row.seen for peer, row in self._rows.items()}}

@@ -13,8 +13,8 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
+from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.security import validate_command
 from strands_robots.mesh.transport import PutConfirmed, Sample, TransportError
 from strands_robots.safety.stopping import Outcome, grade
@@ -61,7 +61,7 @@ class Turn:
         return {"via": self.via, "confirmed": self.confirmed}
 
 
-class Caller:
+class Requester:
     """Sends commands and collects replies for one peer."""
 
     def __init__(self, context: Context) -> None:

@@ -1,89 +1,250 @@
-"""The mesh's two safety topics: a fleet e-stop and its signed resume, carried to and from the safety plane.
+"""Fleet e-stop and signed resume on the mesh, carried to and from the safety plane of this process.
 
 Nothing is decided here. Locking, halting and checking a resume are the plane's, reached through a
-:class:`SafetyDoor`; this module translates between it and the wire.
+:class:`SafetyAdapter`; this module translates between it and the wire, and :class:`EstopRetry` repeats a stop to the
+peers that missed it.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import threading
 import time
-from collections import deque
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from strands_robots.envelope import is_error
 from strands_robots.mesh import dispatch, topics, wire
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.door import SafetyDoor
 from strands_robots.mesh.executor import Lane
-from strands_robots.mesh.pursuit import KNOWN_S, Pursuit
-from strands_robots.mesh.rpc import Caller, stop_outcome
+from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
+from strands_robots.safety.decision import Decision
+from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.orders import StopOrder, derived_epoch, new_epoch
+from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, sign
-from strands_robots.safety.stopping import Outcome, StopVerdict
-from strands_robots.utils import ValidationError, identifier
+from strands_robots.safety.stopping import Outcome, StopVerdict, explain
+from strands_robots.utils import ValidationError, identifier, shown
 
 logger = logging.getLogger(__name__)
 
 COLLECT_S = 3.0
+"""Seconds in which the answers to an e-stop are collected."""
+
 SPACING_S = 0.55
 """Between two messages on a safety topic: peers in the field let two a second through."""
 
+REPORT_S = 2.0
+"""Seconds besides the halt deadline in which the plane reports, its lockout file included."""
+
 RECENT_MAX = 512
+
+RETRY_EVERY_S = SPACING_S
+RETRY_ANSWER_S = 1.0
+UNANSWERED_MAX = 10
+"""Repeats to a peer that is in reach and does not answer; access rules may keep it from us."""
+
+KNOWN_S = 600.0
+"""A peer that sent a heartbeat within these seconds gets the stop when it comes back; a newcomer does not."""
+
+Verdict = Callable[[], StopVerdict | None]
+
+
+class NoRobot:
+    """The robot of a peer that has none, such as an operator's console: it never moves."""
+
+    tool_name_str = "none"
+
+    def __init__(self) -> None:
+        self.gate = MotionGate()
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        return StopVerdict()
+
+
+class SafetyAdapter:
+    """The robot of one peer on the safety plane.
+
+    Args:
+        robot: None for a peer without one.
+        key: under which its lockout survives a restart; None for one that is not stored.
+        own: another plane than the process's; for tests with several peers in one process.
+    """
+
+    def __init__(
+        self, peer_id: str, robot: Stoppable | None, key: str | None = None, own: SafetyPlane | None = None
+    ) -> None:
+        self._plane = own or plane()
+        self._peer_id = peer_id
+        self._robot = robot or NoRobot()
+        self._key = key
+        self._entry: Registered | None = None
+        self._decision = Decision()
+        self.open()
+
+    def open(self) -> None:
+        """Register this peer's robot; twice is once.
+
+        Raises:
+            ValidationError: another robot of this process has this name.
+        """
+        if self._entry is None:
+            self._entry = self._plane.register(self._peer_id, self._robot, key=self._key)
+
+    def epochs(self) -> tuple[str, ...]:
+        """The epochs that lock this robot, oldest first; empty while it may move."""
+        return self._entry.epochs if self._entry is not None else ()
+
+    def source_refusal(self, source: str) -> str | None:
+        """The reason why an e-stop of ``source`` does not count, or None."""
+        return self._decision.source_refusal(source)
+
+    def begin(self, order: StopOrder) -> Verdict | None:
+        """Lock under the order's epoch, start the halt and return at once; None when the epoch was seen before.
+
+        The callable that is returned waits for the robot's verdict, at most the halt deadline and the time that the
+        plane takes to report; it returns None when there is none by then.
+        """
+        run, entry = self._plane.begin(order), self._entry
+        if run is None:
+            return None
+
+        def verdict() -> StopVerdict | None:
+            run.wait(run.deadline_s + REPORT_S)
+            report = entry.reports.get(order.epoch) if entry is not None else None
+            return report.verdict if report is not None else None
+
+        return verdict
+
+    def resume(self, assertion: object) -> str | None:
+        """Clear one epoch, when the assertion is an operator's and for this robot; else return the rejection."""
+        entry = self._entry
+        return REJECTED if entry is None or is_error(entry.resume(assertion, "mesh")) else None
+
+    def close(self) -> None:
+        """Take this peer's robot off the plane; twice is once."""
+        entry, self._entry = self._entry, None
+        if entry is not None:
+            entry.close()
+
+
+class EstopRetry:
+    """Repeats one emergency stop to the peers that did not answer it, when they are back, until they stopped.
+
+    A link that parted, or a hub that hangs, loses what is published meanwhile, and Zenoh stores nothing for a peer
+    that comes back. So the issuer repeats the stop itself, for as long as it is locked by it.
+    """
+
+    def __init__(self, context: Context, requester: Requester) -> None:
+        self._context = context
+        self._requester = requester
+        self._over = threading.Event()
+
+    def begin(
+        self, epoch: str, missing: Iterable[str], locked: Callable[[], bool], publish: Callable[[], None]
+    ) -> None:
+        """Repeat the stop to ``missing`` until all have stopped, ``locked`` is false, or this peer leaves.
+
+        Args:
+            publish: publishes the stop's envelope once more.
+        """
+        self._over.set()  # a later stop is answered for an earlier one as well
+        over = self._over = threading.Event()
+        left = set(missing)
+        if left:
+            name = f"mesh-{self._context.peer_id}-estop-retry"
+            thread = threading.Thread(
+                target=self._run, args=(over, epoch, left, locked, publish), name=name, daemon=True
+            )
+            thread.start()
+
+    def _run(
+        self, over: threading.Event, epoch: str, left: set[str], locked: Callable[[], bool], publish: Callable[[], None]
+    ) -> None:
+        began, silences = self._context.monotonic(), Counter[str]()
+        logged: set[tuple[str, Outcome]] = set()
+        while left and not over.wait(RETRY_EVERY_S) and self._context.transport is not None and locked():
+            back = sorted(peer for peer in left if self._seen_since(began, peer))
+            if back:
+                publish()
+            for peer in back:
+                if over.is_set():
+                    return
+                reply: dict[str, Any] = self._requester.send(peer, {"action": "stop"}, RETRY_ANSWER_S)
+                outcome = stop_outcome(reply)
+                if outcome is Outcome.STOPPED:
+                    left.discard(peer)
+                    logger.warning("%s was out of reach and has answered emergency stop %s now.", peer, epoch)
+                elif outcome is Outcome.TIMED_OUT:
+                    silences[peer] += 1
+                    if silences[peer] >= UNANSWERED_MAX:
+                        left.discard(peer)
+                        logger.critical("%s is in reach and does not answer emergency stop %s.", peer, epoch)
+                elif (peer, outcome) not in logged:
+                    logged.add((peer, outcome))
+                    why = explain(reply.get("result")) if "result" in reply else shown(reply.get("error"))
+                    logger.critical("%s is in reach and did NOT stop on emergency stop %s: %s", peer, epoch, why)
+
+    def _seen_since(self, began: float, peer: str) -> bool:
+        row = self._context.registry.get(peer, self._context.monotonic() - began)
+        return row is not None and bool(row["reachable"])
 
 
 class FleetSafety:
     """Issues and receives fleet e-stops and resumes for one peer.
 
     Args:
-        lane: where a relayed resume is checked, off the transport's thread.
+        resumes: checks a relayed resume off the transport's thread.
         robot: this peer has one, whose answer to an e-stop comes first.
     """
 
-    def __init__(self, context: Context, door: SafetyDoor, caller: Caller, lane: Lane, *, robot: bool = True) -> None:
+    def __init__(
+        self, context: Context, adapter: SafetyAdapter, requester: Requester, resumes: Lane, *, robot: bool = True
+    ) -> None:
         self._context = context
-        self._door = door
-        self._caller = caller
-        self._lane = lane
+        self._adapter = adapter
+        self._requester = requester
+        self._resumes = resumes
         self._robot = robot
-        self._pursuit = Pursuit(context, caller, f"mesh-{context.peer_id}-pursuit")
+        self._retry = EstopRetry(context, requester)
         self._recent: deque[str] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
 
     def locked(self) -> bool:
-        return bool(self._door.epochs())
+        return bool(self._adapter.epochs())
 
     # Issuing.
 
     def emergency_stop(self) -> list[dict[str, Any]]:
-        """Stop this robot and every peer; the answer of the robot here, if any, then each attributed reply."""
+        """Stop this robot and every peer; return the reply of the local robot, if any, then each attributed reply."""
         context = self._context
         order = StopOrder(new_epoch(), context.peer_id, "emergency stop", "mesh", issued=context.clock())
-        # The halt is set going, and the fleet hears of it while the local robot stops.
-        local = self._door.begin(order)
+        # The fleet is told while the local robot halts.
+        local = self._adapter.begin(order)
         none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
         self._publish_estop(order, none)
         roster = {row["peer_id"] for row in context.registry.all() if row["reachable"]} - {context.peer_id}
-        told = time.monotonic()
+        published = time.monotonic()
 
-        def missing(have: list[dict[str, Any]]) -> set[str]:
-            nonlocal told
-            absent = roster - {str(reply["responder_id"]) for reply in have}
-            if absent and time.monotonic() - told >= SPACING_S:
+        def missing(replies: list[dict[str, Any]]) -> set[str]:
+            nonlocal published
+            absent = roster - {str(reply["responder_id"]) for reply in replies}
+            if absent and time.monotonic() - published >= SPACING_S:
                 # A link that was down when the stop was published may be back: the same stop again.
-                told = time.monotonic()
+                published = time.monotonic()
                 self._publish_estop(order, none)
             return absent
 
-        replies = self._caller.broadcast({"action": "stop"}, COLLECT_S, missing)
+        replies = self._requester.broadcast({"action": "stop"}, COLLECT_S, missing)
         verdict = local() if local is not None else None
-        responses = [*self._own(order, verdict), *replies]
-        still = {str(each["responder_id"]) for each in responses if stop_outcome(each) is Outcome.STOPPED}
-        not_stopped = [name for each in responses if (name := str(each["responder_id"])) not in still]
+        responses = [*self._local_reply(order, verdict), *replies]
+        stopped = {str(each["responder_id"]) for each in responses if stop_outcome(each) is Outcome.STOPPED}
+        not_stopped = [name for each in responses if (name := str(each["responder_id"])) not in stopped]
         silent = sorted(roster - {str(each["responder_id"]) for each in replies})
         for peer in not_stopped:
             logger.critical("%s did NOT stop on emergency stop %s.", peer, order.epoch)
@@ -95,12 +256,12 @@ class FleetSafety:
             "peers_silent": len(silent),
         }
         self._publish_estop(order, counts)
-        self._tell("emergency_stop", order.epoch)
-        unreached = (roster | context.registry.heard_within(KNOWN_S)) - still - {context.peer_id}
-        self._pursuit.begin(
+        self._publish_event("emergency_stop", order.epoch)
+        unreached = (roster | context.registry.seen_within(KNOWN_S)) - stopped - {context.peer_id}
+        self._retry.begin(
             order.epoch,
             unreached,
-            lambda: order.epoch in self._door.epochs(),
+            lambda: order.epoch in self._adapter.epochs(),
             lambda: self._publish_estop(order, counts),
         )
         context.audit.always(
@@ -113,24 +274,19 @@ class FleetSafety:
         )
         return responses
 
-    def _own(self, order: StopOrder, verdict: StopVerdict | None) -> list[dict[str, Any]]:
-        """What the robot here answers, as a peer would; a peer without one has nothing to halt and says nothing."""
+    def _local_reply(self, order: StopOrder, verdict: StopVerdict | None) -> list[dict[str, Any]]:
+        """The reply of the local robot as a peer would send it; none for a peer without a robot."""
         if not self._robot:
             return []
         context = self._context
-        told = dispatch.told(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
-        return [wire.Reply("response", context.peer_id, order.epoch, told, timestamp=context.clock()).to_wire()]
+        result = dispatch.told(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
+        return [wire.Reply("response", context.peer_id, order.epoch, result, timestamp=context.clock()).to_wire()]
 
     def _publish_estop(self, order: StopOrder, counts: dict[str, Any]) -> None:
         context = self._context
         issued = order.issued if order.issued is not None else context.clock()
-        notice = wire.EstopNotice(
-            context.peer_id,
-            issued,
-            order.epoch,
-            context.session_id(),
-            {**counts, "lockout_engaged": True},
-        )
+        counts = {**counts, "lockout_engaged": True}
+        notice = wire.EstopNotice(context.peer_id, issued, order.epoch, context.session_id(), counts)
         try:
             context.put(topics.estop(), notice.to_wire())
         except (TransportError, wire.WireError) as exc:
@@ -139,19 +295,19 @@ class FleetSafety:
     # Receiving.
 
     def on_estop(self, sample: Sample) -> None:
-        """A fleet e-stop arrived: when this returns every robot of this process is locked and its halt under way."""
+        """Receive a fleet e-stop: on return every robot of this process is locked and its halt has started."""
         received = time.monotonic()
         context = self._context
         try:
             body = wire.decode(sample.payload, topics.BY_NAME["estop"].max_bytes)
-            _agree(body, sample)
+            _require_same_session(body, sample)
             notice = wire.EstopNotice.of(body)
         except wire.WireError as exc:
             context.audit("estop_rejected", reason=str(exc))
             return
         if notice.peer_id == context.peer_id and sample.session == context.session_id():
             return
-        why = self._door.counts(notice.peer_id)
+        why = self._adapter.source_refusal(notice.peer_id)
         if why is not None:
             context.audit("estop_rejected", notice.peer_id, reason=why)
             return
@@ -164,16 +320,16 @@ class FleetSafety:
             return
         order = StopOrder(epoch, notice.peer_id, "fleet e-stop", "mesh", True, notice.t, received)
         self._recent.append(epoch)
-        # The plane locks and sets the halts going at once; nothing on this way waits.
-        if self._door.begin(order) is None:
+        # The plane locks and starts the halts at once; nothing on this path waits.
+        if self._adapter.begin(order) is None:
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
             return
         if order.timing(context.clock()) == "ahead":
             context.audit("estop_clock_skew", notice.peer_id, estop_id=epoch)
-        self._tell("emergency_stop", epoch)
+        self._publish_event("emergency_stop", epoch)
 
-    def _tell(self, event: str, epoch: str) -> None:
-        """The redacted event for dashboards: what happened, as a code, and nothing of why."""
+    def _publish_event(self, event: str, epoch: str) -> None:
+        """Publish the redacted event for dashboards: its code, without the reason."""
         context = self._context
         body = {
             "peer_id": context.peer_id,
@@ -191,10 +347,10 @@ class FleetSafety:
     # Resume.
 
     def resume(self, signing_key: Any, targets: Sequence[str] | None) -> dict[str, Any]:
-        """Sign for every epoch held here, admit it here and relay it to the targets."""
+        """Sign for every epoch that locks this peer, admit each assertion here and relay it to the targets."""
         context = self._context
         wanted = [row["peer_id"] for row in context.registry.all() if row["reachable"]] if targets is None else targets
-        epochs = self._door.epochs()
+        epochs = self._adapter.epochs()
         if not epochs:
             return self._denied("no epoch is held")
         try:
@@ -202,32 +358,29 @@ class FleetSafety:
             signed = [each for epoch in epochs for each in sign(signing_key, epoch, names)]
         except (ValidationError, AttributeError, TypeError) as exc:
             return self._denied(str(exc))
-        first = True
-        for assertion in signed:
-            if context.peer_id in assertion["targets"]:
-                rejected = self._door.resume(assertion)
-                if rejected is not None:
-                    return {"status": "error", "error": rejected}
-            if not first:
+        for index, assertion in enumerate(signed):
+            rejected = self._adapter.resume(assertion) if context.peer_id in assertion["targets"] else None
+            if rejected is not None:
+                return {"status": "error", "error": rejected}
+            if index:
                 time.sleep(SPACING_S)
-            first = False
             self._relay(assertion)
         return {"status": "ok"}
 
     def on_resume_command(self, assertion: object) -> dict[str, Any]:
-        """A resume that came as a command: admitted and relayed, or the one rejection."""
-        rejected = self._door.resume(assertion)
+        """Admit and relay a resume that came as a command, or return the one rejection."""
+        rejected = self._adapter.resume(assertion)
         if rejected is not None:
             return {"status": "error", "error": rejected}
         self._relay(assertion)
         return {"status": "ok"}
 
     def on_resume(self, sample: Sample) -> None:
-        """A relayed resume; one that is not for us costs nothing and is not held against its sender."""
+        """Receive a relayed resume; one for other peers or other epochs does not count against its sender."""
         context = self._context
         try:
             body = wire.decode(sample.payload, topics.BY_NAME["resume"].max_bytes)
-            _agree(body, sample)
+            _require_same_session(body, sample)
             relay = wire.ResumeRelay.of(body)
         except wire.WireError as exc:
             context.audit("resume_denied", reason=str(exc))
@@ -236,19 +389,19 @@ class FleetSafety:
             return
         assertion = relay.assertion
         if sample.retained:
-            self._note_resumed(assertion)
+            self._note_retained(assertion)
             return
-        epochs = self._door.epochs()
+        epochs = self._adapter.epochs()
         if not isinstance(assertion, dict) or not epochs or assertion.get("epoch") not in epochs:
             context.audit("remote_resume_redundant", relay.peer_id)
             return
         targets = assertion.get("targets")
         if not isinstance(targets, list) or context.peer_id not in targets:
             return
-        self._lane.submit(lambda: self._apply(relay))
+        self._resumes.submit(lambda: self._admit_relayed(relay))
 
-    def _note_resumed(self, assertion: Any) -> None:
-        """A resume that the broker kept is too old to clear anything, but says which kept e-stop is over."""
+    def _note_retained(self, assertion: Any) -> None:
+        """Note the epoch of a retained resume: it is too old to clear a lockout, but ends the retained e-stop."""
         if not isinstance(assertion, dict) or self._context.peer_id not in (assertion.get("targets") or ()):
             return
         signature = ed25519.decode(assertion.get("sig"), 64)
@@ -259,10 +412,10 @@ class FleetSafety:
         if signature is not None and ed25519.signed_by_one_of(configured_keys(), signature, covered):
             self._resumed.append(str(assertion.get("epoch")))
 
-    def _apply(self, relay: wire.ResumeRelay) -> None:
-        # The plane records a refusal with its reason; only that it came twice is known here alone.
+    def _admit_relayed(self, relay: wire.ResumeRelay) -> None:
+        # The plane records a refusal with its reason; that it came twice is known here alone.
         nonce = str(relay.assertion.get("nonce"))
-        if self._door.resume(relay.assertion) is None:
+        if self._adapter.resume(relay.assertion) is None:
             self._admitted.append(nonce)
             self._context.audit.always("remote_resume_applied", about=relay.peer_id)
         elif nonce in self._admitted:
@@ -281,8 +434,8 @@ class FleetSafety:
         return {"status": "error", "error": REJECTED}
 
 
-def _agree(body: dict[str, Any], sample: Sample) -> None:
-    """The session in the body and on the sample: both there and equal, or both absent. Raises WireError."""
+def _require_same_session(body: dict[str, Any], sample: Sample) -> None:
+    """Raise WireError unless the session in the body and on the sample are equal, or both absent."""
     stated = body.get("source_zid")
     if stated is None and sample.session is None:
         return

@@ -12,9 +12,9 @@ from weakref import WeakKeyDictionary
 
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.attribution import attribute
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lane, Lanes
+from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.security import ANSWERED_WHILE_LOCKED, CHANGING, MOTION, STOP_FIELDS, validate_command
 from strands_robots.mesh.stops import Asker, Stops, Tell
 from strands_robots.mesh.transport import Sample, TransportError

@@ -1,35 +1,52 @@
-"""What a peer publishes of itself ten times a second: joints, task, simulated time, its robots."""
+"""A robot read into messages: its state ten times a second, and the description in its presence.
+
+Each section and each field is read by itself: one that cannot be read takes no other with it.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
-from strands_robots.contract import TaskRobot, WorldRobot
+from strands_robots.contract import TaskRobot, WorldRobot, body_of
 from strands_robots.envelope import is_error, text_of
-from strands_robots.mesh.dispatch import Robot
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.mesh.throttle import TroubleLog
+
+logger = logging.getLogger(__name__)
 
 TASK_FIELDS = {"status": "task_status", "instruction": "instruction", "steps": "step_count", "duration": "duration"}
 
 DETAIL_MAX = 160
+KEYS_MAX = 256
+IMAGE_DIMENSIONS = 3
 STALE_S = 1.0
 """Age in seconds from which joints of an earlier read are published no more."""
 
+Fields = Mapping[str, Any]
 
-class UnreadableError(Exception):
-    """A section that cannot be read, or only in part; ``found`` is the part."""
 
-    def __init__(self, reason: str, detail: str, found: Mapping[str, Any] | None = None) -> None:
+class UnreadableError(StrandsRobotsError):
+    """A section that cannot be read, or only in part.
+
+    Attributes:
+        reason: short code of the failure.
+        part: the entries that were read.
+    """
+
+    def __init__(self, reason: str, detail: str, part: Fields | None = None) -> None:
         super().__init__(detail)
         self.reason = reason
-        self.found = found or {}
+        self.part = part or {}
 
 
 @dataclass(slots=True)
-class _Trouble:
+class _Degradation:
     reason: str
     detail: str
     since: float
@@ -37,68 +54,72 @@ class _Trouble:
 
 
 class StateReader:
-    """Reads a robot into state messages; a section that cannot be read is told as degraded, the others stay."""
+    """Reads a robot into state messages; a section that cannot be read is reported as degraded, the others stay."""
 
-    def __init__(self, peer_id: str, robot: Robot | None, clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self, peer_id: str, robot: TaskRobot | WorldRobot | None, clock: Callable[[], float] = time.time
+    ) -> None:
         self._peer_id = peer_id
         self._robot = robot
         self._clock = clock
-        self._troubles: dict[str, _Trouble] = {}
-        self._before: dict[str, tuple[float, float]] = {}
+        self._degraded: dict[str, _Degradation] = {}
+        self._positions: dict[str, tuple[float, float]] = {}
 
     def read(self) -> dict[str, Any] | None:
-        """The message, or None when there is nothing to say."""
+        """Return the message, or None when no section can be read and none is degraded."""
         body: dict[str, Any] = {}
         for name, read in self._sections().items():
-            self._section(body, name, read)
-        if self._troubles:
+            self._add_section(body, name, read)
+        if self._degraded:
             now = time.monotonic()
             body["degraded"] = {
                 name: {
-                    "reason": trouble.reason,
-                    "detail": trouble.detail,
-                    "failures": trouble.failures,
-                    "seconds": round(now - trouble.since, 3),
+                    "reason": each.reason,
+                    "detail": each.detail,
+                    "failures": each.failures,
+                    "seconds": round(now - each.since, 3),
                 }
-                for name, trouble in self._troubles.items()
+                for name, each in self._degraded.items()
             }
-        # Written last, so that nothing a robot says can pass for another peer.
+        # Written last, so that a robot's own fields cannot pass for another peer.
         return {**body, "peer_id": self._peer_id, "t": self._clock()} if body else None
 
     def _sections(self) -> dict[str, Callable[[], Any]]:
         robot = self._robot
         if isinstance(robot, WorldRobot):
-            state, running, names = _Once(robot.get_state), _Once(robot.list_policies_running), _Once(robot.list_robots)
+            # A read that succeeds is shared by the sections of one message.
+            state, running, names = cache(robot.get_state), cache(robot.list_policies_running), cache(robot.list_robots)
             return {
-                "joints": lambda: self._world_joints(_told(state()), names()),
-                "sim_time": lambda: _sim_time(_told(state())),
+                "joints": lambda: self._world_joints(_checked(state()), names()),
+                "sim_time": lambda: _sim_time(_checked(state())),
                 "robots": lambda: _active(names(), running()),
                 "task": lambda: _world_task(running()),
             }
         if isinstance(robot, TaskRobot):
             return {
-                "joints": lambda: _joints(_told(robot.get_state())),
-                "task": lambda: task_of(_told(robot.get_task_status())),
+                "joints": lambda: _joints(_checked(robot.get_state())),
+                "task": lambda: _task(_checked(robot.get_task_status())),
             }
         return {}
 
-    def _section(self, body: dict[str, Any], name: str, read: Callable[[], Any]) -> None:
+    def _add_section(self, body: dict[str, Any], name: str, read: Callable[[], Any]) -> None:
         try:
-            found, reason, detail = read(), "", ""
+            section, reason, detail = read(), "", ""
         except UnreadableError as exc:
-            found, reason, detail = exc.found, exc.reason, str(exc)
-        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is told, not hidden
-            found, reason, detail = None, type(exc).__name__, str(exc)
+            section, reason, detail = exc.part, exc.reason, str(exc)
+        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is reported in the message
+            section, reason, detail = None, type(exc).__name__, str(exc)
         if reason:
-            trouble = self._troubles.setdefault(name, _Trouble("", "", time.monotonic()))
-            trouble.reason, trouble.detail = reason, _bounded(detail)
-            trouble.failures += 1
+            degraded = self._degraded.setdefault(name, _Degradation("", "", time.monotonic()))
+            degraded.reason = reason
+            degraded.detail = detail if len(detail) <= DETAIL_MAX else f"{detail[:DETAIL_MAX]}..."
+            degraded.failures += 1
         else:
-            self._troubles.pop(name, None)
-        if found is not None and found != {}:
-            body[name] = found
+            self._degraded.pop(name, None)
+        if section is not None and section != {}:
+            body[name] = section
 
-    def _world_joints(self, state: Mapping[str, Any], names: list[str]) -> dict[str, Any]:
+    def _world_joints(self, state: Fields, names: list[str]) -> dict[str, Any]:
         joints: dict[str, Any] = {}
         at = state.get("sim_time")
         for name, values in dict(state.get("robots") or {}).items():
@@ -107,52 +128,64 @@ class StateReader:
                 if isinstance(value, Mapping):
                     entry = {"position": value.get("position"), "velocity": value.get("velocity")}
                 elif isinstance(value, int | float):
-                    entry = {"position": float(value), "velocity": self._speed(f"{name}/{joint}", float(value), at)}
+                    entry = {"position": float(value), "velocity": self._velocity(f"{name}/{joint}", float(value), at)}
                 else:
                     continue
                 joints[joint if len(names) == 1 else f"{name}/{joint}"] = entry
-        bad = [name for name, entry in joints.items() if not all(_sound(entry[part]) for part in entry)]
-        return _good(joints, bad)
+        bad = [name for name, entry in joints.items() if not all(_is_number_or_none(each) for each in entry.values())]
+        return _without(joints, bad)
 
-    def _speed(self, joint: str, position: float, at: object) -> float | None:
+    def _velocity(self, joint: str, position: float, at: object) -> float | None:
         """Velocity by simulated time between two messages; 0 while the world stands still, None for the first."""
         if not isinstance(at, int | float):
             return None
-        known = self._before.get(joint)
-        self._before[joint] = (float(at), position)
+        known = self._positions.get(joint)
+        self._positions[joint] = (float(at), position)
         if known is None:
             return None
         passed = float(at) - known[0]
         return (position - known[1]) / passed if passed > 0 else 0.0
 
 
-class _Once:
-    """One read of a robot that several sections of a message share."""
+class Description:
+    """Reads a robot for the presence of its peer; a field that cannot be read is logged once for each reason."""
 
-    def __init__(self, read: Callable[[], Any]) -> None:
-        self._read = read
-        self._answer: Any = None
-        self._raised: Exception | None = None
-        self._asked = False
+    def __init__(self, peer_id: str, robot: TaskRobot | WorldRobot | None) -> None:
+        self._peer_id = peer_id
+        self._robot = robot
+        self._troubles = TroubleLog(logger)
 
-    def __call__(self) -> Any:
-        if not self._asked:
-            self._asked = True
-            try:
-                self._answer = self._read()
-            except Exception as exc:  # noqa: BLE001 - raised again, for each section that needs it
-                self._raised = exc
-        if self._raised is not None:
-            raise self._raised
-        return self._answer
+    def read(self) -> dict[str, Any]:
+        """Return the fields that can be read now."""
+        robot = self._robot
+        if robot is None:
+            return {}
+        fields: dict[str, Any] = {"tool_name": robot.tool_name_str}
+        if isinstance(robot, WorldRobot):
+            fields["world"] = True
+            fields.update(self._field("sim_robots", lambda: {"sim_robots": robot.list_robots()}))
+            fields.update(self._field("task_status", lambda: _world_status(robot.list_policies_running())))
+            fields.update(self._field("features", lambda: _world_features(_checked(robot.get_features()))))
+            return fields
+        device = body_of(robot)
+        fields.update(self._field("task_status", lambda: _status(_checked(robot.get_task_status()))))
+        fields.update(self._field("features", lambda: _features(_checked(robot.get_features()))))
+        fields.update(self._field("connected", lambda: _typed(device, "connected", "is_connected", bool)))
+        fields.update(self._field("hw", lambda: _typed(device, "hw", "hardware_name", str)))
+        return fields
+
+    def _field(self, name: str, read: Callable[[], Fields]) -> Fields:
+        fields: Fields = {}
+        trouble = ""
+        try:
+            fields = read()
+        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises costs this field alone
+            trouble = f"{type(exc).__name__}: {exc}"
+        self._troubles.note(name, trouble, "%s is announced without its %s: %s", self._peer_id, name, trouble)
+        return fields
 
 
-def task_of(status: Mapping[str, Any]) -> dict[str, Any]:
-    """The task section of a status envelope."""
-    return {name: status[field] for name, field in TASK_FIELDS.items() if field in status}
-
-
-def _told(answer: Mapping[str, Any]) -> Mapping[str, Any]:
+def _checked(answer: Fields) -> Fields:
     if not isinstance(answer, Mapping):
         raise UnreadableError("malformed", f"the robot answered with a {type(answer).__name__}")
     if is_error(answer):
@@ -160,30 +193,39 @@ def _told(answer: Mapping[str, Any]) -> Mapping[str, Any]:
     return answer
 
 
-def _joints(state: Mapping[str, Any]) -> dict[str, float]:
+def _joints(state: Fields) -> dict[str, float]:
     joints = state.get("joints")
-    found: dict[str, float] = {}
+    good: dict[str, float] = {}
     bad: list[str] = []
     for name, value in (joints if isinstance(joints, Mapping) else {}).items():
-        if _sound(value) and value is not None:
-            found[str(name)] = float(value)
+        if _is_number_or_none(value) and value is not None:
+            good[str(name)] = float(value)
         else:
             bad.append(str(name))
     problem, age = state.get("joints_error"), state.get("joints_age_s")
     if problem:
         fresh = isinstance(age, int | float) and age <= STALE_S
-        raise UnreadableError("stale", str(problem), found if fresh else None)
-    return _good(found, bad)
+        raise UnreadableError("stale", str(problem), good if fresh else None)
+    return _without(good, bad)
 
 
-def _good(joints: dict[str, Any], bad: list[str]) -> dict[str, Any]:
+def _without(joints: dict[str, Any], bad: list[str]) -> dict[str, Any]:
     if bad:
         good = {name: entry for name, entry in joints.items() if name not in bad}
         raise UnreadableError("not a number", ", ".join(bad), good)
     return joints
 
 
-def _sim_time(state: Mapping[str, Any]) -> float | None:
+def _is_number_or_none(value: object) -> bool:
+    if value is None:
+        return True
+    try:
+        return not isinstance(value, bool | str | bytes) and math.isfinite(value)  # type: ignore[arg-type]
+    except TypeError:
+        return False
+
+
+def _sim_time(state: Fields) -> float | None:
     at = state.get("sim_time")
     return float(at) if isinstance(at, int | float) else None
 
@@ -193,7 +235,11 @@ def _active(names: list[str], running: list[dict[str, Any]]) -> dict[str, bool]:
     return {name: name in moving for name in names}
 
 
-def _world_task(running: list[dict[str, Any]]) -> dict[str, Any]:
+def _task(status: Fields) -> Fields:
+    return {name: status[field] for name, field in TASK_FIELDS.items() if field in status}
+
+
+def _world_task(running: list[dict[str, Any]]) -> Fields:
     if not running:
         return {}
     first = running[0]
@@ -205,14 +251,48 @@ def _world_task(running: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _sound(value: object) -> bool:
-    if value is None:
-        return True
-    try:
-        return not isinstance(value, bool | str | bytes) and math.isfinite(value)  # type: ignore[arg-type]
-    except TypeError:
-        return False
+def _status(status: Fields) -> Fields:
+    fields = {"task_status": str(status.get("task_status", "idle"))}
+    return fields | ({"instruction": str(status["instruction"])} if status.get("instruction") else {})
 
 
-def _bounded(text: str) -> str:
-    return text if len(text) <= DETAIL_MAX else f"{text[:DETAIL_MAX]}..."
+def _world_status(running: list[dict[str, Any]]) -> Fields:
+    if not running:
+        return {"task_status": "idle"}
+    return {"task_status": "running", "instruction": str(running[0].get("instruction", ""))}
+
+
+def _features(features: Fields) -> Fields:
+    fields: dict[str, Any] = {}
+    actions, observations = features.get("action_features"), features.get("observation_features")
+    if isinstance(actions, Mapping):
+        fields["action_keys"] = sorted(str(key) for key in actions)[:KEYS_MAX]
+    if isinstance(observations, Mapping):
+        images = [
+            str(key)
+            for key, shape in observations.items()
+            if isinstance(shape, list | tuple) and len(shape) == IMAGE_DIMENSIONS
+        ]
+        if images:
+            fields["cameras"] = images[:KEYS_MAX]
+    return fields
+
+
+def _world_features(features: Fields) -> Fields:
+    fields: dict[str, Any] = {}
+    robots, cameras = features.get("robots"), features.get("cameras")
+    if isinstance(robots, Mapping) and robots:
+        fields["action_keys"] = sorted(
+            str(key) if len(robots) == 1 else f"{name}/{key}"
+            for name, each in robots.items()
+            for key in each.get("action_features", ())
+        )[:KEYS_MAX]
+    if cameras:
+        # The wire's camera names hold no slash.
+        fields["cameras"] = [str(name).replace("/", ".") for name in cameras][:KEYS_MAX]
+    return fields
+
+
+def _typed(device: Any, field: str, name: str, kind: type) -> Fields:
+    value = getattr(device, name, None)
+    return {field: value} if isinstance(value, kind) and value != "" else {}

@@ -1,12 +1,9 @@
-"""The audit trail as the mesh writes it: a flood of refusals is told as a count.
-
-A hostile peer can make the mesh refuse a thousand messages a second. Each kind of refusal from each peer is
-written a few times a second, and then once with the number of those left out. The sink returns at once; the
-record is written elsewhere.
-"""
+"""Bounds on what repeats itself: audit events of a flood, log lines about one trouble, messages above a rate."""
 
 from __future__ import annotations
 
+import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -30,8 +27,12 @@ class _Window:
     left_out: int = 0
 
 
-class Recorder:
-    """Writes the events of one peer to ``sink``; thread-safe."""
+class AuditThrottle:
+    """Writes the safety events of one peer to ``sink``; thread-safe.
+
+    A hostile peer can make the mesh refuse a thousand messages a second. Each kind of refusal from each peer is
+    written :data:`BURST` times in :data:`WINDOW_S`, and the next record states how many were left out.
+    """
 
     def __init__(
         self, peer_id: str, sink: AuditSink = log_safety_event, clock: Callable[[], float] = time.monotonic
@@ -44,14 +45,14 @@ class Recorder:
 
     def __call__(self, event: str, about: str = "", **payload: Any) -> None:
         """Record ``event``, which concerns the peer ``about``; in a flood, some of them."""
-        who = about[:128]
-        left_out = self._admit((event, who))
+        about = about[:128]
+        left_out = self._admit((event, about))
         if left_out is None:
             return
         if left_out:
             payload["left_out_before"] = left_out
-        if who:
-            payload.setdefault("about", who)
+        if about:
+            payload.setdefault("about", about)
         self._sink(event, self._peer, payload)
 
     def always(self, event: str, **payload: Any) -> None:
@@ -59,7 +60,7 @@ class Recorder:
         self._sink(event, self._peer, payload)
 
     def close(self) -> None:
-        """Tell the counts of what was left out and not yet told."""
+        """Record the counts of events that were left out since the last record of their kind."""
         with self._lock:
             counts = {kind: window.left_out for kind, window in self._windows.items() if window.left_out}
             self._windows.clear()
@@ -83,3 +84,35 @@ class Recorder:
                 return None
             window.written += 1
             return left_out
+
+
+class TroubleLog:
+    """Logs the trouble of each subject once, and again only when it changed or had ended."""
+
+    def __init__(self, logger: logging.Logger) -> None:
+        self._logger = logger
+        self._kinds: dict[str, str] = {}
+
+    def note(self, subject: str, kind: str, message: str, *args: object, level: int = logging.WARNING) -> None:
+        """Log ``message`` unless ``subject`` has trouble of this ``kind`` already; an empty kind is no trouble."""
+        if kind and kind != self._kinds.get(subject):
+            self._logger.log(level, message, *args)
+        self._kinds[subject] = kind
+
+
+class RateLimiter:
+    """Admits at most ``hz`` a second; 0 or less admits none."""
+
+    def __init__(self, hz: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._period = 1.0 / hz if hz > 0 else math.inf
+        self._clock = clock
+        self._due = -math.inf
+
+    def admit(self) -> bool:
+        """Whether the next one may go now."""
+        now = self._clock()
+        if math.isinf(self._period) or now < self._due:
+            return False
+        # Half a period from now at least: a source at just this rate loses nothing, a burst is thinned out.
+        self._due = max(self._due + self._period, now + self._period / 2)
+        return True

@@ -10,7 +10,7 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 from tests.mesh.test_repeats import Strict
 
-from strands_robots.mesh import pursuit, safety
+from strands_robots.mesh import safety
 from strands_robots.mesh.core import Mesh
 
 
@@ -58,7 +58,7 @@ def test_nobody_is_pursued_once_the_stop_was_cleared(peers: Fleet) -> None:
     peers.planes["console"].clear_local("operator")
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
-    # Longer than two rounds of the pursuit.
+    # Longer than two rounds of the safety.
     time.sleep(1.3)
     assert far.lockout_epoch is None
     assert arm.halts == []
@@ -76,8 +76,8 @@ def test_a_newcomer_is_not_pursued(peers: Fleet) -> None:
 def test_a_peer_that_is_heard_and_never_answers_is_given_up(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(pursuit, "EVERY_S", 0.05)
-    monkeypatch.setattr(pursuit, "ANSWER_S", 0.02)
+    monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
+    monkeypatch.setattr(safety, "RETRY_ANSWER_S", 0.02)
     console, ghost = peers.join(None, "console"), peers.stranger()
     heartbeat = {"robot_id": "ghost", "timestamp": peers.clock()}
     ghost.put("strands/ghost/presence", heartbeat)
@@ -89,18 +89,18 @@ def test_a_peer_that_is_heard_and_never_answers_is_given_up(
     peers.clock.pass_(1)
     ghost.put("strands/ghost/presence", {**heartbeat, "timestamp": peers.clock()})
     eventually(lambda: "is in reach and does not answer" in caplog.text)
-    assert len(asked) == pursuit.TRIES
+    assert len(asked) == safety.UNANSWERED_MAX
 
 
 def test_a_peer_that_comes_back_and_does_not_stop_is_named_once_and_asked_until_it_does(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(pursuit, "EVERY_S", 0.05)
+    monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
     _, _, arm = cut_off(peers)
     arm.stops = False
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
-    eventually(lambda: len(arm.halts) > pursuit.TRIES, what="it is asked on and on")
+    eventually(lambda: len(arm.halts) > safety.UNANSWERED_MAX, what="it is asked on and on")
     named = [line for line in caplog.records if line.levelname == "CRITICAL" and "did NOT stop" in line.getMessage()]
     assert len(named) == 1
     assert "the brake is stuck" in named[0].getMessage()
@@ -112,8 +112,8 @@ def test_a_peer_that_comes_back_and_does_not_stop_is_named_once_and_asked_until_
 def test_an_error_for_an_answer_is_no_stop(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(pursuit, "EVERY_S", 0.05)
-    monkeypatch.setattr(pursuit, "ANSWER_S", 20.0)
+    monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
+    monkeypatch.setattr(safety, "RETRY_ANSWER_S", 20.0)
     console = peers.join(None, "console")
     faulty = Strict(peers, "faulty", 0.0, first={"type": "error", "error": "dispatch error"})
     peers.bus.partition(faulty.wire)
