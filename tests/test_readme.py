@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,3 +30,21 @@ def test_every_make_target_it_names_exists() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE))
     for named in re.findall(r"`make ([a-z-]+)", README):
         assert named in targets, named
+
+
+def test_every_make_target_that_the_pipelines_run_exists() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE))
+    for pipeline in (ROOT / ".github" / "workflows" / "ci.yml", ROOT / ".ci" / "run"):
+        if pipeline.exists():  # a source archive has neither
+            named = re.findall(r"(?:^|run: )make ([a-z-]+)", pipeline.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            assert {"lint", "test", "test-all"} <= set(named) <= targets
+
+
+def test_the_pipeline_runs_every_python_that_the_package_names() -> None:
+    workflow = ROOT / ".github" / "workflows" / "ci.yml"
+    if workflow.exists():
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        named = [line.rpartition(" ")[2] for line in project["classifiers"] if "Python :: 3." in line]
+        tested = re.search(r"python: \[(.*)\]", workflow.read_text(encoding="utf-8"))
+        assert tested is not None
+        assert re.findall(r"3\.\d+", tested[1]) == named
