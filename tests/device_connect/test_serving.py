@@ -62,7 +62,7 @@ class Choosy(Driver):
 
 
 class Messaging:
-    """What a runtime needs of a client to serve commands; keeps who serves them."""
+    """A client stand-in that hands commands to the runtime and keeps its answer."""
 
     def __init__(self):
         self.serve_command = None
@@ -70,10 +70,10 @@ class Messaging:
         self.answer = None
 
     async def serve(self, _subject, serve):
-        async def called(data):
-            self.answer = await serve(jsonrpc.check(data))
+        def answered(data):
+            self.answer = data
 
-        self.serve_command, self.serving = serve, called
+        self.serve_command, self.serving = serve, lambda data: serve(jsonrpc.check(data), answered)
 
     async def subscribe(self, _subject, callback):
         self.serving = lambda data: callback(data, "reply")
@@ -143,7 +143,7 @@ async def test_callers_at_the_same_time_are_not_mixed_up():
 
     async def ask(number):
         command = jsonrpc.Command("late", number, {"_dc_meta": {"source_device": f"agent-{number}"}})
-        answers.append(json.loads(await messaging.serve_command(command)))
+        await messaging.serve_command(command, lambda data: answers.append(json.loads(data)))
 
     await asyncio.gather(*(ask(number) for number in range(20)))
     assert all(each["result"] == f"agent-{each['id']}" for each in answers)

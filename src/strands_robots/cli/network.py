@@ -139,7 +139,7 @@ def _pem(flag: str, path: Path | None, otherwise: str) -> str:
 
 
 def _endpoints(given: list[str] | None) -> tuple[str, ...]:
-    from strands_robots.device_connect.backends.endpoints import endpoints  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
 
     return endpoints([part for each in given or [] for part in each.split(",")])
 

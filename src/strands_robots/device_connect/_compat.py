@@ -22,6 +22,7 @@ from device_connect_edge.messaging.exceptions import AuthenticationError, Messag
 
 from .. import settings
 from .backends import LinkConfig, backend_for, jsonrpc
+from .backends.dispatch import Answer, send
 
 FRAMEWORK_VERSION = "0.2.5"
 
@@ -243,21 +244,23 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         functions.update({name: _quick(function) for name, function in functions.items()})
         await self.messaging.serve(f"device-connect.{self.tenant}.{self.device_id}.cmd", self._serve)
 
-    async def _serve(self, command: jsonrpc.Command) -> bytes:
-        """The framework's answer to a command, without its spans: they would be recorded for nobody."""
+    async def _serve(self, command: jsonrpc.Command, answer: Answer | None) -> None:
+        """Give the framework's answer to a command, without its spans: no exporter would receive them."""
         method, params = command.method, command.params
-        if method == "requestRegistration":
-            return jsonrpc.result(command.id, self._build_registration_params())
         source = params.pop("_dc_meta", {}).get("source_device")
-        if method not in self._driver._get_functions():
-            return jsonrpc.error(command.id, jsonrpc.METHOD_NOT_FOUND, f"Unknown method: {method}")
         if source:
             params["source_device"] = source
-        try:
-            return jsonrpc.result(command.id, await self._driver.invoke(method, **params))
-        except Exception as problem:  # noqa: BLE001 - whatever a driver raises is its answer
-            self._logger.warning("Driver function %s failed: %s", method, problem)
-            return jsonrpc.error(command.id, jsonrpc.FUNCTION_FAILED, str(problem))
+        if method == "requestRegistration":
+            reply = jsonrpc.result(command.id, self._build_registration_params())
+        elif method not in self._driver._get_functions():
+            reply = jsonrpc.error(command.id, jsonrpc.METHOD_NOT_FOUND, f"Unknown method: {method}")
+        else:
+            try:
+                reply = jsonrpc.result(command.id, await self._driver.invoke(method, **params))
+            except Exception as problem:  # noqa: BLE001 - whatever a driver raises is its answer
+                self._logger.warning("Driver function %s failed: %s", method, problem)
+                reply = jsonrpc.error(command.id, jsonrpc.FUNCTION_FAILED, str(problem))
+        await send(answer, reply)
 
     async def _heartbeat_loop(self) -> None:
         # The last thing the framework starts: from here on the device is callable and announced.

@@ -23,7 +23,7 @@ from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.backends.errors import NoResponderError
+from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from strands_robots import settings
 from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
-from strands_robots.device_connect.backends.endpoints import endpoints
+from strands_robots.device_connect.backends.config import endpoints
 from strands_robots.utils import ValidationError, choice, device_id, shown, text
 
 logger = logging.getLogger(__name__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.backends.endpoints import host_of
+from strands_robots.device_connect.backends.config import host_of
 from strands_robots.utils import ValidationError
 
 

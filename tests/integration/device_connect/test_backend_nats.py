@@ -95,7 +95,7 @@ async def test_a_device_answers_when_a_killed_server_has_come_back(server):
 async def test_nobody_at_a_subject_is_told_at_once_on_nats(server):
     async with Caller(client=await open_client(link_to(server))) as caller:
         started = asyncio.get_running_loop().time()
-        with pytest.raises(MessagingError, match="nobody answers"):
+        with pytest.raises(MessagingError, match="no device answers"):
             await caller.call("nobody", "getStatus", wait_s=60)
         assert asyncio.get_running_loop().time() - started < 30
 

@@ -75,7 +75,7 @@ import psutil
 from fixtures.echo_device import EchoDriver
 from fixtures.waiting import eventually
 from strands_robots.device_connect._compat import Runtime
-from strands_robots.device_connect.backends import LinkConfig, sessions
+from strands_robots.device_connect.backends import LinkConfig, zenoh_session
 
 link = LinkConfig(**json.loads(sys.argv[1], object_hook=lambda d: {k: tuple(v) if isinstance(v, list) else v
                                                                    for k, v in d.items()}))
@@ -90,7 +90,7 @@ async def once():
 
 def cycle():
     asyncio.run(once())
-    assert not sessions.open_links()
+    assert not zenoh_session.open_links()
 
 def used():
     return me.num_threads(), me.num_fds()
@@ -164,8 +164,8 @@ def test_a_start_that_is_given_up_never_comes_online_later():
     )
     link = {"connect": [f"tcp/127.0.0.1:{absent}"], "connect_timeout_s": 0.3}
     program = program.replace("range(20)", "range(8)").replace(
-        "    assert not sessions.open_links()\n",
-        "    eventually(lambda: not sessions.open_links())\n",
+        "    assert not zenoh_session.open_links()\n",
+        "    eventually(lambda: not zenoh_session.open_links())\n",
     )
     assert "nothing grew" in run(program, json.dumps(link))
 

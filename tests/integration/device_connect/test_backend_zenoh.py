@@ -168,7 +168,7 @@ async def test_peers_over_mutual_tls_admit_only_their_own_authority(tmp_path):
         )
         for link in intruders:
             async with Caller(client=await open_client(link)) as caller:
-                with pytest.raises(MessagingError, match="nobody answers"):
+                with pytest.raises(MessagingError, match="no device answers"):
                     await caller.call("arm-1", "getStatus", wait_s=20)
 
 

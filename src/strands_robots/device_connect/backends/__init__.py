@@ -1,8 +1,8 @@
 """A Zenoh and a NATS messaging backend for ``device_connect_edge``, wire-compatible with every bare peer and agent.
 
-What they add to the framework's own: commands are served concurrently and bounded, ``stop`` and reads never wait
-behind motion, malformed commands are answered at once, puts and replies use no thread pool, peers may speak mutual
-TLS or meet without multicast, and all runtimes of a process share one Zenoh session.
+Unlike the framework's own backends they serve commands concurrently and bounded, ``stop`` and reads never wait for
+motion, malformed commands are answered at once, puts and replies use no thread pool, peers may use mutual TLS or meet
+without multicast, and all runtimes of a process share one Zenoh session.
 
 A device::
 
@@ -24,12 +24,13 @@ A client without a device (command line, tools)::
     answer = await client.request("device-connect.default.arm-1.cmd", payload, timeout=5.0)
     await client.close()
 
-Commands that are answered by returning: ``await client.serve(subject, serve)``, where ``serve(command)`` gives the
-encoded reply (``jsonrpc.result`` or ``jsonrpc.error``); the framework's ``subscribe`` on a ``.cmd`` subject works, too.
+A client serves commands by ``await client.serve(subject, serve)``, where ``serve(command, answer)`` carries a command
+out and gives the encoded reply (``jsonrpc.result`` or ``jsonrpc.error``) to ``dispatch.send(answer, reply)``; the
+framework's ``subscribe`` on a ``.cmd`` subject works, too.
 
-Which link: ``loopback_config()`` needs nothing and stays on this machine; ``link_from_environment()`` reads the
+Links: ``loopback_config()`` needs nothing and stays on this machine; ``link_from_environment()`` reads the
 framework's own variables (``ZENOH_CONNECT``, ``NATS_URL``, ``MESSAGING_TLS_*`` ...) as the framework does;
-``LinkConfig(...)`` says everything. ``link.authenticated`` tells whether the far side is checked.
+``LinkConfig(...)`` says everything. ``link.authenticated`` is true where both sides prove their identity.
 
 A stock ``DeviceRuntime`` may use them as well: after ``register()``, ``messaging_backend="strands-zenoh"`` or
 ``"strands-nats"``; ``register(link)`` returns the name for one particular link.
@@ -43,7 +44,7 @@ from typing import TYPE_CHECKING
 from .config import LinkConfig, link_from_environment, loopback_config
 
 if TYPE_CHECKING:
-    from device_connect_edge.messaging.base import MessagingClient
+    from .base import Backend
 
 __all__ = [
     "LinkConfig",
@@ -55,27 +56,24 @@ __all__ = [
 ]
 
 
-def backend_for(link: LinkConfig, *, open_ended: bool = False) -> MessagingClient:
-    """An unconnected messaging client for ``link``.
+def backend_for(link: LinkConfig, *, open_ended: bool = False) -> Backend:
+    """Return an unconnected messaging client for ``link``.
 
     Args:
         link: what to connect to.
         open_ended: take what the link leaves open from the arguments of ``connect``, as the framework's own do.
     """
-    client: MessagingClient
     if link.transport == "nats":
         from .nats import NatsBackend  # noqa: PLC0415 - only the transport in use is loaded
 
-        client = NatsBackend(link, open_ended=open_ended)
-    else:
-        from .zenoh import ZenohBackend  # noqa: PLC0415 - only the transport in use is loaded
+        return NatsBackend(link, open_ended=open_ended)
+    from .zenoh import ZenohBackend  # noqa: PLC0415 - only the transport in use is loaded
 
-        client = ZenohBackend(link, open_ended=open_ended)
-    return client
+    return ZenohBackend(link, open_ended=open_ended)
 
 
 def register(link: LinkConfig | None = None) -> str:
-    """Make the backends known to the framework; the name to give as ``messaging_backend``.
+    """Make the backends known to the framework; return the name to give as ``messaging_backend``.
 
     Args:
         link: with it, the returned name stands for exactly this link. Without it, ``strands-zenoh`` and
@@ -95,11 +93,11 @@ def register(link: LinkConfig | None = None) -> str:
     return name
 
 
-async def open_client(link: LinkConfig) -> MessagingClient:
-    """A connected client without a device.
+async def open_client(link: LinkConfig) -> Backend:
+    """Return a connected client without a device.
 
     Raises:
-        MessagingConnectionError: the far side did not answer within ``link.connect_timeout_s``.
+        MessagingConnectionError: the other side did not answer within ``link.connect_timeout_s``.
     """
     client = backend_for(link)
     await client.connect(servers=[])

@@ -1,21 +1,26 @@
-"""What a link to Device Connect is made of: endpoints, scouting, certificates, credentials, deadlines."""
+"""Configuration of a link to Device Connect: endpoints, scouting, certificates, credentials, deadlines."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
 import json
+import re
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlparse, urlsplit
 
 from ... import settings
-from ...utils import ValidationError, choice, device_id, port
-from .endpoints import check_nats, check_zenoh, endpoints, host_of
+from ...utils import ValidationError, choice, device_id, port, shown
 
 LOOPBACK = "127.0.0.1"
+INTERNET = ("tcp", "udp", "tls", "quic", "ws")
+ZENOH_PORT = 7447
+
+_DOTTED = re.compile(r"[0-9.]+")
 
 # A peer that is stopped in a debugger costs this much per priority and link, and no more (64 KiB batches).
 QUEUED_BATCHES = 16
@@ -74,7 +79,7 @@ class LinkConfig:
         choice("mode", self.mode, ("auto", "peer", "client"))
         # A wildcard here would make one link of every tenant.
         device_id("tenant", self.tenant)
-        check = check_nats if self.transport == "nats" else check_zenoh
+        check = _check_nats if self.transport == "nats" else _check_zenoh
         for name, stated in (("connect", self.connect), ("listen", self.listen)):
             for endpoint in stated:
                 check(name, endpoint)
@@ -284,6 +289,69 @@ def link_from_environment(tenant: str = "default", transport: str | None = None)
         cert=tls["cert"],
         key=tls["key"],
     )
+
+
+def endpoints(servers: Sequence[str]) -> tuple[str, ...]:
+    """Return Zenoh endpoints for URLs in any of the framework's spellings; ``zenoh://`` alone means none."""
+    found = []
+    for server in (each.strip() for each in servers):
+        scheme, _, rest = server.partition("://")
+        if rest and scheme in ("zenoh", "zenoh+tls"):
+            url = urlparse(server)
+            found.append(f"{'tls' if scheme.endswith('tls') else 'tcp'}/{url.hostname}:{url.port or ZENOH_PORT}")
+        elif server and "://" not in server:
+            found.append(server if "/" in server else f"tcp/{server}")
+        elif rest:
+            found.append(server)
+    return tuple(found)
+
+
+def host_of(endpoint: str) -> str:
+    """Return the host that an endpoint names, without brackets, credentials and port."""
+    address = endpoint.partition("://")[2] or endpoint.partition("/")[2]
+    return address.rpartition("@")[2].rpartition(":")[0].strip("[]")
+
+
+def _check_zenoh(name: str, endpoint: str) -> None:
+    """Refuse an endpoint that no attempt could reach: ``tcp/host:port`` is the form; serial and sockets pass.
+
+    Raises:
+        ValidationError: naming ``name``, the value and the domain.
+    """
+    scheme, slash, rest = endpoint.partition("/")
+    if slash and scheme not in INTERNET:
+        return
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    host, colon, number = address.rpartition(":")
+    if not (slash and colon and _is_host(host) and number.isascii() and number.isdigit() and int(number) <= 65535):
+        raise ValidationError(f"{name} must be like tcp/host:port or tls/host:port, not {shown(endpoint)}.")
+
+
+def _check_nats(name: str, url: str) -> None:
+    """Refuse a URL that no attempt could reach: ``nats://host:port`` is the form; the port may be left out.
+
+    Raises:
+        ValidationError: naming ``name``, the value and the domain.
+    """
+    try:
+        parts = urlsplit(url if "://" in url else f"nats://{url}")
+        good = parts.scheme in ("nats", "tls", "ws", "wss") and _is_host(parts.hostname or "") and parts.port != 0
+    except ValueError:  # the port is no number
+        good = False
+    if not good:
+        # A URL may carry a password, which must not reach a log.
+        raise ValidationError(f"{name} must be like nats://host:port or tls://host:port, not {shown(_safe(url))}.")
+
+
+def _is_host(host: str) -> bool:
+    if _DOTTED.fullmatch(host):
+        octets = host.split(".")
+        return len(octets) == 4 and all(octet and int(octet) <= 255 for octet in octets)
+    return bool(host) and not re.search(r"[\s/]", host)
+
+
+def _safe(url: str) -> str:
+    return re.sub(r"//[^@/]*@", "//***@", url)
 
 
 def _first_set(*names: str) -> tuple[str, ...]:

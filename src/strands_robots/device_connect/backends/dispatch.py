@@ -1,20 +1,27 @@
 """From a transport's thread to handlers on an event loop: commands side by side, events in order.
 
-Nothing here knows a transport. All queues are bounded, and a flood costs one log line a second.
+This module knows no transport. All queues are bounded, and a flood costs one log line a second.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import contextvars
+import itertools
 import logging
+import math
+import sys
 import threading
 import time
+
+# Documented under "Extending asyncio": how a task says that it is the one that runs.
+from asyncio.tasks import _enter_task, _leave_task
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine, Generator
+from functools import partial
 from typing import Any
 
-from . import eager, jsonrpc
+from . import jsonrpc
 
 logger = logging.getLogger(__name__)
 
@@ -22,7 +29,7 @@ MAX_COMMANDS = 256
 """Commands of one device that run at once; the next is answered 'busy'."""
 
 RESERVED_COMMANDS = 64
-"""Room besides, for ``stop`` and reads alone, so that they are never behind motion."""
+"""Capacity besides, for ``stop`` and reads alone, so that they never wait for motion."""
 
 MAX_EVENTS = 65_536
 """Messages of one subscription that wait for its handler; the oldest is dropped for the next."""
@@ -36,19 +43,20 @@ MAX_ARRIVED = 4_096
 # One turn of the loop serves this many messages, then timers and sockets have their turn.
 DRAIN_AT_ONCE = 256
 
+REPLY_SUBJECT = "_strands_reply/"
+"""Start of the subjects on which handlers publish their replies."""
+
 Handler = Callable[[bytes, str | None], Awaitable[None]]
 """The framework's: gets a message, and the subject to publish its reply to."""
 
-Serve = Callable[[jsonrpc.Command], Awaitable[bytes]]
-"""Carries a command out and gives the encoded reply."""
+Answer = Callable[[bytes], Awaitable[None] | None]
+"""Sends an encoded reply to one caller; what it returns, if anything, is awaited."""
 
-Relay = Callable[[bytes, Any, jsonrpc.Command], Awaitable[bytes | None]]
-"""Hands a command on, as it came, to somebody who replies; the reply that is still owed afterwards, if any."""
+Serve = Callable[[jsonrpc.Command, Answer | None], Coroutine[Any, Any, None]]
+"""Carries a command out and answers it; there is no answer where no caller waits for one."""
 
-
-def never_behind_motion(method: str) -> bool:
-    """True for stops and reads, which find room when motion has filled the rest."""
-    return method.startswith(("stop", "get", "list", "describe")) or method in ("emergencyStop", "requestRegistration")
+CallSoon = Callable[[Callable[[], None]], object]
+"""Has a function called on the loop soon."""
 
 
 class Throttled:
@@ -61,7 +69,7 @@ class Throttled:
         self._left_out = 0
 
     def warning(self, message: str, *args: object) -> None:
-        """One warning, or a count until one is due."""
+        """Log one warning, or count it until one is due."""
         now = time.monotonic()
         if now < self._next:
             self._left_out += 1
@@ -71,157 +79,223 @@ class Throttled:
         self._log.warning(message + "%s", *args, more)
 
 
-class Inbox:
-    """Calls from any thread, made on the loop in their order. One wake-up serves all that came meanwhile."""
+class Backlog:
+    """A bounded queue from any thread to one loop; one wake-up serves all that arrives meanwhile.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self._calls: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
+    Args:
+        wake: called by the thread that puts the first message of a batch.
+        messages, size: how many messages, and how many bytes of them, may wait.
+    """
+
+    def __init__(self, wake: Callable[[], object], messages: float = math.inf, size: float = math.inf) -> None:
+        self._wake = wake
+        self._messages, self._size = messages, size
+        self._waiting: deque[tuple[Any, int]] = deque()
+        self._bytes = 0
         self._awake = False
+        self._lock = threading.Lock()
 
-    def put(self, function: Callable[..., None], *args: Any) -> None:
-        """Have ``function(*args)`` called on the loop soon."""
-        self._calls.append((function, args))
-        if not self._awake:
-            self._awake = True
-            # A loop that is closed has nobody left to tell.
-            with contextlib.suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._drain)
+    def offer(self, message: Any, size: int = 0) -> bool:
+        """Add a message of ``size`` bytes; False where it has no room."""
+        with self._lock:
+            if len(self._waiting) >= self._messages or self._bytes + size > self._size:
+                return False
+            asleep = self._add(message, size)
+        if asleep:
+            self._wake()
+        return True
 
-    def _drain(self) -> None:
-        # Lowered before the first call is taken: whoever comes from here on wakes the loop again.
-        self._awake = False
-        for _ in range(DRAIN_AT_ONCE):
-            try:
-                function, args = self._calls.popleft()
-            except IndexError:
-                return
-            function(*args)
-        if self._calls and not self._awake:
-            self._awake = True
-            self._loop.call_soon(self._drain)
+    def push(self, message: Any, size: int = 0) -> int:
+        """Add a message in place of the oldest ones where it has no room; the number of those."""
+        dropped = 0
+        with self._lock:
+            asleep = self._add(message, size)
+            while len(self._waiting) > self._messages or (self._bytes > self._size and len(self._waiting) > 1):
+                self._bytes -= self._waiting.popleft()[1]
+                dropped += 1
+        if asleep:
+            self._wake()
+        return dropped
+
+    def take(self) -> Any:
+        """Remove and return the oldest message; None, and a wake-up for the next one, when there is none."""
+        with self._lock:
+            if not self._waiting:
+                self._awake = False
+                return None
+            message, size = self._waiting.popleft()
+            self._bytes -= size
+            return message
+
+    def _add(self, message: Any, size: int) -> bool:
+        self._waiting.append((message, size))
+        self._bytes += size
+        asleep, self._awake = not self._awake, True
+        return asleep
 
 
-class CommandDesk:
+class CommandServer:
     """Serves one device's commands, each in a task of its own, so that none waits for another.
 
     Args:
         subject: for the log.
-        relay: carries a command out.
-        answer: sends an encoded reply to whoever waits for it; what it returns, if anything, is awaited.
+        serve: carries a command out and answers it.
+        read: splits a transport's message into its bytes (or their number, where a command may not have so many) and
+            the place its reply goes to, None where no caller waits.
+        answer: sends an encoded reply there. What it returns has to be awaited on the loop; a short reply that is
+            sent from another thread returns nothing.
+        call_soon: has a function called on the loop; from any thread.
     """
 
-    def __init__(self, subject: str, relay: Relay, answer: Callable[[Any, bytes], Awaitable[None] | None]) -> None:
+    def __init__(
+        self,
+        subject: str,
+        serve: Serve,
+        read: Callable[[Any], tuple[bytes | int, Any]],
+        answer: Callable[[Any, bytes], Awaitable[None] | None],
+        call_soon: CallSoon,
+    ) -> None:
         self._subject = subject
-        self._relay = relay
+        self._serve = serve
+        self._read = read
         self._answer = answer
-        self._tasks: set[asyncio.Future[None]] = set()
-        self._refusals: set[asyncio.Future[None]] = set()
+        self._wake = partial(call_soon, self._drain)
+        self._backlog = Backlog(self._wake, MAX_ARRIVED, MAX_WAITING_BYTES)
+        self._running: set[asyncio.Future[None]] = set()
+        self._sending: set[asyncio.Future[None]] = set()
         self._log = Throttled(logger)
+        self._closed = False
 
-    def accept(self, data: bytes, reply: Any) -> None:
-        """Start a command or refuse it at once. On the loop's thread.
+    def receive(self, message: Any) -> None:
+        """Take a message for the loop, or answer 'busy' while the loop is held up. On the receiving thread."""
+        data, reply = self._read(message)
+        size = 0 if isinstance(data, int) else len(data)
+        if not self._backlog.offer((data, reply), size) and reply is not None:
+            self._send(reply, jsonrpc.error(None, jsonrpc.BUSY, "busy: the device's loop is held up"))
 
-        Args:
-            data: the command as it came.
-            reply: where the answer goes; None where nobody waits for one.
-        """
-        found = jsonrpc.check(data)
-        if isinstance(found, jsonrpc.Command):
-            running = len(self._tasks)
-            if running < MAX_COMMANDS or (
-                running < MAX_COMMANDS + RESERVED_COMMANDS and never_behind_motion(found.method)
-            ):
-                _track(eager.start(self._serve(data, reply, found)), self._tasks)
+    def _drain(self) -> None:
+        """Start the commands that arrived, or refuse them. On the loop."""
+        for _ in range(DRAIN_AT_ONCE):
+            arrived = self._backlog.take()
+            if arrived is None or self._closed:
                 return
-            found = jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {running} commands are running", found.id)
-        self.refuse(found, reply)
-
-    def refuse(self, refusal: jsonrpc.Refusal, reply: Any) -> None:
-        """Answer a message that is no command, when somebody waits for an answer, and log it."""
-        self._log.warning("refused a message on %s: %d %s", self._subject, refusal.code, refusal.reason)
-        if reply is not None:
-            sending = self._answer(reply, refusal.encoded())
-            if sending is not None:
-                _track(asyncio.ensure_future(sending), self._refusals)
+            data, reply = arrived
+            command = self._admitted(data)
+            if isinstance(command, jsonrpc.Refusal):
+                self._log.warning("refused a message on %s: %d %s", self._subject, command.code, command.reason)
+                if reply is not None:
+                    self._send(reply, command.encoded())
+                continue
+            task = start_now(self._serve(command, None if reply is None else partial(self._answer, reply)))
+            self._running.add(task)
+            task.add_done_callback(partial(self._finished, command, reply))
+        self._wake()
 
     async def close(self) -> None:
-        """Cancel what runs and wait for it."""
-        tasks = [task for task in self._tasks | self._refusals if task is not asyncio.current_task()]
+        """Cancel what runs and wait for it; commands that still wait are dropped."""
+        self._closed = True
+        tasks = [task for task in self._running | self._sending if task is not asyncio.current_task()]
         for task in tasks:
             task.cancel()
         if tasks:
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _serve(self, data: bytes, reply: Any, command: jsonrpc.Command) -> None:
+    def _admitted(self, data: bytes | int) -> jsonrpc.Command | jsonrpc.Refusal:
+        command = jsonrpc.too_large(data) if isinstance(data, int) else jsonrpc.check(data)
+        running = len(self._running)
+        if running < MAX_COMMANDS or isinstance(command, jsonrpc.Refusal):
+            return command
+        if running < MAX_COMMANDS + RESERVED_COMMANDS and reserved(command.method):
+            return command
+        return jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {running} commands are running", command.id)
+
+    def _finished(self, command: jsonrpc.Command, reply: Any, task: asyncio.Future[None]) -> None:
+        self._running.discard(task)
+        problem = None if task.cancelled() else task.exception()
+        if problem is not None:
+            # ``serve`` answers its own failures; any other one must still not leave a caller waiting.
+            logger.error("the handler of %s failed", self._subject, exc_info=problem)
+            if reply is not None:
+                self._send(reply, _failure(command, problem))
+
+    def _send(self, reply: Any, data: bytes) -> None:
+        sending = self._answer(reply, data)
+        if sending is not None:
+            task = asyncio.ensure_future(sending)
+            self._sending.add(task)
+            task.add_done_callback(self._sending.discard)
+
+
+class PendingReplies:
+    """Replies that handlers owe, by the subject on which they publish them."""
+
+    def __init__(self) -> None:
+        self._answers: dict[str, tuple[Answer, float]] = {}
+        self._numbers = itertools.count()
+        self._lock = threading.Lock()
+
+    @property
+    def full(self) -> bool:
+        """True while so many replies are owed that no further one should be."""
+        return len(self._answers) >= MAX_ARRIVED
+
+    def expect(self, answer: Answer, within_s: float = math.inf) -> str:
+        """Remember how to answer a caller, for ``within_s`` seconds; the subject that stands for it. Any thread."""
+        subject, now = f"{REPLY_SUBJECT}{next(self._numbers)}", time.monotonic()
+        with self._lock:
+            if within_s < math.inf:
+                for old in [each for each, (_, until) in self._answers.items() if until < now]:
+                    del self._answers[old]
+            self._answers[subject] = answer, now + within_s
+        return subject
+
+    def take(self, subject: str) -> Answer | None:
+        """Remove and return what :meth:`expect` remembered; None when it was answered or given up."""
+        with self._lock:
+            return self._answers.pop(subject, (None, 0.0))[0]
+
+    def clear(self) -> None:
+        """Give up all callers."""
+        with self._lock:
+            self._answers.clear()
+
+
+def relaying(handler: Handler, replies: PendingReplies) -> Serve:
+    """Serve commands by a handler that publishes its reply; the caller is answered even when it does not."""
+
+    async def relay(command: jsonrpc.Command, answer: Answer | None) -> None:
+        if answer is None:
+            await handler(command.data, None)
+            return
+        subject, failure = replies.expect(answer), _failure(command, None)
         try:
-            answer = await self._relay(data, reply, command)
-        except Exception as problem:
-            # Whoever serves catches what is its own; what comes here must still not leave a caller waiting.
-            logger.exception("the handler of %s failed", self._subject)
-            answer = jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, f"{type(problem).__name__} in the device")
-        if reply is not None and answer is not None:
-            sending = self._answer(reply, answer)
-            if sending is not None:
-                await sending
-
-
-def serving(serve: Serve) -> Relay:
-    """A relay to somebody who gives the reply."""
-
-    return lambda _data, _reply, command: serve(command)
-
-
-def relaying(handler: Handler, keep: Callable[[Any], str], owed: Callable[[str], bool]) -> Relay:
-    """A relay to a handler that publishes its reply.
-
-    Args:
-        handler: gets the command as it came, and the subject to reply to.
-        keep: the subject for a caller who waits.
-        owed: forgets a subject; True when nothing was published on it.
-    """
-
-    async def relay(data: bytes, reply: Any, command: jsonrpc.Command) -> bytes | None:
-        if reply is None:
-            await handler(data, None)
-            return None
-        subject, reason, unanswered = keep(reply), "the device gave no answer", False
-        try:
-            await handler(data, subject)
+            await handler(command.data, subject)
         except Exception as problem:
             logger.exception("a handler of commands failed")
-            reason = f"{type(problem).__name__} in the device"
+            failure = _failure(command, problem)
         finally:
-            unanswered = owed(subject)
-        return jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, reason) if unanswered else None
+            unanswered = replies.take(subject) is not None
+        if unanswered:
+            await send(answer, failure)
 
     return relay
 
 
-def _track(task: asyncio.Future[None], among: set[asyncio.Future[None]]) -> None:
-    among.add(task)
-    task.add_done_callback(among.discard)
+async def send(answer: Answer | None, data: bytes) -> None:
+    """Send a reply where a caller waits for one."""
+    sending = None if answer is None else answer(data)
+    if sending is not None:
+        await sending
 
 
-class Room:
-    """How many messages, and how many bytes, may be on their way from a transport's thread to the loop."""
+def reserved(method: str) -> bool:
+    """Return True for stops and reads, which still have capacity when motion has filled the rest."""
+    return method.startswith(("stop", "get", "list", "describe")) or method in ("emergencyStop", "requestRegistration")
 
-    def __init__(self, messages: int = MAX_ARRIVED, size: int = MAX_WAITING_BYTES) -> None:
-        self._messages, self._size = messages, size
-        self._lock = threading.Lock()
 
-    def take(self, size: int) -> bool:
-        """Room for a message of ``size`` bytes, if there is any; from any thread."""
-        with self._lock:
-            if self._messages < 1 or self._size < size:
-                return False
-            self._messages, self._size = self._messages - 1, self._size - size
-            return True
-
-    def give_back(self, size: int) -> None:
-        """The message has arrived."""
-        with self._lock:
-            self._messages, self._size = self._messages + 1, self._size + size
+def _failure(command: jsonrpc.Command, problem: BaseException | None) -> bytes:
+    reason = "the device gave no answer" if problem is None else f"{type(problem).__name__} in the device"
+    return jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, reason)
 
 
 class OrderedFeed:
@@ -230,44 +304,21 @@ class OrderedFeed:
     Args:
         subject: for the log.
         handler: called with what ``accept`` was given.
-        hand_over: calls a function on the feed's loop; ``accept`` may then be called from any thread.
+        call_soon: has a function called on the feed's loop; ``accept`` may be called from the threads that it may.
     """
 
-    def __init__(
-        self,
-        subject: str,
-        handler: Callable[..., Awaitable[None]],
-        hand_over: Callable[[Callable[[], None]], None] | None = None,
-    ) -> None:
+    def __init__(self, subject: str, handler: Callable[..., Awaitable[None]], call_soon: CallSoon) -> None:
         self._subject = subject
         self._handler = handler
-        self._hand_over = hand_over
-        self._waiting: deque[tuple[Any, ...]] = deque()
-        self._bytes = 0
-        self._lock = threading.Lock()
-        self._told = False
         self._arrived = asyncio.Event()
+        self._backlog = Backlog(partial(call_soon, self._arrived.set), MAX_EVENTS, MAX_WAITING_BYTES)
         self._log = Throttled(logger)
         self._task = asyncio.ensure_future(self._work())
 
     def accept(self, *message: Any) -> None:
         """Take a message, whose bytes come first, for the handler."""
-        with self._lock:
-            self._waiting.append(message)
-            self._bytes += len(message[0])
-            late = 0
-            while len(self._waiting) > MAX_EVENTS or (self._bytes > MAX_WAITING_BYTES and len(self._waiting) > 1):
-                self._bytes -= len(self._waiting.popleft()[0])
-                late += 1
-            told, self._told = self._told, True
-        if late:
+        if self._backlog.push(message, len(message[0])):
             self._log.warning("the handler of %s does not keep up; dropped the oldest messages", self._subject)
-        if told:
-            return
-        if self._hand_over is None:
-            self._arrived.set()
-        else:
-            self._hand_over(self._arrived.set)
 
     async def close(self) -> None:
         """Stop serving; what still waits is dropped."""
@@ -275,21 +326,12 @@ class OrderedFeed:
         if self._task is not asyncio.current_task():
             await asyncio.gather(self._task, return_exceptions=True)
 
-    def _next(self) -> tuple[Any, ...] | None:
-        with self._lock:
-            if not self._waiting:
-                self._told = False
-                return None
-            message = self._waiting.popleft()
-            self._bytes -= len(message[0])
-            return message
-
     async def _work(self) -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()
             served = 0
-            while (message := self._next()) is not None:
+            while (message := self._backlog.take()) is not None:
                 try:
                     await self._handler(*message)
                 except Exception:
@@ -297,3 +339,94 @@ class OrderedFeed:
                 served += 1
                 if served % DRAIN_AT_ONCE == 0:
                     await asyncio.sleep(0)
+
+
+async def on_a_thread(function: Callable[[], Any], undo: Callable[[Any], None] | None = None) -> Any:
+    """Await ``function()`` on a thread of its own, for the rare calls that wait; a loop's pool would keep its threads.
+
+    When the caller is cancelled meanwhile, a result is handed to ``undo``.
+    """
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[Any] = loop.create_future()
+
+    def settle(result: Any, error: BaseException | None) -> None:
+        if future.done():
+            if undo is not None and error is None:
+                threading.Thread(target=undo, args=(result,), daemon=True).start()
+        elif error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(result)
+
+    def work() -> None:
+        result, error = None, None
+        try:
+            result = function()
+        except BaseException as problem:  # noqa: BLE001 - raised again where the call is awaited
+            error = problem
+        try:
+            loop.call_soon_threadsafe(settle, result, error)
+        except RuntimeError:  # the loop was closed while this thread waited
+            if undo is not None and error is None:
+                undo(result)
+
+    threading.Thread(target=work, name="strands-zenoh-call", daemon=True).start()
+    return await future
+
+
+def start_now(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    """Start a task whose first step runs at once instead of in the loop's next turn.
+
+    Inside another task it begins in the next turn, as any task does.
+    """
+    loop = asyncio.get_running_loop()
+    if asyncio.current_task(loop) is not None:
+        return loop.create_task(work)
+    if sys.version_info >= (3, 12):
+        return asyncio.Task(work, loop=loop, eager_start=True)
+    context = contextvars.copy_context()
+    started = _Started(work)
+    task = loop.create_task(started, context=context)
+    _enter_task(loop, task)
+    try:
+        started.first = context.run(work.send, None), None
+    except BaseException as end:  # noqa: BLE001 - raised again where the task takes this step
+        started.first = None, end
+    finally:
+        _leave_task(loop, task)
+    return task
+
+
+class _Started(Coroutine[Any, Any, None]):
+    """A coroutine that has taken its first step; a task that steps it first gets that step's outcome."""
+
+    __slots__ = ("_work", "first")
+
+    def __init__(self, work: Coroutine[Any, Any, None]) -> None:
+        self._work = work
+        self.first: tuple[Any, BaseException | None] | None = None
+
+    def send(self, value: Any, /) -> Any:
+        """Give the outcome of the first step, then take the next ones."""
+        if self.first is None:
+            return self._work.send(value)
+        (waits_for, end), self.first = self.first, None
+        if end is not None:
+            raise end
+        return waits_for
+
+    def throw(self, *error: Any) -> Any:
+        """Raise inside the coroutine; a task that is cancelled before its first step cancels what it waits for."""
+        (waits_for, end), self.first = self.first or (None, None), None
+        if end is not None:
+            raise end
+        if isinstance(waits_for, asyncio.Future):
+            waits_for.cancel()
+        return self._work.throw(*error)
+
+    def close(self) -> None:
+        """End the coroutine at its present step."""
+        self._work.close()
+
+    def __await__(self) -> Generator[Any, Any, None]:
+        raise TypeError("only a task drives this")

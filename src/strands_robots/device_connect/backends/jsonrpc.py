@@ -1,4 +1,4 @@
-"""Is this a JSON-RPC 2.0 command, and if not, which answer is owed?
+"""JSON-RPC 2.0 on a device's command topic: check a message, encode its answer.
 
 Codes are those of the JSON-RPC 2.0 specification, section 5.1; -32000 to -32099 are free for servers.
 """
@@ -37,16 +37,17 @@ RpcId = str | int | float | None
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A well-formed command, parsed."""
+    """A well-formed command, parsed; ``data`` is the message it came as."""
 
     method: str
     id: RpcId
     params: dict[str, Any] = field(default_factory=dict)
+    data: bytes = field(default=b"", compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a message is no command: the JSON-RPC error it is owed."""
+    """The JSON-RPC error that a message is owed which is no command, and the reason."""
 
     code: int
     reason: str
@@ -68,17 +69,21 @@ def result(rpc_id: RpcId, value: object) -> bytes:
     Raises:
         TypeError, ValueError: the value has no JSON at all.
     """
-    encoded = json.dumps({"jsonrpc": "2.0", "id": rpc_id, "result": value}).encode()
-    return encoded if valid_json(encoded) else no_number(rpc_id)
+    return sendable(json.dumps({"jsonrpc": "2.0", "id": rpc_id, "result": value}).encode())
 
 
-def no_number(rpc_id: RpcId) -> bytes:
-    """The error that stands for a result with NaN or Infinity in it."""
-    return error(rpc_id, INTERNAL_ERROR, "the result holds NaN or Infinity, which JSON cannot carry")
+def sendable(reply: bytes, size_max: int | None = None) -> bytes:
+    """Return ``reply``, or the error that stands for one too large or with NaN or Infinity in it."""
+    if size_max is not None and len(reply) > size_max:
+        reason = f"the result has {len(reply)} bytes and the NATS server takes at most {size_max}"
+        return error(_id_of(reply), INTERNAL_ERROR, reason)
+    if not valid_json(reply):
+        return error(_id_of(reply), INTERNAL_ERROR, "the result holds NaN or Infinity, which JSON cannot carry")
+    return reply
 
 
 def check(data: bytes) -> Command | Refusal:
-    """What ``data`` is: a command, or the refusal it is owed. Never raises."""
+    """Parse ``data``: a command, or the refusal it is owed. Never raises."""
     if len(data) > MAX_COMMAND_BYTES:
         return too_large(len(data))
     try:
@@ -89,11 +94,11 @@ def check(data: bytes) -> Command | Refusal:
         return Refusal(INVALID_REQUEST, f"a command is a JSON object, not {_kind(request)}")
     if data.count(b"[") + data.count(b"{") > MAX_DEPTH and _deeper_than(request, MAX_DEPTH):
         return Refusal(INVALID_REQUEST, f"nested deeper than {MAX_DEPTH}")
-    return _check_request(request)
+    return _check_request(request, data)
 
 
 def too_large(size: int) -> Refusal:
-    """The refusal for a command of ``size`` bytes, whose id nobody has read."""
+    """The refusal for a command of ``size`` bytes, which was not parsed."""
     return Refusal(INVALID_REQUEST, f"a command has at most {MAX_COMMAND_BYTES} bytes, not {size}")
 
 
@@ -108,16 +113,16 @@ def valid_json(data: bytes) -> bool:
     return True
 
 
-def id_of(data: bytes) -> RpcId:
-    """The id of an encoded reply, as far as it can be read."""
+def _id_of(data: bytes) -> RpcId:
+    """The id of an encoded reply, as far as it is readable."""
     try:
-        found = json.loads(data).get("id")
+        rpc_id = json.loads(data).get("id")
     except (ValueError, RecursionError, AttributeError):
         return None
-    return found if isinstance(found, str | int | float) else None
+    return rpc_id if isinstance(rpc_id, str | int | float) else None
 
 
-def _check_request(request: dict[str, Any]) -> Command | Refusal:
+def _check_request(request: dict[str, Any], data: bytes) -> Command | Refusal:
     if "id" not in request:
         return Refusal(INVALID_REQUEST, "id is missing")
     rpc_id = request["id"]
@@ -132,7 +137,7 @@ def _check_request(request: dict[str, Any]) -> Command | Refusal:
         return Refusal(INVALID_REQUEST, f"method must be a name, not {shown(method)}", rpc_id)
     params = request.get("params", {})
     problem = _params_problem(params)
-    return Refusal(INVALID_PARAMS, problem, rpc_id) if problem else Command(method, rpc_id, params)
+    return Refusal(INVALID_PARAMS, problem, rpc_id) if problem else Command(method, rpc_id, params, data)
 
 
 def _params_problem(params: object) -> str:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import nats.errors
-from device_connect_edge.messaging.base import MessagingClient, Subscription
 from device_connect_edge.messaging.exceptions import (
     AuthenticationError,
     MessagingConnectionError,
@@ -29,12 +28,11 @@ from device_connect_edge.messaging.exceptions import (
 )
 from nats.aio.client import Client
 from nats.aio.msg import Msg
-from nats.aio.subscription import Subscription as NatsSubscription
 
 from . import jsonrpc
+from .base import Backend, NoResponderError, Undo
 from .config import LinkConfig
-from .dispatch import CommandDesk, OrderedFeed, Serve, Throttled, relaying, serving
-from .errors import NoResponderError
+from .dispatch import REPLY_SUBJECT, CommandServer, OrderedFeed, Throttled
 
 logger = logging.getLogger(__name__)
 
@@ -44,22 +42,14 @@ RECONNECT_WAIT_S = 0.5
 DEFAULT_URL = "nats://127.0.0.1:4222"
 
 
-class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has no type information
-    """A messaging client on a NATS connection; ``open_ended`` takes what the link leaves open from ``connect``."""
+class NatsBackend(Backend):
+    """A messaging client on a NATS connection."""
 
     def __init__(self, link: LinkConfig, *, open_ended: bool = False) -> None:
-        self._link = link
-        self._open_ended = open_ended
+        super().__init__(link, open_ended=open_ended)
         self._client = Client()
         self._closing = False
-        self._desks: set[_NatsSubscription] = set()
-        self._unanswered: set[str] = set()
         self._log = Throttled(logger)
-
-    @property
-    def link(self) -> LinkConfig:
-        """The link as it is used, with what ``connect`` was given filled in."""
-        return self._link
 
     async def connect(
         self,
@@ -76,7 +66,7 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
             AuthenticationError: the server refuses the credentials.
             MessagingConnectionError: no server answered within the link's ``connect_timeout_s``.
         """
-        self._link = link = self._link.filled(servers, credentials, tls_config) if self._open_ended else self._link
+        link = self._fill_link(servers, credentials, tls_config)
         options: dict[str, Any] = {}
         if link.jwt:
             options["user_jwt_cb"] = lambda: bytearray(link.jwt.encode())
@@ -95,8 +85,8 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
             "connect_timeout": link.connect_timeout_s,
             "reconnect_time_wait": RECONNECT_WAIT_S,
             "max_reconnect_attempts": -1,
-            "disconnected_cb": partial(self._tell, "lost", disconnect_cb),
-            "reconnected_cb": partial(self._tell, "is back", reconnect_cb),
+            "disconnected_cb": partial(self._report_link, "lost", disconnect_cb),
+            "reconnected_cb": partial(self._report_link, "is back", reconnect_cb),
             "error_cb": on_error,
         }
         where = ", ".join(link.connect) or DEFAULT_URL
@@ -105,8 +95,8 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
                 await self._client.connect(**options)
         except (TimeoutError, OSError, nats.errors.Error) as error:
             await self._abandon()
-            said = [*failed, *refused]
-            reason = said[-1] if said else str(error) or f"no answer within {link.connect_timeout_s:g} s"
+            reasons = [*failed, *refused]
+            reason = reasons[-1] if reasons else str(error) or f"no answer within {link.connect_timeout_s:g} s"
             kind = AuthenticationError if "authorization" in reason.lower() else MessagingConnectionError
             raise kind(f"no NATS connection to {where}: {reason}") from error
         except asyncio.CancelledError:
@@ -118,11 +108,12 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
 
         Raises:
             NotConnectedError: no server at this moment; nothing is kept for later, when it would be stale.
-            PublishError: the server would refuse it: too large, or a bad subject.
+            PublishError: the server would refuse it: too large, or a bad subject; or the caller no longer waits for
+                this reply.
         """
-        if subject in self._unanswered:
-            self._unanswered.discard(subject)
-            data = self._fit_to_send(data)
+        if subject.startswith(REPLY_SUBJECT):
+            await self._publish_reply(subject, data)
+            return
         if not self._client.is_connected:
             raise NotConnectedError("not connected to NATS")
         if len(data) > self._client.max_payload:
@@ -134,54 +125,12 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
         except nats.errors.Error as error:
             raise PublishError(f"cannot publish on {subject}: {error}") from error
 
-    async def subscribe(
-        self,
-        subject: str,
-        callback: Callable[[bytes, str | None], Awaitable[None]],
-        queue: str | None = None,
-        subscribe_only: bool = False,
-    ) -> Subscription:
-        """Have ``callback(data, reply_subject)`` called; one subject ending in ``.cmd`` is served concurrently.
-
-        Raises:
-            NotConnectedError: no server at this moment.
-            SubscribeError: the subject is none.
-        """
-        if subject.endswith(".cmd") and not subscribe_only:
-            desk = CommandDesk(subject, relaying(callback, self._await_reply, self._owed), self._answer)
-            return await self._declare(subject, queue, lambda msg: desk.accept(msg.data, msg.reply or None), desk)
-        feed = OrderedFeed(subject, callback)
-        return await self._declare(subject, queue, lambda msg: feed.accept(msg.data, msg.reply or None), feed)
-
-    async def serve(self, subject: str, serve: Serve) -> Subscription:
-        """Have every command on ``subject`` carried out by ``serve``, concurrently, and its reply sent.
-
-        Raises:
-            NotConnectedError: no server at this moment.
-            SubscribeError: the subject is none.
-        """
-        desk = CommandDesk(subject, serving(serve), self._answer)
-        return await self._declare(subject, None, lambda msg: desk.accept(msg.data, msg.reply or None), desk)
-
-    async def subscribe_with_subject(
-        self,
-        subject: str,
-        callback: Callable[[bytes, str, str | None], Awaitable[None]],
-        queue: str | None = None,
-        subscribe_only: bool = False,
-    ) -> Subscription:
-        """``subscribe`` whose callback also gets the subject that matched: ``callback(data, subject, reply)``."""
-        feed = OrderedFeed(subject, callback)
-        return await self._declare(
-            subject, queue, lambda msg: feed.accept(msg.data, msg.subject, msg.reply or None), feed
-        )
-
     async def request(self, subject: str, data: bytes, timeout: float = 5.0) -> bytes:  # noqa: ASYNC109 - the framework's signature
-        """The first reply to ``data``.
+        """Return the first reply to ``data``.
 
         Raises:
-            NoResponderError: nobody serves ``subject``.
-            RequestTimeoutError: somebody does, but gave no reply within ``timeout`` seconds.
+            NoResponderError: no device serves ``subject``.
+            RequestTimeoutError: a device does, but gave no reply within ``timeout`` seconds.
             PublishError: the server would refuse the request.
             NotConnectedError: no server at this moment.
         """
@@ -190,7 +139,7 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
         try:
             answer = await self._client.request(subject, data, timeout=timeout)
         except nats.errors.NoRespondersError as error:
-            raise NoResponderError(f"nobody answers on {subject}") from error
+            raise NoResponderError(f"no device answers on {subject}") from error
         except (nats.errors.TimeoutError, TimeoutError) as error:
             raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
         except nats.errors.Error as error:
@@ -206,8 +155,7 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
     async def close(self) -> None:
         """Unsubscribe, send what is pending, and close."""
         self._closing = True
-        for subscription in tuple(self._desks):
-            await subscription.unsubscribe()
+        await self._unsubscribe_all()
         if self._client.is_connected:
             await self.flush()
         # A client that was never connected has nothing to close, and nats-py trips over it.
@@ -228,50 +176,44 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
         self,
         subject: str,
         queue: str | None,
-        accept: Callable[[Msg], None],
-        served_by: CommandDesk | OrderedFeed,
-    ) -> Subscription:
+        consumer: CommandServer | OrderedFeed,
+        *,
+        answers: bool = True,
+        with_subject: bool = False,
+    ) -> Undo:
         async def on_message(message: Msg) -> None:
-            accept(message)
+            if isinstance(consumer, CommandServer):
+                consumer.receive(message)
+            else:
+                matched = (message.subject,) if with_subject else ()
+                consumer.accept(message.data, *matched, message.reply or None)
 
         if not self._client.is_connected:
-            await served_by.close()
             raise NotConnectedError("not connected to NATS")
         try:
-            inner = await self._client.subscribe(subject, queue=queue or "", cb=on_message)
+            subscription = await self._client.subscribe(subject, queue=queue or "", cb=on_message)
         except nats.errors.Error as error:
-            await served_by.close()
             raise SubscribeError(f"cannot subscribe to {subject}: {error}") from error
-        subscription = _NatsSubscription(inner, served_by, self._desks.discard)
-        self._desks.add(subscription)
-        return subscription
 
-    def _await_reply(self, reply: str) -> str:
-        self._unanswered.add(reply)
-        return reply
+        async def unsubscribe() -> None:
+            # A closed connection has dropped its subscriptions already.
+            with contextlib.suppress(nats.errors.Error):
+                await subscription.unsubscribe()
 
-    def _owed(self, reply: str) -> bool:
-        owed = reply in self._unanswered
-        self._unanswered.discard(reply)
-        return owed
+        return unsubscribe
+
+    @staticmethod
+    def _read(message: Msg) -> tuple[bytes | int, str | None]:
+        return message.data, message.reply or None
 
     async def _answer(self, reply: str, data: bytes) -> None:
         with contextlib.suppress(PublishError, NotConnectedError):  # the caller is out of reach
-            await self.publish(reply, self._fit_to_send(data))
+            await self.publish(reply, jsonrpc.sendable(data, self._client.max_payload))
 
-    def _fit_to_send(self, data: bytes) -> bytes:
-        limit = self._client.max_payload
-        if len(data) > limit:
-            return jsonrpc.error(
-                jsonrpc.id_of(data),
-                jsonrpc.INTERNAL_ERROR,
-                f"the result has {len(data)} bytes and the NATS server takes at most {limit}",
-            )
-        if not jsonrpc.valid_json(data):
-            return jsonrpc.no_number(jsonrpc.id_of(data))
-        return data
+    def _call_soon(self, function: Callable[[], None]) -> None:
+        asyncio.get_running_loop().call_soon(function)
 
-    async def _tell(self, what: str, callback: Callable[[], Awaitable[None]] | None) -> None:
+    async def _report_link(self, what: str, callback: Callable[[], Awaitable[None]] | None) -> None:
         if self._closing:
             return
         logger.log(logging.INFO if what == "is back" else logging.WARNING, "NATS connection %s", what)
@@ -286,32 +228,8 @@ class NatsBackend(MessagingClient):  # type: ignore[misc]  # the framework has n
         self._closing = False
 
 
-class _NatsSubscription(Subscription):  # type: ignore[misc]  # the framework has no type information
-    """A handle that unsubscribes once."""
-
-    def __init__(
-        self,
-        inner: NatsSubscription,
-        served_by: CommandDesk | OrderedFeed,
-        forget: Callable[[_NatsSubscription], None],
-    ) -> None:
-        self._inner: NatsSubscription | None = inner
-        self._served_by = served_by
-        self._forget = forget
-
-    async def unsubscribe(self) -> None:
-        """Stop receiving; cancels what is being served."""
-        inner, self._inner = self._inner, None
-        self._forget(self)
-        if inner is not None:
-            # A closed connection has dropped its subscriptions already.
-            with contextlib.suppress(nats.errors.Error):
-                await inner.unsubscribe()
-            await self._served_by.close()
-
-
 def _signed(seed: str, nonce: str | bytes) -> bytes:
-    """The server's nonce, signed with the seed's key, in base64."""
+    """Sign the server's nonce with the seed's key; in base64."""
     import nkeys  # type: ignore[import-untyped]  # noqa: PLC0415 - only credentials need it
 
     challenge = nonce.encode() if isinstance(nonce, str) else nonce
@@ -331,7 +249,7 @@ def _tls_context(link: LinkConfig) -> ssl.SSLContext:
 
 
 def _load_identity(context: ssl.SSLContext, cert: str, key: str) -> None:
-    """Certificate and key, which the standard library reads from files only."""
+    """Load certificate and key, which the standard library reads from files only."""
     if not cert.lstrip().startswith("-----BEGIN"):
         context.load_cert_chain(cert, key)
         return

@@ -7,16 +7,14 @@ device's ``cmd`` key whose payload is the JSON-RPC request, its reply carries th
 from __future__ import annotations
 
 import asyncio
-import itertools
+import contextlib
 import logging
-import math
 import time
 from collections.abc import Awaitable, Callable
 from functools import lru_cache, partial
 from typing import Any
 
 import zenoh
-from device_connect_edge.messaging.base import MessagingClient, Subscription
 from device_connect_edge.messaging.exceptions import (
     MessagingConnectionError,
     NotConnectedError,
@@ -25,55 +23,54 @@ from device_connect_edge.messaging.exceptions import (
     SubscribeError,
 )
 
-from . import jsonrpc, sessions
+from . import jsonrpc, zenoh_session
+from .base import Backend, NoResponderError, Undo
 from .config import LinkConfig
-from .dispatch import CommandDesk, Inbox, OrderedFeed, Serve, relaying, serving
-from .errors import NoResponderError
-from .threads import on_a_thread
-from .zenoh_ask import LARGE_BYTES, ask
-from .zenoh_intake import Handle, Intake, answer_query
+from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
 
 logger = logging.getLogger(__name__)
 
 REPLY_TTL_S = 60.0
 """Seconds a query outside a command waits for its reply before it is given up."""
 
-_REPLY = "_strands_reply/"
+LARGE_BYTES = 2**16
+"""From here on, which is more than one batch, a message goes out on a thread: it may have to wait for the link."""
+
+# Zenoh keeps a query's deadline itself; this many seconds later we stop believing that it will.
+_GRACE_S = 0.05
 
 _EVENT = {"congestion_control": zenoh.CongestionControl.DROP, "priority": zenoh.Priority.DATA}
+
+# Queries have a queue of their own beside telemetry. Not express: an express message takes a whole batch of that queue.
+_QUERY = {
+    "congestion_control": zenoh.CongestionControl.BLOCK,
+    "priority": zenoh.Priority.INTERACTIVE_HIGH,
+    "consolidation": zenoh.ConsolidationMode.NONE,
+}
+# A peer's routes may be a moment old: asking all that match, not the best, costs nothing where one matches.
+_QUERY_OF_A_PEER = {**_QUERY, "target": zenoh.QueryTarget.ALL}
 
 
 @lru_cache(maxsize=1024)
 def key_of(subject: str) -> str:
-    """The key expression for a dotted subject; one with a slash in it is a key expression already."""
+    """Return the key expression for a dotted subject; one with a slash in it is a key expression already."""
     if "/" in subject:
         return subject
     return "/".join("**" if token == ">" else token for token in subject.split("."))
 
 
-class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has no type information
-    """A messaging client on a shared session. Everything but zenoh's callbacks runs on the loop that connected.
-
-    ``open_ended`` takes what the link leaves open from the arguments of ``connect``.
-    """
+class ZenohBackend(Backend):
+    """A messaging client on a shared session. Everything but Zenoh's callbacks runs on the loop that connected."""
 
     def __init__(self, link: LinkConfig, *, open_ended: bool = False) -> None:
-        self._link = link
-        self._open_ended = open_ended
-        self._shared: sessions.SharedSession | None = None
+        super().__init__(link, open_ended=open_ended)
+        self._shared: zenoh_session.SharedSession | None = None
         self._closed = False
-        self._inbox: Inbox | None = None
-        self._queries: dict[str, tuple[Any, float]] = {}
-        self._numbers = itertools.count()
-        self._subscriptions: set[Handle] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._outcomes = Backlog(lambda: self._call_soon(self._settle_requests))
         self._callbacks: tuple[Callable[[], Awaitable[None]] | None, ...] = (None, None)
         self._tasks: set[asyncio.Task[Any]] = set()
         self._tries, self._retry_delay = 3, 0.3
-
-    @property
-    def link(self) -> LinkConfig:
-        """The link as it is used, with what ``connect`` was given filled in."""
-        return self._link
 
     async def connect(
         self,
@@ -90,14 +87,16 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             MessagingConnectionError: no router answered within the link's ``connect_timeout_s``, a port is taken,
                 or a certificate is unusable.
         """
-        self._link = self._link.filled(servers, credentials, tls_config) if self._open_ended else self._link
-        self._inbox = Inbox(asyncio.get_running_loop())
+        link = self._fill_link(servers, credentials, tls_config)
+        self._loop = asyncio.get_running_loop()
         self._callbacks = (disconnect_cb, reconnect_cb)
         try:
-            self._shared = await on_a_thread(partial(sessions.acquire, self._link), undo=sessions.release)
+            self._shared = await on_a_thread(partial(zenoh_session.acquire, link), undo=zenoh_session.release)
         except zenoh.ZError as error:
-            where = ", ".join(self._link.connect or self._link.listeners)
-            raise MessagingConnectionError(f"no Zenoh link at {where}: {_plain(error)}") from error
+            where = ", ".join(link.connect or link.listeners)
+            # Zenoh adds the place in its own sources to the reason.
+            reason = str(error).partition(" at /")[0].strip()
+            raise MessagingConnectionError(f"no Zenoh link at {where}: {reason}") from error
         self._closed = False
         self._shared.watch(self._on_link)
 
@@ -106,74 +105,34 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
 
         Raises:
             NotConnectedError: closed, or a client without its router.
-            PublishError: the subject is no key, the message is larger than a peer accepts, or it is no valid JSON
-                reply.
+            PublishError: the subject is no key, the message is larger than a peer accepts, or its caller no longer
+                waits for this reply.
         """
-        if subject.startswith(_REPLY):
-            await self._reply(subject, data)
+        if subject.startswith(REPLY_SUBJECT):
+            await self._publish_reply(subject, data)
             return
-        shared = self._session()
+        put = partial(self._connected().session.put, key_of(subject), data, **_EVENT)
         try:
             if len(data) < LARGE_BYTES:
-                shared.session.put(key_of(subject), data, **_EVENT)
+                put()
             else:
-                await on_a_thread(partial(shared.session.put, key_of(subject), data, **_EVENT))
+                await on_a_thread(put)
         except zenoh.ZError as error:
             raise PublishError(f"cannot publish on {subject}: {error}") from error
 
-    async def subscribe(
-        self,
-        subject: str,
-        callback: Callable[[bytes, str | None], Awaitable[None]],
-        queue: str | None = None,
-        subscribe_only: bool = False,
-    ) -> Subscription:
-        """Have ``callback(data, reply_subject)`` called; one subject ending in ``.cmd`` is served concurrently.
-
-        Raises:
-            NotConnectedError: not connected.
-            SubscribeError: the subject is no key expression.
-        """
-        if key_of(subject).endswith("/cmd") and not subscribe_only:
-            relay = relaying(callback, partial(self.keep, until_answered=True), self._owed)
-            return self._declare(subject, queue, desk=CommandDesk(subject, relay, _answer))
-        return self._declare(subject, queue, OrderedFeed(subject, callback, self.hand_over), answers=not subscribe_only)
-
-    async def serve(self, subject: str, serve: Serve) -> Subscription:
-        """Have every command on ``subject`` carried out by ``serve``, concurrently, and its reply sent.
-
-        Raises:
-            NotConnectedError: not connected.
-            SubscribeError: the subject is no key expression.
-        """
-        return self._declare(subject, None, desk=CommandDesk(subject, serving(serve), _answer))
-
-    async def subscribe_with_subject(
-        self,
-        subject: str,
-        callback: Callable[[bytes, str, str | None], Awaitable[None]],
-        queue: str | None = None,
-        subscribe_only: bool = False,
-    ) -> Subscription:
-        """``subscribe`` whose callback also gets the key that matched: ``callback(data, key, reply_subject)``."""
-        feed = OrderedFeed(subject, callback, self.hand_over)
-        return self._declare(subject, queue, feed, answers=not subscribe_only, with_subject=True)
-
     async def request(self, subject: str, data: bytes, timeout: float = 5.0) -> bytes:  # noqa: ASYNC109 - the framework's signature
-        """The first reply to ``data``.
+        """Return the first reply to ``data``.
 
         Raises:
-            NoResponderError: nobody serves ``subject``.
-            RequestTimeoutError: somebody does, but gave no reply within ``timeout`` seconds.
+            NoResponderError: no device serves ``subject``.
+            RequestTimeoutError: a device does, but gave no reply within ``timeout`` seconds.
             NotConnectedError: closed, or a client without its router.
         """
         deadline = time.monotonic() + timeout
-        key, of_peers, remaining = key_of(subject), self._link.is_peer, max(timeout, 0.001)
-        for left in reversed(range(self._tries if of_peers else 1)):
-            session, inbox = self._session().session, self._inbox
-            assert inbox is not None
+        key, remaining = key_of(subject), max(timeout, 0.001)
+        for left in reversed(range(self._tries if self._link.is_peer else 1)):
             try:
-                answer = await ask(session, inbox, key, data, remaining, of_peers=of_peers)
+                answer = await self._request_once(key, data, remaining)
             except RequestTimeoutError as error:
                 raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
             if answer is not None:
@@ -183,20 +142,19 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
                 break
             # A peer that links at this very moment is not known here yet.
             await asyncio.sleep(self._retry_delay)
-        raise NoResponderError(f"nobody answers on {subject}")
+        raise NoResponderError(f"no device answers on {subject}")
 
     async def close(self) -> None:
         """Undeclare everything and give the session back; the last of the process closes it."""
         self._closed = True
         shared, self._shared = self._shared, None
-        for subscription in tuple(self._subscriptions):
-            await subscription.unsubscribe()
-        self._queries.clear()
+        await self._unsubscribe_all()
+        self._replies.clear()
         for task in tuple(self._tasks):
             task.cancel()
         if shared is not None:
             shared.unwatch(self._on_link)
-            await on_a_thread(partial(sessions.release, shared))
+            await on_a_thread(partial(zenoh_session.release, shared))
 
     @property
     def is_connected(self) -> bool:
@@ -209,82 +167,127 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
         return self._closed
 
     def convert_subject_syntax(self, subject: str) -> str:
-        """The key expression for a dotted subject."""
+        """Return the key expression for a dotted subject."""
         return key_of(subject)
 
     def configure_d2d_retry(self, retries: int = 3, delay: float = 0.3) -> None:
-        """How often a peer asks again when nobody answers, and after how many seconds; the framework calls this."""
+        """Set how often a peer asks again without an answer, and after how many seconds; the framework calls this."""
         self._tries, self._retry_delay = retries, delay
 
-    def _session(self) -> sessions.SharedSession:
+    def _connected(self) -> zenoh_session.SharedSession:
         if self._shared is None or not self._shared.linked:
             raise NotConnectedError("closed" if self._closed else "not connected to Zenoh")
         return self._shared
 
-    def _declare(
+    async def _declare(
         self,
         subject: str,
         queue: str | None,
-        feed: OrderedFeed | None = None,
+        consumer: CommandServer | OrderedFeed,
         *,
-        desk: CommandDesk | None = None,
         answers: bool = True,
         with_subject: bool = False,
-    ) -> Subscription:
+    ) -> Undo:
         if queue:
             logger.warning("Zenoh has no queue groups: every subscriber of %s gets every message", subject)
-        shared, key = self._session(), key_of(subject)
-        intake = Intake(self, desk, feed, with_subject)
+        shared, key = self._connected(), key_of(subject)
+        if isinstance(consumer, CommandServer):
+            on_sample = on_query = consumer.receive
+        else:
+            on_sample = partial(self._on_message, consumer, with_subject)
+            on_query = partial(self._on_question, consumer, with_subject)
         undo = []
         try:
-            undo.append(shared.subscribe(key, intake.on_sample))
+            undo.append(shared.subscribe(key, on_sample))
             if answers:
-                undo.append(shared.answer(key, intake.on_query))
+                undo.append(shared.answer(key, on_query))
         except zenoh.ZError as error:
             for each in undo:
                 each()
             raise SubscribeError(f"cannot subscribe to {subject}: {error}") from error
-        subscription = Handle(undo, desk or feed, self._subscriptions.discard)
-        self._subscriptions.add(subscription)
-        return subscription
 
-    def hand_over(self, function: Callable[..., None], *args: Any) -> None:
-        """Call ``function(*args)`` on the client's loop; from any thread."""
-        if self._inbox is not None:
-            self._inbox.put(function, *args)
+        async def undeclare() -> None:
+            for each in undo:
+                each()
 
-    def keep(self, query: Any, *, until_answered: bool) -> str:
-        """Remember a query until its reply is published; the subject to publish it to. On the loop.
+        return undeclare
 
-        A command's query is let go when its handler ends, any other after ``REPLY_TTL_S``.
+    @staticmethod
+    def _on_message(feed: OrderedFeed, with_subject: bool, sample: Any) -> None:
+        """Take a put. On Zenoh's thread."""
+        key = (str(sample.key_expr),) if with_subject else ()
+        feed.accept(sample.payload.to_bytes(), *key, None)
+
+    def _on_question(self, feed: OrderedFeed, with_subject: bool, query: Any) -> None:
+        """Take a query that is no command. On Zenoh's thread."""
+        if self._replies.full:
+            query.drop()
+            return
+        key = (str(query.key_expr),) if with_subject else ()
+        data = b"" if query.payload is None else query.payload.to_bytes()
+        feed.accept(data, *key, self._replies.expect(partial(self._answer, query), REPLY_TTL_S))
+
+    @staticmethod
+    def _read(message: Any) -> tuple[bytes | int, Any]:
+        payload = message.payload
+        size = 0 if payload is None else len(payload)
+        data = size if size > jsonrpc.MAX_COMMAND_BYTES else payload.to_bytes() if size else b""
+        return data, message if isinstance(message, zenoh.Query) else None
+
+    def _answer(self, reply: Any, data: bytes) -> Awaitable[None] | None:
+        if len(data) < LARGE_BYTES:
+            _reply_to(reply, data)
+            return None
+        return on_a_thread(partial(_reply_to, reply, data))
+
+    def _call_soon(self, function: Callable[[], None]) -> None:
+        # A closed loop has no handler left.
+        with contextlib.suppress(RuntimeError):
+            if self._loop is not None:
+                self._loop.call_soon_threadsafe(function)
+
+    async def _request_once(self, key: str, data: bytes, wait_s: float) -> bytes | None:
+        """Return the first reply on ``key`` to ``data``; None when no device serves it.
+
+        Raises:
+            RequestTimeoutError: a device serves it and gave no reply within ``wait_s`` seconds.
+            PublishError: the key is malformed, or the other side refused.
         """
-        reply = f"{_REPLY}{next(self._numbers)}"
-        if until_answered:
-            self._queries[reply] = (query, math.inf)
-        else:
-            now = time.monotonic()
-            for old in [each for each, (_, until) in self._queries.items() if until < now]:
-                del self._queries[old]
-            self._queries[reply] = (query, now + REPLY_TTL_S)
-        return reply
+        session, loop = self._connected().session, asyncio.get_running_loop()
+        request = _Request(loop, self._outcomes)
+        token: Any = zenoh.CancellationToken()
+        options = _QUERY_OF_A_PEER if self._link.is_peer else _QUERY
+        handler = zenoh_session.direct(request.on_reply, request.on_end)
+        get = partial(session.get, key, handler, payload=data, timeout=wait_s, cancellation_token=token, **options)
+        deadline = loop.call_later(wait_s + _GRACE_S, request.on_deadline)
+        try:
+            if len(data) < LARGE_BYTES:
+                get()
+            else:
+                await on_a_thread(get)
+            answer = await request.future
+        except zenoh.ZError as error:
+            raise PublishError(f"cannot ask {key}: {error}") from error
+        finally:
+            deadline.cancel()
+            if not request.answered:
+                token.cancel()
+        if answer is None and request.failure == "Timeout":
+            raise RequestTimeoutError(f"no reply on {key} in time")
+        if answer is None and request.failure:
+            raise PublishError(f"{key} refused: {request.failure}")
+        return answer
 
-    def _owed(self, reply: str) -> bool:
-        return self._queries.pop(reply, None) is not None
-
-    async def _reply(self, reply: str, data: bytes) -> None:
-        query, _ = self._queries.pop(reply, (None, 0.0))
-        if query is None:
-            raise PublishError("the caller no longer waits for this reply")
-        if not jsonrpc.valid_json(data):
-            data = jsonrpc.no_number(jsonrpc.id_of(data))
-        sending = _answer(query, data)
-        if sending is not None:
-            await sending
+    def _settle_requests(self) -> None:
+        while (outcome := self._outcomes.take()) is not None:
+            request, value = outcome
+            request.settle(value)
 
     def _on_link(self, linked: bool) -> None:
-        self.hand_over(self._tell, linked)
+        """Report a lost or restored link. On Zenoh's thread."""
+        self._call_soon(partial(self._report_link, linked))
 
-    def _tell(self, linked: bool) -> None:
+    def _report_link(self, linked: bool) -> None:
         logger.log(logging.INFO if linked else logging.WARNING, "Zenoh link %s", "is back" if linked else "lost")
         callback = self._callbacks[linked]
         if callback is not None and not self._closed:
@@ -293,14 +296,45 @@ class ZenohBackend(MessagingClient):  # type: ignore[misc]  # the framework has 
             task.add_done_callback(self._tasks.discard)
 
 
-def _answer(query: Any, data: bytes) -> Awaitable[None] | None:
-    """Reply to a query; what has to wait for room is returned and awaited."""
-    if len(data) < LARGE_BYTES:
-        answer_query(query, data)
-        return None
-    return on_a_thread(partial(answer_query, query, data))
+class _Request:
+    """A query on its way: collects replies on Zenoh's thread and settles its future on the loop, once."""
+
+    __slots__ = ("_outcomes", "answered", "failure", "future")
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, outcomes: Backlog) -> None:
+        self._outcomes = outcomes
+        self.failure = ""
+        self.future: asyncio.Future[bytes | None] = loop.create_future()
+        self.answered = False
+
+    def on_reply(self, reply: Any) -> None:
+        """Take a reply. On Zenoh's thread."""
+        ok = reply.ok
+        if ok is None:
+            self.failure = reply.err.payload.to_bytes()[:200].decode(errors="replace")
+        elif not self.answered:
+            self.answered = True
+            self._outcomes.offer((self, ok.payload.to_bytes()))
+
+    def on_end(self) -> None:
+        """Settle a request that ended without a reply. On Zenoh's thread."""
+        # An answered request has woken the loop already.
+        if not self.answered:
+            self._outcomes.offer((self, None))
+
+    def on_deadline(self) -> None:
+        """Give up. On the loop."""
+        self.failure = "Timeout"
+        self.settle(None)
+
+    def settle(self, value: bytes | None) -> None:
+        """Set the outcome, unless there is one. On the loop."""
+        if not self.future.done():
+            self.future.set_result(value)
 
 
-def _plain(error: BaseException) -> str:
-    """What Zenoh says, without the place in its own sources."""
-    return str(error).partition(" at /")[0].strip()
+def _reply_to(query: Any, data: bytes) -> None:
+    """Reply with the caller's own priority and let go of the query, which tells the caller that no more comes."""
+    with contextlib.suppress(zenoh.ZError):  # the link to the caller is gone
+        query.reply(query.key_expr, data)
+    query.drop()

@@ -29,13 +29,13 @@ logger = logging.getLogger(__name__)
 
 Sink = Callable[[Any], None]
 
-# How often a process without the meeting port looks whether somebody still has it, in seconds, half of it at random
-# so that two survivors rarely try in the same instant.
+# Seconds between two checks of a process without the meeting port whether another one still has it; half of it is
+# random, so that two survivors rarely try in the same instant.
 MEETING_CHECK_S = 1.0
 
-# What Zenoh's threads may still need after a close to let go of callbacks. One that asks for the interpreter while that
-# ends aborts the process, and nothing tells when the last has let go.
-LET_GO_S = 0.05
+# Seconds that Zenoh's threads may still need after a close to release callbacks. A thread that asks for the interpreter
+# while that ends aborts the process, and Zenoh does not report when the last one has released.
+RELEASE_S = 0.05
 
 _ever_opened = threading.Event()
 
@@ -44,7 +44,7 @@ _lock = threading.Lock()
 
 
 def acquire(link: LinkConfig) -> SharedSession:
-    """The process's session for ``link``, opened if nobody has. Blocks; call it off the event loop.
+    """Return the process's session for ``link``, opened on first use. Blocks; call it off the event loop.
 
     Raises:
         zenoh.ZError: the session cannot be opened.
@@ -75,18 +75,18 @@ def release(shared: SharedSession) -> None:
 
 
 def open_links() -> tuple[LinkConfig, ...]:
-    """The links that have a session at this moment."""
+    """Return the links that have a session at this moment."""
     with _lock:
         return tuple(_sessions)
 
 
 def direct(sink: Sink, drop: Callable[[], None] | None = None) -> Any:
-    """A Zenoh handler that calls ``sink`` on the thread on which Zenoh received."""
+    """Return a Zenoh handler that calls ``sink`` on the thread on which Zenoh received."""
     return zenoh.handlers.Callback(sink, drop, indirect=False)
 
 
 class SharedSession:
-    """A Zenoh session with its users, its subscribers by key, and what it knows of its far sides."""
+    """A Zenoh session with its users, its subscribers by key, and the sessions it is linked to."""
 
     def __init__(self, link: LinkConfig) -> None:
         self.link = link
@@ -94,10 +94,10 @@ class SharedSession:
         self.session: Any = None
         self._lock = threading.RLock()
         self._topics: dict[str, _Topic] = {}
-        self._far_sides: set[str] = set()
+        self._remotes: set[str] = set()
         self._watchers: list[Callable[[bool], None]] = []
         self._link_events: Any = None
-        self._meeting: Meeting | None = None
+        self._meeting: MeetingPort | None = None
 
     def open(self) -> None:
         """Open the session unless it is open."""
@@ -121,7 +121,7 @@ class SharedSession:
         if meeting is not None:
             meeting.close()
         if link_events is not None:
-            # Closing ends links, which Zenoh would tell on its own threads after this has returned.
+            # Closing ends links, which Zenoh would report on its own threads after this has returned.
             _undeclare(link_events)
         if session is not None:
             try:
@@ -131,11 +131,11 @@ class SharedSession:
 
     @property
     def linked(self) -> bool:
-        """True when the session can reach somebody, or is a peer, which needs nobody."""
-        return self.session is not None and (self.link.is_peer or bool(self._far_sides))
+        """True when the session can send: a client while it has its router, a peer always."""
+        return self.session is not None and (self.link.is_peer or bool(self._remotes))
 
     def watch(self, watcher: Callable[[bool], None]) -> None:
-        """Have ``watcher(linked)`` called, on a foreign thread, when the link is lost or back."""
+        """Have ``watcher(linked)`` called, on Zenoh's thread, when the link is lost or back."""
         with self._lock:
             self._watchers.append(watcher)
 
@@ -179,7 +179,7 @@ class SharedSession:
         zid = str(event.transport.zid)
         with self._lock:
             before = self.linked
-            (self._far_sides.add if event.kind == zenoh.SampleKind.PUT else self._far_sides.discard)(zid)
+            (self._remotes.add if event.kind == zenoh.SampleKind.PUT else self._remotes.discard)(zid)
             after = self.linked
             watchers = tuple(self._watchers)
         if before != after:
@@ -202,7 +202,7 @@ class _Topic:
             sink(sample)
 
 
-class Meeting:
+class MeetingPort:
     """Takes over the meeting port when the process that has it goes.
 
     Zenoh cannot add a listener to an open session, and a session that still waits for a port does not close, so the
@@ -226,18 +226,18 @@ class Meeting:
 
     def _watch(self) -> None:
         while not self._closing.wait(MEETING_CHECK_S * random.uniform(0.5, 1.0)):
-            if self._host is None and not self._somebody_has_it() and self._port_is_free():
+            if self._host is None and not self._is_served() and self._is_free():
                 # A faster process may have it by now; the main session's retry finds that one.
                 with contextlib.suppress(zenoh.ZError):
                     self._host = zenoh.open(_zenoh_config(self._link.meeting_host()))
                     logger.info("took over the meeting point %s", self._link.meeting_point)
 
-    def _somebody_has_it(self) -> bool:
+    def _is_served(self) -> bool:
         return any(str(link.dst) == self._link.meeting_point for link in self._session.info.links())
 
-    def _port_is_free(self) -> bool:
+    def _is_free(self) -> bool:
         with socket.socket() as probe:
-            # As Zenoh binds: what is left of dead connections does not count.
+            # Zenoh binds like this: the remains of dead connections do not count.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind((LOOPBACK, self._link.meet_port or 0))
@@ -246,14 +246,14 @@ class Meeting:
         return True
 
 
-def _open(link: LinkConfig) -> tuple[Any, Meeting | None]:
+def _open(link: LinkConfig) -> tuple[Any, MeetingPort | None]:
     if link.meeting_point is None:
         return zenoh.open(_zenoh_config(link.zenoh())), None
     try:
         return zenoh.open(_zenoh_config(link.zenoh(meet=True))), None
     except zenoh.ZError:
         session = zenoh.open(_zenoh_config(link.zenoh()))
-        return session, Meeting(link, session)
+        return session, MeetingPort(link, session)
 
 
 def _zenoh_config(config: dict[str, Any]) -> Any:
@@ -275,4 +275,4 @@ def _close_all() -> None:
     for shared in left:
         shared.close()
     if _ever_opened.is_set():
-        time.sleep(LET_GO_S)
+        time.sleep(RELEASE_S)

@@ -6,7 +6,7 @@ import contextvars
 import pytest
 from fixtures.waiting import until
 
-from strands_robots.device_connect.backends import eager
+from strands_robots.device_connect.backends.dispatch import start_now
 
 NAME = contextvars.ContextVar("NAME", default="")
 
@@ -16,7 +16,7 @@ def at_once(work):
     started = asyncio.get_running_loop().create_future()
 
     def start():
-        task = eager.start(work)
+        task = start_now(work)
         started.set_result((task, seen_at_start()))
 
     seen = []
@@ -107,7 +107,7 @@ async def test_cancelled_at_any_moment_it_ends_in_order_and_takes_what_it_waits_
             seen.append("cleaned up")
 
     def start():
-        task = eager.start(work())
+        task = start_now(work())
         if let_it_run:
             loop.call_soon(loop.call_soon, task.cancel)
         else:
@@ -141,7 +141,7 @@ async def test_inside_a_task_it_begins_in_the_next_turn():
     async def work():
         seen.append(asyncio.current_task())
 
-    task = eager.start(work())
+    task = start_now(work())
     assert not seen
     await task
     assert seen == [task]
