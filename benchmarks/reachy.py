@@ -24,7 +24,7 @@ from strands_robots.device_connect import (
     loopback_config,
     stop_device_connect,
 )
-from strands_robots.drivers.reachy.pose import HeadPose
+from strands_robots.drivers.reachy.target import HeadPose
 
 SECONDS = 10.0
 

@@ -18,9 +18,8 @@ from fixtures.reachy_daemon.process import Daemon, Kind
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.reachy import ReachyDriver
-from strands_robots.drivers.reachy.envelope import Target
-from strands_robots.drivers.reachy.feed import Joints
-from strands_robots.drivers.reachy.pose import HeadPose
+from strands_robots.drivers.reachy.connection import Joints
+from strands_robots.drivers.reachy.target import HeadPose, Target
 
 SIZE = (400, 480)
 Sample = tuple[Joints, float]

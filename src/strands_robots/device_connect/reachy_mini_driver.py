@@ -15,13 +15,11 @@ from strands_robots.device_connect._compat import Labels, emit, rpc
 from strands_robots.device_connect.base_driver import Call, RobotDriver
 from strands_robots.device_connect.live_driver import Activity
 from strands_robots.drivers.reachy import ReachyDriver
-from strands_robots.drivers.reachy.catalogue import LIBRARIES
 from strands_robots.drivers.reachy.connection import STATUS_PATH
-from strands_robots.drivers.reachy.envelope import Target, bounded
-from strands_robots.drivers.reachy.motors import selected
-from strands_robots.drivers.reachy.pose import HeadPose
+from strands_robots.drivers.reachy.driver import LIBRARIES, motor_names
+from strands_robots.drivers.reachy.links import DEFAULT_PREFIX
 from strands_robots.drivers.reachy.rest import DaemonError
-from strands_robots.drivers.reachy.transport import DEFAULT_PREFIX
+from strands_robots.drivers.reachy.target import HeadPose, Target, bounded
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
@@ -257,7 +255,7 @@ class ReachyMiniDriver(RobotDriver):
 
     async def _torque(self, verb: str, on_: bool, motor_ids: object) -> Envelope:
         def prepare() -> Call:
-            names = ",".join(selected(motor_ids))
+            names = ",".join(motor_names(motor_ids))
             return self.answering(lambda: self.reachy.motors.torque(on_, names, verb))
 
         return await self.move(verb, prepare)

@@ -15,10 +15,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from strands_robots.drivers.reachy.rest import (
-    BackendDown,
-    DaemonFault,
-    DaemonRefused,
-    DaemonUnknown,
+    BackendDownError,
+    DaemonFaultError,
+    DaemonNotFoundError,
+    DaemonRefusedError,
     RestClient,
 )
 
@@ -109,7 +109,7 @@ def test_a_nan_comes_back_as_null_until_a_number_repairs_it(daemon: Daemon) -> N
 
 def test_a_move_that_is_over_cannot_be_stopped_and_the_next_request_works(daemon: Daemon, rest: RestClient) -> None:
     for _ in range(3):
-        with pytest.raises(DaemonFault) as fault:
+        with pytest.raises(DaemonFaultError) as fault:
             rest.post("/api/move/stop", {"uuid": "00000000-0000-4000-8000-000000000000"})
         assert fault.value.status == 500
         assert "Internal Server Error" in str(fault.value)
@@ -119,13 +119,13 @@ def test_a_move_that_is_over_cannot_be_stopped_and_the_next_request_works(daemon
 @pytest.mark.parametrize(
     ("path", "body", "kind", "says"),
     [
-        ("/api/move/stop", {"uuid": "nope"}, DaemonRefused, "valid UUID"),
-        ("/api/move/goto", {"head_pose": {"yaw": 0.1}}, DaemonRefused, "body.duration: Field required"),
-        ("/api/move/goto", {"antennas": [0, 0, 0], "duration": 1}, DaemonRefused, "at most 2 items"),
-        ("/api/motors/set_mode/bogus", None, DaemonRefused, "'enabled', 'disabled'"),
-        ("/api/daemon/stop", None, DaemonRefused, "goto_sleep"),
-        ("/api/move/play/nothing", None, DaemonUnknown, "Not Found"),
-        ("/nope", None, DaemonUnknown, "Not Found"),
+        ("/api/move/stop", {"uuid": "nope"}, DaemonRefusedError, "valid UUID"),
+        ("/api/move/goto", {"head_pose": {"yaw": 0.1}}, DaemonRefusedError, "body.duration: Field required"),
+        ("/api/move/goto", {"antennas": [0, 0, 0], "duration": 1}, DaemonRefusedError, "at most 2 items"),
+        ("/api/motors/set_mode/bogus", None, DaemonRefusedError, "'enabled', 'disabled'"),
+        ("/api/daemon/stop", None, DaemonRefusedError, "goto_sleep"),
+        ("/api/move/play/nothing", None, DaemonNotFoundError, "Not Found"),
+        ("/nope", None, DaemonNotFoundError, "Not Found"),
     ],
 )
 def test_a_wrong_request_is_refused_with_the_daemons_words(
@@ -157,9 +157,9 @@ def test_two_moves_run_at_the_same_time_and_nobody_objects(daemon: Daemon, rest:
 def test_recorded_moves_in_the_cache_need_no_hub(rest: RestClient) -> None:
     path = "/api/move/recorded-move-datasets/list/pollen-robotics/reachy-mini-"
     assert sorted(rest.get(path + "emotions-library")) == ["no1", "yes1"]
-    with pytest.raises(DaemonFault):
+    with pytest.raises(DaemonFaultError):
         rest.get(path + "nothing-of-that-name")
-    with pytest.raises(DaemonUnknown, match="nope"):
+    with pytest.raises(DaemonNotFoundError, match="nope"):
         rest.post("/api/move/play/recorded-move-dataset/pollen-robotics/reachy-mini-emotions-library/nope")
 
 
@@ -182,7 +182,7 @@ def test_six_joints_end_the_backend_and_a_restart_repairs_it(daemon: Daemon, res
         ws.send(json.dumps({"type": "set_head_joints", "joints": [0.0] * 6}))
         eventually(lambda: rest.get("/api/daemon/status")["state"] == "error", what="state error")
     assert "length 6 (got 5)" in rest.get("/api/daemon/status")["error"]
-    with pytest.raises(BackendDown, match="Backend not running"):
+    with pytest.raises(BackendDownError, match="Backend not running"):
         rest.get("/api/motors/status")
     rest.post("/api/daemon/restart")
     eventually(lambda: rest.get("/api/daemon/status")["state"] == "running", what="running again")

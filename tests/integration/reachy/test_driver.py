@@ -13,8 +13,7 @@ from fixtures.waiting import eventually
 from tests.integration.reachy.conftest import Connect
 
 from strands_robots.drivers.reachy import ReachyDriver, connection
-from strands_robots.drivers.reachy.envelope import Target
-from strands_robots.drivers.reachy.pose import HeadPose
+from strands_robots.drivers.reachy.target import HeadPose, Target
 from strands_robots.safety.gate import MotionRefused
 
 
@@ -242,7 +241,7 @@ def test_two_drivers_on_one_robot_see_and_stop_one_another(
     first = one.motions.current
     assert first is not None
     eventually(first.done.is_set, what="the first driver learns it")
-    assert (first.state, first.detail) == ("stopped", "somebody else stopped it")
+    assert (first.state, first.detail) == ("stopped", "another client stopped it")
 
 
 def test_after_disconnect_nothing_reaches_the_robot(reachy: ReachyDriver) -> None:

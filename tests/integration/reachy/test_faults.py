@@ -15,9 +15,8 @@ from zeroconf import ServiceInfo, Zeroconf
 
 from strands_robots.drivers.reachy import ReachyDriver, discovery
 from strands_robots.drivers.reachy.discovery import SERVICE, discover, make_reachy
-from strands_robots.drivers.reachy.envelope import FRAME_STEP, Target
-from strands_robots.drivers.reachy.pose import HeadPose
-from strands_robots.drivers.reachy.rest import DaemonUnreachable
+from strands_robots.drivers.reachy.rest import DaemonUnreachableError
+from strands_robots.drivers.reachy.target import FRAME_STEP, HeadPose, Target
 from strands_robots.safety.gate import MotionRefused
 from strands_robots.utils import ValidationError
 
@@ -65,7 +64,7 @@ def test_nan_in_the_stream_is_stale_joints_and_not_a_dead_link(daemon: Daemon, r
     eventually(lambda: reachy.get_joints()["status"] == "error", what="no usable numbers")
     assert reachy.is_connected
     eventually(lambda: reachy.facts()["unusable_frames"] > 10, what="what is not usable, counted")
-    with pytest.raises(DaemonUnreachable, match="unusable numbers"):
+    with pytest.raises(DaemonUnreachableError, match="unusable numbers"):
         reachy.get_observation()
     reachy.go(Target(antennas=(0.0, 0.0)))
     daemon.control(nan=False)
@@ -143,7 +142,7 @@ def test_connect_eagerly_never_raises_and_connects_later(daemon: Daemon) -> None
             reachy.go(Target(HeadPose()))
     finally:
         reachy.disconnect()
-    with pytest.raises(DaemonUnreachable, match="Connection refused"):
+    with pytest.raises(DaemonUnreachableError, match="Connection refused"):
         ReachyDriver("127.0.0.1", api_port=free_port()).connect(within_s=3.0)
 
 

@@ -10,7 +10,7 @@ from fixtures.reachy_daemon.process import Daemon
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.reachy import ReachyDriver
-from strands_robots.drivers.reachy.envelope import ACTION_KEYS, BOUNDS
+from strands_robots.drivers.reachy.target import ACTION_KEYS, BOUNDS
 from strands_robots.hardware import HardwareRobot
 
 

@@ -1,4 +1,4 @@
-"""Pollen's Reachy Mini, through its daemon, with the standard library until a connection is asked for."""
+"""Driver of Pollen's Reachy Mini through its daemon; third parties are loaded by the first connection."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["ReachyDriver"]
 
 def __getattr__(name: str) -> Any:
     if name == "ReachyDriver":
-        from strands_robots.drivers.reachy.driver import ReachyDriver  # noqa: PLC0415 - the package loads nothing by itself
+        from strands_robots.drivers.reachy.driver import ReachyDriver  # noqa: PLC0415 - loaded on use
 
         return ReachyDriver
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

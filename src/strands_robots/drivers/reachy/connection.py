@@ -1,30 +1,38 @@
-"""Being connected to a daemon that may be away, restart, be updated or fall silent.
+"""Connection to a daemon that may be away, restart, be updated or fall silent, and the data it streams.
 
 One thread asks for the status, opens the link that the daemon speaks, and opens it again whenever joint frames stop
-for 1.5 seconds: after a restart an old socket stays open and silent for ever, so the socket's own state proves nothing.
+for 1.5 seconds: after a restart an old socket stays open and silent, so the socket's own state proves nothing.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from strands_robots.drivers.reachy.feed import FRESH_S, Feed
-from strands_robots.drivers.reachy.links import ZENOH_PORT, Link, PubSub, key_prefix
-from strands_robots.drivers.reachy.rest import DaemonError, DaemonUnknown, DaemonUnreachable, RestClient
-from strands_robots.drivers.reachy.transport import (
+from strands_robots.drivers.reachy.links import (
     APP_LOCK_SINCE,
     DEFAULT_PREFIX,
     TRANSPORTS,
+    ZENOH_PORT,
     DaemonInfo,
+    Link,
+    PubSub,
+    key_prefix,
     make_link,
 )
+from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
+from strands_robots.drivers.reachy.target import HeadPose
 from strands_robots.utils import ValidationError, choice, port
 
 logger = logging.getLogger(__name__)
+
+FRESH_S = 1.5
+"""Oldest sample that still counts, in seconds: joints come at 37 to 50 Hz."""
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.1, 1.0
 WATCH_EVERY_S, POLL_EVERY_S = 0.1, 1.0
@@ -32,26 +40,179 @@ STATUS_LAG_S = 1.5
 STATUS_PATH, RUNNING_PATH = "/api/daemon/status", "/api/move/running"
 LOCK_PATH, APP_PATH = "/api/daemon/robot-app-lock-status", "/api/apps/current-app-status"
 
+HEAD_JOINTS = ("body_yaw", "stewart_1", "stewart_2", "stewart_3", "stewart_4", "stewart_5", "stewart_6")
+
 
 @dataclass(frozen=True, slots=True)
-class Poll:
-    """What the daemon tells only when asked: who holds the robot (empty: nobody) and which REST moves run."""
+class JointSample:
+    """Positions in radians: body yaw, the six legs of the head, and the antennas (right, left)."""
+
+    head: tuple[float, ...]
+    antennas: tuple[float, float]
+    at: float
+
+    @property
+    def body_yaw(self) -> float:
+        return self.head[0]
+
+    def named(self) -> dict[str, float]:
+        """Return the positions by motor name."""
+        right, left = self.antennas
+        return {**dict(zip(HEAD_JOINTS, self.head, strict=True)), "right_antenna": right, "left_antenna": left}
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """Accelerometer (m/s^2), gyroscope (rad/s), quaternion (w, x, y, z) and temperature (degrees Celsius)."""
+
+    accelerometer: tuple[float, ...]
+    gyroscope: tuple[float, ...]
+    quaternion: tuple[float, ...]
+    temperature: float
+    at: float
+
+
+class Feed:
+    """Latest message of each kind of one robot. Written by the link's thread, read by any.
+
+    Both generations of the daemon send the same objects, over a WebSocket with a ``type`` and over Zenoh with a key.
+    Joint frames are decoded on arrival, because they show whether the link is alive; the others when they are read.
+    """
+
+    def __init__(self) -> None:
+        self._raw: dict[str, tuple[str | bytes, float]] = {}
+        self._joints: JointSample | None = None
+        self._received_at = -math.inf
+        self._news = threading.Condition()
+        self.joint_frames = 0
+        self.unusable_frames = 0
+
+    def take(self, kind: str, payload: str | bytes) -> None:
+        """Store one message; one that cannot be decoded is dropped, as the daemon's clients do."""
+        now = time.monotonic()
+        if kind != "joint_positions":
+            self._raw[kind] = (payload, now)
+            return
+        joints = _joints(payload, now)
+        with self._news:
+            self._received_at = now
+            if joints is None:
+                self.unusable_frames += 1
+                return
+            self._joints = joints
+            self.joint_frames += 1
+            self._news.notify_all()
+
+    def clear(self) -> None:
+        """Forget everything, for a new link."""
+        with self._news:
+            self._raw.clear()
+            self._joints = None
+            self._received_at = -math.inf
+
+    def wait(self, within_s: float) -> bool:
+        """Wait for a usable joint frame; False when ``within_s`` are over."""
+        with self._news:
+            return self._news.wait_for(lambda: self._joints is not None, within_s)
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since any joint frame, usable or not; infinite before the first."""
+        return time.monotonic() - self._received_at
+
+    @property
+    def alive(self) -> bool:
+        """Joint frames arrive."""
+        return self.silent_s <= FRESH_S
+
+    @property
+    def joints(self) -> JointSample | None:
+        """The last usable joint positions, however old."""
+        return self._joints
+
+    @property
+    def fresh_joints(self) -> JointSample | None:
+        """The last joint positions unless they are stale."""
+        joints = self._joints
+        return joints if joints is not None and time.monotonic() - joints.at <= FRESH_S else None
+
+    def pose(self) -> HeadPose | None:
+        """Return the measured head pose, or None when stale or unusable."""
+        message = self._object("head_pose", FRESH_S)
+        rows = message.get("head_pose") if message else None
+        if not isinstance(rows, list):
+            return None
+        flat = [value for row in rows for value in (row if isinstance(row, list) else [row])]
+        try:
+            return HeadPose.from_matrix(flat)
+        except (ValidationError, TypeError):
+            return None
+
+    def imu(self) -> ImuSample | None:
+        """Return the last inertial sample, however old, or None on a robot without one."""
+        message = self._object("imu_data", math.inf)
+        if message is None:
+            return None
+        accelerometer, gyroscope = (_numbers(message.get(key), 3) for key in ("accelerometer", "gyroscope"))
+        quaternion, temperature = _numbers(message.get("quaternion"), 4), _numbers([message.get("temperature")], 1)
+        if accelerometer is None or gyroscope is None or quaternion is None or temperature is None:
+            return None
+        return ImuSample(accelerometer, gyroscope, quaternion, temperature[0], self._raw["imu_data"][1])
+
+    def status(self) -> dict[str, Any] | None:
+        """Return the daemon's status object unless it is older than three seconds (it comes every second)."""
+        return self._object("daemon_status", 3.0)
+
+    def _object(self, kind: str, within_s: float) -> dict[str, Any] | None:
+        payload, at = self._raw.get(kind, ("", -math.inf))
+        if time.monotonic() - at > within_s or not payload:
+            return None
+        try:
+            message = json.loads(payload)
+        except ValueError:
+            return None
+        return message if isinstance(message, dict) else None
+
+
+def _joints(payload: str | bytes, at: float) -> JointSample | None:
+    try:
+        message = json.loads(payload)
+        head = _numbers(message["head_joint_positions"], 7)
+        antennas = _numbers(message["antennas_joint_positions"], 2)
+    except (ValueError, KeyError, TypeError):
+        return None
+    return JointSample(head, (antennas[0], antennas[1]), at) if head and antennas else None
+
+
+def _numbers(values: object, length: int) -> tuple[float, ...] | None:
+    """Return ``length`` finite numbers, or None: NaN arrives as null over WebSocket and as a bare NaN over Zenoh."""
+    if not isinstance(values, list) or len(values) != length:
+        return None
+    good = all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values)
+    return tuple(float(v) for v in values) if good else None
+
+
+@dataclass(frozen=True, slots=True)
+class PollResult:
+    """Facts that the daemon gives only on request.
+
+    ``holder`` is the application that holds the robot, empty for none; ``moves`` are the uuids of running REST moves.
+    """
 
     holder: str = ""
-    moves: frozenset[str] = field(default_factory=frozenset)
-    at: float = 0.0
+    moves: frozenset[str] = frozenset()
 
 
 class Connection:
-    """The way to one daemon; ``start`` it, then ask :meth:`refusal` before sending.
+    """Connection to one daemon; ``start`` it, then ask :meth:`refusal` before sending.
 
     Args:
         host: bare hostname or IP literal of the daemon.
         api_port: its TCP port.
         prefix: of the Zenoh keys; the default gives way to the robot's own name.
-        transport: ``auto`` for what the daemon speaks, or a link's name.
+        transport: ``auto`` for the link that the daemon speaks, or a link's name.
         session: a pub/sub object for the Zenoh link in place of a session of its own.
-        zenoh_port: where a daemon before 1.5 listens for it.
+        zenoh_port: Zenoh port of a daemon before 1.5.
     """
 
     def __init__(
@@ -73,13 +234,12 @@ class Connection:
         self._session, self._zenoh_port = session, port("zenoh_port", zenoh_port)
         self.feed = Feed()
         self.connects = 0
-        # Asked over the stop's own connection, which is thereby open and warm when a stop comes.
-        self.polled = Poll()
+        self.last_poll = PollResult()
         self._info: DaemonInfo | None = None
         self._link: Link | None = None
-        self._why = "not connected"
-        self._noted = ("", 0.0)
-        self._end = threading.Event()
+        self._reason = "not connected"
+        self._answered_mode = ("", 0.0)
+        self._stopping = threading.Event()
         self._up = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -87,16 +247,16 @@ class Connection:
         """Begin to connect, in a thread; returns at once."""
         if self._thread is not None:
             return
-        self._end.clear()
+        self._stopping.clear()
         self._thread = threading.Thread(target=self._run, name="reachy-watch", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Let go of the robot and end the thread."""
-        self._end.set()
+        """Disconnect and end the thread."""
+        self._stopping.set()
         self._up.clear()
         thread, self._thread = self._thread, None
-        self._why = "disconnected"
+        self._reason = "disconnected"
         self._drop()
         if thread is not None and thread is not threading.current_thread():
             thread.join(5.0)
@@ -104,7 +264,7 @@ class Connection:
             client.close()
 
     def wait(self, within_s: float) -> bool:
-        """True when the link is up within the time."""
+        """Wait for the link; True when it is up within the time."""
         return self._up.wait(within_s)
 
     @property
@@ -115,20 +275,20 @@ class Connection:
 
     @property
     def motor_mode(self) -> str:
-        """The motors' mode by the newest word of the daemon: its answer to us, or its status, told every second."""
-        mode, at = self._noted
+        """The motors' mode: the daemon's last answer while that is newer than its status, which comes every second."""
+        mode, at = self._answered_mode
         if time.monotonic() - at < STATUS_LAG_S:
             return mode
         info = self.info
         return info.motor_mode if info is not None else ""
 
     def note_mode(self, mode: str) -> None:
-        """Remember what the daemon just answered about its motors."""
-        self._noted = (mode, time.monotonic())
+        """Remember the motors' mode that the daemon just answered."""
+        self._answered_mode = (mode, time.monotonic())
 
     @property
     def link_kind(self) -> str:
-        """websocket, zenoh, or empty while there is none."""
+        """One of websocket, zenoh; empty while there is no link."""
         link = self._link
         return link.kind if link is not None else ""
 
@@ -139,46 +299,46 @@ class Connection:
         return self._up.is_set() and link is not None and not link.closed and self.feed.alive
 
     def refusal(self) -> str | None:
-        """Why nothing may be sent now, or None."""
+        """Return the reason why nothing may be sent now, or None."""
         if not self.alive:
             silent = self._up.is_set() and not self.feed.alive
-            return f"no joint data for {self.feed.silent_s:.1f} s" if silent else self._why
-        if self.polled.holder:
-            return f"the robot is held by {self.polled.holder}"
+            return f"no joint data for {self.feed.silent_s:.1f} s" if silent else self._reason
+        if self.last_poll.holder:
+            return f"the robot is held by {self.last_poll.holder}"
         return None
 
     def link(self) -> Link:
-        """The open link. Raises :class:`DaemonUnreachable`."""
+        """Return the open link. Raises :class:`DaemonUnreachableError`."""
         link = self._link
         if link is None or not self._up.is_set():
-            raise DaemonUnreachable(f"Reachy Mini at {self.host}:{self.port} is not connected: {self._why}.")
+            raise DaemonUnreachableError(f"Reachy Mini at {self.host}:{self.port} is not connected: {self._reason}.")
         return link
 
     def _run(self) -> None:
         delay = FIRST_DELAY_S
-        while not self._end.is_set():
+        while not self._stopping.is_set():
             try:
-                self._join()
+                self._open()
                 self._poll()
             except Exception as exc:
-                # The device stays, says why it is unavailable, and tries again, whatever went wrong.
-                self._say(str(exc) or type(exc).__name__)
+                # The device stays, reports why it is unavailable, and tries again after any error.
+                self._unavailable(str(exc) or type(exc).__name__)
                 if not isinstance(exc, DaemonError | ImportError):
                     logger.exception("Reachy Mini at %s:%d: connecting failed.", self.host, self.port)
                 self._drop()
-                self._end.wait(delay)
+                self._stopping.wait(delay)
                 delay = min(2 * delay, LONGEST_DELAY_S)
                 continue
             delay = FIRST_DELAY_S
-            self._stay()
+            self._watch()
             self._drop()
 
-    def _join(self) -> None:
+    def _open(self) -> None:
         info = self._info = DaemonInfo.of(self.rest.get(STATUS_PATH))
         if info.state not in ("running", ""):
             raise DaemonError(f"the daemon is {info.state}{': ' + info.error if info.error else ''}")
         self.feed.clear()
-        link = make_link(
+        link = self._link = make_link(
             info,
             self.host,
             self.port,
@@ -187,31 +347,30 @@ class Connection:
             session=self._session,
             zenoh_port=self._zenoh_port,
         )
-        self._link = link
         link.open(self.feed.take)
         deadline = time.monotonic() + FRESH_S
         while not self.feed.alive:
-            if self._end.is_set() or link.closed or time.monotonic() > deadline:
-                raise DaemonUnreachable(f"the {link.kind} link opened but carries no joint data")
+            if self._stopping.is_set() or link.closed or time.monotonic() > deadline:
+                raise DaemonUnreachableError(f"the {link.kind} link opened but carries no joint data")
             self.feed.wait(0.05)
-        if self._end.is_set():
-            raise DaemonUnreachable("disconnected")
+        if self._stopping.is_set():
+            raise DaemonUnreachableError("disconnected")
         self.connects += 1
-        self._why = ""
+        self._reason = ""
         self._up.set()
         version = ".".join(map(str, info.version)) or "of unknown version"
         logger.info("Reachy Mini at %s:%d: daemon %s over %s.", self.host, self.port, version, link.kind)
 
-    def _stay(self) -> None:
-        """Return when the link is dead."""
+    def _watch(self) -> None:
+        """Poll until the link is dead."""
         polled = time.monotonic()
-        while not self._end.wait(WATCH_EVERY_S):
+        while not self._stopping.wait(WATCH_EVERY_S):
             link = self._link
             if link is None or link.closed:
-                self._say("the daemon closed the link")
+                self._unavailable("the daemon closed the link")
                 return
             if not self.feed.alive:
-                self._say(f"no joint data for {FRESH_S:g} s")
+                self._unavailable(f"no joint data for {FRESH_S:g} s")
                 return
             if time.monotonic() - polled >= POLL_EVERY_S:
                 try:
@@ -223,18 +382,18 @@ class Connection:
     def _poll(self) -> None:
         info = self._info
         holder = self._holder(info) if info is not None else ""
-        # Asked over the stop's own connection, which is thereby open and warm when a stop comes.
-        self.polled = Poll(holder, running_moves(self.stop_rest.get(RUNNING_PATH)), time.monotonic())
+        # The moves are asked for over the stop's own connection, which is thereby open and warm when a stop comes.
+        self.last_poll = PollResult(holder, running_moves(self.stop_rest.get(RUNNING_PATH)))
 
     def _holder(self, info: DaemonInfo) -> str:
-        """Which application holds the robot: the lock where the daemon has one, and the managed app."""
+        """Return the application that holds the robot, by the daemon's lock where it has one or by its managed app."""
         if info.since(APP_LOCK_SINCE):
             lock = self.rest.get(LOCK_PATH)
             if isinstance(lock, dict) and lock.get("state") not in ("free", None):
                 return str(lock.get("holder_name") or lock["state"])
         try:
             app = self.rest.get(APP_PATH)
-        except DaemonUnknown:
+        except DaemonNotFoundError:
             return ""
         if isinstance(app, dict) and app.get("state") in ("starting", "running", "stopping"):
             about = app.get("info")
@@ -247,14 +406,14 @@ class Connection:
         if link is not None:
             link.close()
 
-    def _say(self, why: str) -> None:
-        if why != self._why and not self._end.is_set():
-            logger.warning("Reachy Mini at %s:%d is unavailable: %s.", self.host, self.port, why.rstrip("."))
-            self._why = why.rstrip(".")
+    def _unavailable(self, reason: str) -> None:
+        if reason != self._reason and not self._stopping.is_set():
+            logger.warning("Reachy Mini at %s:%d is unavailable: %s.", self.host, self.port, reason.rstrip("."))
+            self._reason = reason.rstrip(".")
 
 
 def running_moves(answer: Any) -> frozenset[str]:
-    """The uuids of ``/api/move/running``. Raises :class:`ValidationError` for another shape."""
+    """Return the uuids of ``/api/move/running``. Raises :class:`ValidationError` for another shape."""
     if not isinstance(answer, list) or not all(isinstance(move, dict) and "uuid" in move for move in answer):
         raise ValidationError("the daemon's list of running moves is no list of uuids.")
     return frozenset(str(move["uuid"]) for move in answer)

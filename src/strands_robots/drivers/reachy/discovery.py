@@ -1,4 +1,4 @@
-"""Finding a Reachy Mini on the local network: its daemon announces ``_reachy-mini._tcp`` by mDNS."""
+"""Discovery of a Reachy Mini on the local network by the mDNS service ``_reachy-mini._tcp`` of its daemon."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SERVICE = "_reachy-mini._tcp.local."
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class DiscoveredDaemon:
     """One announced daemon: its name, an address to dial and the port."""
 
     name: str
@@ -22,8 +22,8 @@ class Found:
     port: int
 
 
-def discover(within_s: float = 3.0, *, interfaces: Any = None) -> list[Found]:
-    """Every Reachy Mini that answers in that time, by name.
+def discover(within_s: float = 3.0, *, interfaces: Any = None) -> list[DiscoveredDaemon]:
+    """Return every Reachy Mini that answers in that time, by name.
 
     Args:
         within_s: seconds to listen, above 0 and at most 60.
@@ -39,23 +39,23 @@ def discover(within_s: float = 3.0, *, interfaces: Any = None) -> list[Found]:
     wait = number("within_s", within_s, above=0, high=60)
     names: set[str] = set()
 
-    def heard(zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange) -> None:
+    def on_change(zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange) -> None:
         del zeroconf, service_type
         if state_change is ServiceStateChange.Added:
             names.add(name)
 
     with Zeroconf(interfaces=interfaces if interfaces is not None else InterfaceChoice.All) as network:
-        browser = ServiceBrowser(network, SERVICE, handlers=[heard])
+        browser = ServiceBrowser(network, SERVICE, handlers=[on_change])
         threading.Event().wait(wait)
         browser.cancel()
         infos = [(name, network.get_service_info(SERVICE, name, timeout=500)) for name in sorted(names)]
-    return [_found(name, info) for name, info in infos if info is not None and info.parsed_addresses()]
+    return [_discovered(name, info) for name, info in infos if info is not None and info.parsed_addresses()]
 
 
-def _found(name: str, info: Any) -> Found:
-    """IPv4 before IPv6: a link-local IPv6 address needs a scope that a URL does not carry."""
+def _discovered(name: str, info: Any) -> DiscoveredDaemon:
+    # IPv4 before IPv6: a link-local IPv6 address needs a scope that a URL does not carry.
     addresses = sorted(info.parsed_addresses(), key=lambda text: ipaddress.ip_address(text).version)
-    return Found(name.removesuffix("." + SERVICE), addresses[0], int(info.port))
+    return DiscoveredDaemon(name.removesuffix("." + SERVICE), addresses[0], int(info.port))
 
 
 def make_reachy(
@@ -66,24 +66,24 @@ def make_reachy(
     driver: type[ReachyDriver] = ReachyDriver,
     **options: Any,
 ) -> ReachyDriver:
-    """A driver for ``host``, or for the one Reachy Mini that announces itself when no host is given.
+    """Return a driver for ``host``, or for the one Reachy Mini that announces itself when no host is given.
 
     Args:
-        host: bare hostname or IP literal; empty to look for it.
+        host: bare hostname or IP literal; empty to discover it.
         api_port: TCP port of the daemon, when ``host`` is given.
-        within_s: seconds to look.
+        within_s: seconds to listen.
         driver: the class to make.
         options: further arguments of :class:`ReachyDriver`.
 
     Raises:
-        ValidationError: not just one was found, or an argument is out of its domain.
+        ValidationError: none or several were found, or an argument is out of its domain.
     """
     if host:
         return driver(host, api_port=api_port, **options)
-    found = discover(within_s)
-    if not found:
+    daemons = discover(within_s)
+    if not daemons:
         raise ValidationError(f"host must name a Reachy Mini: none announced itself within {within_s:g} s.")
-    if len(found) > 1:
-        names = ", ".join(f"{each.name} at {each.host}:{each.port}" for each in found)
-        raise ValidationError(f"host must name one Reachy Mini; {len(found)} were found: {names}.")
-    return driver(found[0].host, api_port=found[0].port, **options)
+    if len(daemons) > 1:
+        names = ", ".join(f"{each.name} at {each.host}:{each.port}" for each in daemons)
+        raise ValidationError(f"host must name one Reachy Mini; {len(daemons)} were found: {names}.")
+    return driver(daemons[0].host, api_port=daemons[0].port, **options)

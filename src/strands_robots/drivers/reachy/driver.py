@@ -6,35 +6,180 @@ import time
 from typing import Any
 
 from strands_robots.contract import Observer, Unsubscribe
-from strands_robots.drivers.reachy import gestures
-from strands_robots.drivers.reachy.catalogue import Library
-from strands_robots.drivers.reachy.connection import Connection
-from strands_robots.drivers.reachy.envelope import (
+from strands_robots.drivers.reachy.connection import FRESH_S, Connection
+from strands_robots.drivers.reachy.links import (
+    DEFAULT_PREFIX,
+    SLEEP_DISABLES_SINCE,
+    STOP_MOVE_SINCE,
+    ZENOH_PORT,
+    PubSub,
+)
+from strands_robots.drivers.reachy.motion import MotionController
+from strands_robots.drivers.reachy.rest import DaemonError, DaemonFaultError, DaemonUnreachableError, RestClient
+from strands_robots.drivers.reachy.target import (
     ACTION_KEYS,
     BOUNDS,
+    GESTURES,
     INIT_ANTENNAS,
     SLEEP_ANTENNAS,
     Target,
     check,
     from_action,
 )
-from strands_robots.drivers.reachy.feed import FRESH_S
-from strands_robots.drivers.reachy.links import ZENOH_PORT, PubSub
-from strands_robots.drivers.reachy.motion import Motions, head_distance
-from strands_robots.drivers.reachy.motors import Motors
-from strands_robots.drivers.reachy.rest import DaemonError, DaemonUnreachable
-from strands_robots.drivers.reachy.transport import DEFAULT_PREFIX, SLEEP_DISABLES_SINCE
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import flag
+from strands_robots.utils import ValidationError, choice, flag, identifier, shown, text
 
 UPRIGHT_LEGS = (0.6265, -0.6265, 0.6265, -0.6265, 0.6265, -0.6265)
 """Legs of the head at the identity, in radians, by the daemon's own inverse kinematics."""
 
 ARRIVED = 0.2
+"""Largest error of a joint at the end of a move, in radians."""
+
 POSE_EVERY_S = 0.005
-GESTURES = {"nod": gestures.nod, "shake": gestures.shake, "happy": gestures.happy}
+
+MOTOR_IDS = {
+    "body_rotation": 10,
+    **{f"stewart_{leg}": 10 + leg for leg in range(1, 7)},
+    "right_antenna": 17,
+    "left_antenna": 18,
+}
+"""Motor names that the daemon knows, and their ids on the bus."""
+
+LIBRARIES = {
+    "emotions": "pollen-robotics/reachy-mini-emotions-library",
+    "dances": "pollen-robotics/reachy-mini-dances-library",
+}
+"""Data sets of recorded moves."""
+
+
+def motor_names(motor_ids: object) -> tuple[str, ...]:
+    """Return the motors of a comma list of names or bus ids; empty for all.
+
+    Raises:
+        ValidationError: no text, a part that is no motor, or a list that names none.
+    """
+    chosen = text("motor_ids", motor_ids, longest=200, empty=True)
+    if not chosen:
+        return ()
+    by_id = {str(number): name for name, number in MOTOR_IDS.items()}
+    parts = [part.strip() for part in chosen.split(",") if part.strip()]
+    names = tuple(dict.fromkeys(by_id.get(part, part) for part in parts))
+    if not names or any(name not in MOTOR_IDS for name in names):
+        known = ", ".join(f"{name} ({number})" for name, number in MOTOR_IDS.items())
+        raise ValidationError(f"motor_ids must name motors of {known}, or be empty for all, not {shown(motor_ids)}.")
+    return names
+
+
+class Motors:
+    """Torque of one robot's motors.
+
+    The mode of all motors is verified by asking back; the daemon never reports the torque of a single motor.
+    """
+
+    def __init__(self, connection: Connection, motions: MotionController) -> None:
+        self._connection, self._motions = connection, motions
+        self._set_singly = False
+
+    def mode(self, rest: RestClient | None = None, within_s: float | None = None) -> str:
+        """Ask for the mode: enabled, disabled or gravity_compensation. Raises :class:`DaemonError`."""
+        answer = (rest or self._connection.rest).get("/api/motors/status", within_s)
+        mode = str(answer.get("mode")) if isinstance(answer, dict) else "unknown"
+        self._connection.note_mode(mode)
+        return mode
+
+    def set_mode(self, mode: str) -> None:
+        """Set the mode of all motors and verify it. Raises :class:`DaemonError`."""
+        info = self._connection.info
+        if mode == "enabled" and self._set_singly and info is not None and not info.since(STOP_MOVE_SINCE):
+            # Before 1.10 a robot ignored this after torque was set motor by motor, unless all were off in between.
+            self._connection.rest.post("/api/motors/set_mode/disabled")
+        self._set(mode, self._connection.rest)
+        self._set_singly = False
+
+    def release(self, within_s: float = 1.0) -> None:
+        """Switch all motors off, for an emergency stop: no turn, no permit, its own connection."""
+        self._set("disabled", self._connection.stop_rest, within_s)
+
+    def _set(self, mode: str, rest: RestClient, within_s: float | None = None) -> None:
+        rest.post(f"/api/motors/set_mode/{mode}", within_s=within_s)
+        now = self.mode(rest, within_s)
+        if now != mode:
+            raise DaemonFaultError(f"the motors were to be {mode} and are {now}.")
+
+    def torque(self, on: bool, motor_ids: str, name: str) -> Envelope:
+        """Switch torque on or off, of all motors or of some; ``name`` is the verb of the caller."""
+        names, mode = motor_names(motor_ids), "enabled" if on else "disabled"
+        if not names:
+            self._motions.torque(lambda: self.set_mode(mode), name)
+            return success(f"All motors are {mode}.", motors="all", motor_mode=mode, verified=True)
+
+        def change() -> None:
+            self._connection.link().send_torque(on, names)
+            self._set_singly = True
+
+        self._motions.torque(change, name)
+        return success(
+            f"Asked for {', '.join(names)} {mode}; the daemon does not report the torque of a single motor.",
+            motors=list(names),
+            verified=False,
+        )
+
+
+class RecordedMoves:
+    """Recorded moves of one robot's daemon, kept on a hub that may be out of reach.
+
+    A daemon that asks a hub which accepts and does not answer freezes as a whole, stop included (measured: over
+    120 s). So a data set that is not known to be in the daemon's cache is asked for only while nothing moves, over a
+    connection of its own.
+    """
+
+    def __init__(self, connection: Connection, motions: MotionController) -> None:
+        self._connection, self._motions = connection, motions
+        self._known: dict[str, tuple[int, tuple[str, ...]]] = {}
+
+    def names(self, library: str) -> Envelope:
+        """Answer with the ``moves`` of a library, or with the reason why they are unknown."""
+        checked = choice("library", library, tuple(LIBRARIES))
+        refusal = self._fetch(checked)
+        if refusal is not None:
+            return refusal
+        moves = list(self._known[checked][1])
+        return success(f"{len(moves)} recorded moves in {checked}.", library=checked, moves=moves)
+
+    def play(self, move_name: str, library: str) -> Envelope:
+        """Start a recorded move; an event and the status report its end."""
+        name = identifier("move_name", move_name)
+        checked = choice("library", library, tuple(LIBRARIES))
+        reason = self._connection.refusal()
+        if reason is not None:
+            return error(f"playMove refused: {reason}.")
+        refusal = self._fetch(checked)
+        if refusal is not None:
+            return refusal
+        if name not in self._known[checked][1]:
+            return error(f"{checked} has no move {name!r}; listMoves has the names.")
+        path = f"/api/move/play/recorded-move-dataset/{LIBRARIES[checked]}/{name}"
+        uuid = self._motions.daemon_move(name, path, arrived=str)
+        return success(f"Playing {name}.", move=name, library=checked, uuid=uuid)
+
+    def _fetch(self, library: str) -> Envelope | None:
+        """Make sure that the names are known and the daemon has the data set; return the refusal where not."""
+        known = self._known.get(library)
+        if known is not None and known[0] == self._connection.connects:
+            return None
+        unknown = f"The catalogue of {library} is unknown"
+        try:
+            if self._motions.moving():
+                return error(f"{unknown}, and asking while the robot moves could freeze its daemon; stop it first.")
+            answer = self._connection.hub_rest.get(f"/api/move/recorded-move-datasets/list/{LIBRARIES[library]}")
+        except (DaemonError, ValidationError) as exc:
+            return error(f"{unknown}: {exc}")
+        if not isinstance(answer, list) or not all(isinstance(name, str) for name in answer):
+            return error(f"{unknown}: the daemon's answer is no list of names.")
+        self._known[library] = (self._connection.connects, tuple(answer))
+        return None
 
 
 class ReachyDriver:
@@ -44,11 +189,11 @@ class ReachyDriver:
         host: bare hostname or IP literal of the daemon.
         prefix: of the Zenoh keys of a daemon before 1.5; the default gives way to the robot's own name.
         api_port: TCP port of the daemon.
-        transport: ``auto`` for what the daemon speaks, ``websocket`` or ``zenoh``.
+        transport: ``auto`` for the link that the daemon speaks, ``websocket`` or ``zenoh``.
         automatic_body_yaw: let the daemon turn the body along with the head; without it head and body may be at most
             65 degrees apart.
         session: a pub/sub object for the Zenoh link in place of a session of its own.
-        zenoh_port: where a daemon before 1.5 listens for it.
+        zenoh_port: Zenoh port of a daemon before 1.5.
 
     Raises:
         ValidationError: an argument outside its domain.
@@ -74,16 +219,16 @@ class ReachyDriver:
             host, api_port, prefix=prefix, transport=transport, session=session, zenoh_port=zenoh_port
         )
         self.gate = MotionGate()
-        self.motions = Motions(self.connection, self.gate, self.tool_name_str, automatic_body_yaw=self._automatic)
+        self.motions = MotionController(
+            self.connection, self.gate, self.tool_name_str, automatic_body_yaw=self._automatic
+        )
         self.motors = Motors(self.connection, self.motions)
-        self.catalogue = Library(self.connection, self.motions)
+        self.catalogue = RecordedMoves(self.connection, self.motions)
 
     @property
     def safety_key(self) -> str:
-        """Under which a lockout of this robot is remembered, whatever device id it is given."""
+        """Key of this robot's lockout in the store, independent of its device id."""
         return f"hardware:{self.tool_name_str}:{self.connection.host}:{self.connection.port}"
-
-    # LeRobot's verbs.
 
     @property
     def observation_features(self) -> dict[str, type]:
@@ -107,34 +252,34 @@ class ReachyDriver:
 
     @property
     def is_calibrated(self) -> bool:
-        """Always: the daemon calibrates its robot."""
+        """Always true: the daemon calibrates its robot."""
         return True
 
     def calibrate(self) -> None:
-        """Nothing to do: the daemon calibrates its robot."""
+        """Do nothing: the daemon calibrates its robot."""
 
     def configure(self) -> None:
-        """Nothing to do: the daemon configures its motors."""
+        """Do nothing: the daemon configures its motors."""
 
     def connect(self, calibrate: bool = False, *, within_s: float = 10.0) -> None:
-        """Connect, and wait until joint data arrives, and for its first head pose.
+        """Connect and wait for joint data and the first head pose.
 
         Raises:
-            DaemonUnreachable: no joint data ``within_s``; the driver has let go again.
+            DaemonUnreachableError: no joint data ``within_s``; the driver has disconnected again.
         """
         del calibrate
         self.connection.start()
         if not self.connection.wait(within_s):
-            why = self.connection.refusal()
+            reason = self.connection.refusal()
             self.connection.close()
-            raise DaemonUnreachable(f"Reachy Mini at {self.connection.host}:{self.connection.port}: {why}.")
+            raise DaemonUnreachableError(f"Reachy Mini at {self.connection.host}:{self.connection.port}: {reason}.")
         # The head's pose is a message of its own, and an observation needs both.
         deadline = time.monotonic() + min(within_s, FRESH_S)
         while self.connection.feed.pose() is None and time.monotonic() < deadline:
             time.sleep(POSE_EVERY_S)
 
     def connect_eagerly(self, within_s: float = 5.0) -> Envelope:
-        """Connect and say how it went; a robot that is away is connected to as soon as it appears. Never raises."""
+        """Connect and answer with the result; never raises. The driver keeps trying to reach a robot that is away."""
         self.connection.start()
         if self.connection.wait(within_s):
             return success("Connected.", **self.facts())
@@ -143,31 +288,31 @@ class ReachyDriver:
         )
 
     def disconnect(self) -> None:
-        """Halt what we started, then let go. The robot holds its pose."""
+        """Halt every motion, then disconnect. The robot keeps its pose."""
         if self.connection.connects:
             self.motions.halt("disconnect")
         self.gate.revoke()
         self.connection.close()
 
     def cleanup(self) -> None:
-        """The same as :meth:`disconnect`."""
+        """Disconnect, as :meth:`disconnect` does."""
         self.disconnect()
 
     def get_observation(self) -> dict[str, float]:
-        """Measured head pose, body yaw and antennas by action key, in metres and radians.
+        """Return measured head pose, body yaw and antennas by action key, in metres and radians.
 
         Raises:
-            DaemonUnreachable: not connected, or the data is older than 1.5 s.
+            DaemonUnreachableError: not connected, or the data is older than 1.5 s.
         """
         joints, pose = self.connection.feed.fresh_joints, self.connection.feed.pose()
         if joints is None or pose is None:
-            raise DaemonUnreachable(
+            raise DaemonUnreachableError(
                 f"Reachy Mini has no fresh data: {self.connection.refusal() or 'unusable numbers'}."
             )
         return Target(pose, joints.body_yaw, joints.antennas).action()
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Send one frame and return what was really sent: at most 0.3 rad and 10 mm from the last one, at 50 Hz.
+        """Send one frame and return the action sent: at most 0.3 rad and 10 mm from the last one, at 50 Hz.
 
         Raises:
             ValidationError: a key or value outside the envelope.
@@ -177,7 +322,7 @@ class ReachyDriver:
         return self.motions.stream(target, "send_action").action()
 
     def hold(self) -> None:
-        """Stop whatever moves the robot, so that it keeps its pose: how a control loop around this driver freezes it.
+        """Stop every motion so that the robot keeps its pose, for a control loop around this driver.
 
         Raises:
             DaemonError: it is not known to stand still.
@@ -186,10 +331,10 @@ class ReachyDriver:
         if not verdict.stopped:
             raise DaemonError(f"Reachy Mini is not known to stand still: {verdict.envelope().get('reason')}")
 
-    # Reachy's own verbs. Each raises MotionRefused, ValidationError or DaemonError where it does not do it.
+    # Reachy's own verbs. A verb that fails raises MotionRefused, ValidationError or DaemonError.
 
     def checked(self, target: Target) -> Target:
-        """``target`` when the robot can reach it from where it is. Raises :class:`ValidationError`."""
+        """Return ``target`` when the robot can reach it from its position. Raises :class:`ValidationError`."""
         return check(target, automatic_body_yaw=self._automatic, body_yaw=self.motions.present().body_yaw)
 
     def go(self, target: Target, name: str = "go") -> Envelope:
@@ -203,40 +348,38 @@ class ReachyDriver:
         return success(f"{name}: started.", motion=name)
 
     def wake_up(self) -> Envelope:
-        """Enable the motors, make sure of it, and play the daemon's wake-up; its end is told by event and status."""
-
-        def enable() -> None:
-            self.motors.set_mode("enabled")
-
-        uuid = self.motions.daemon_move("wakeUp", "/api/move/play/wake_up", reached=self._awake, before=enable)
+        """Enable and verify the motors and play the daemon's wake-up; an event and the status report its end."""
+        uuid = self.motions.daemon_move(
+            "wakeUp", "/api/move/play/wake_up", arrived=self._awake, before=lambda: self.motors.set_mode("enabled")
+        )
         return success("Motors enabled; waking up.", motor_mode="enabled", uuid=uuid)
 
     def sleep(self) -> Envelope:
-        """Play the daemon's way to sleep, after which the motors are off; the end is told by event and status."""
-        uuid = self.motions.daemon_move("sleep", "/api/move/play/goto_sleep", reached=self._asleep)
+        """Play the daemon's way to sleep, which ends with the motors off; an event and the status report its end."""
+        uuid = self.motions.daemon_move("sleep", "/api/move/play/goto_sleep", arrived=self._asleep)
         return success("Going to sleep.", uuid=uuid)
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Tell ``observer`` of every motion's end."""
-        return self.motions.subscribe(observer)
+        """Call ``observer`` at every motion's end."""
+        return self.motions.observers.subscribe(observer)
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop every motion source: gestures, ramps, streams, and every move that the daemon runs."""
         return self.motions.halt(reason)
 
     def emergency_stop(self, reason: str = "", *, release: bool = False) -> Envelope:
-        """Halt, then hold the pose or, with ``release``, switch the motors off; says what it did."""
+        """Halt, then keep the pose or, with ``release``, switch the motors off."""
         verdict = self.halt(reason).envelope()
         if not flag("release", release):
             return {**verdict, "torque": "held"}
         try:
             self.motors.release()
-        except Exception as exc:  # noqa: BLE001 - an emergency stop reports whatever its parts did
+        except Exception as exc:  # noqa: BLE001 - an emergency stop reports every failure of its parts
             return error(f"{verdict['content'][0]['text']} Torque was not released: {exc}", stopped=verdict["stopped"])
         return {**verdict, "torque": "released"}
 
     def get_joints(self) -> Envelope:
-        """Joint positions by motor name, radians, and their age; stale ones are refused."""
+        """Answer with joint positions by motor name, in radians, and their age; stale ones are refused."""
         joints = self.connection.feed.joints
         age = time.monotonic() - joints.at if joints else None
         if joints is None or age is None or age > FRESH_S or not self.connection.alive:
@@ -244,11 +387,11 @@ class ReachyDriver:
         return success("Joint positions in radians.", joints=joints.named(), age_s=round(age, 4))
 
     def get_imu(self) -> Envelope:
-        """The inertial sample and its age; stale ones are refused, and a robot without a sensor says so."""
+        """Answer with the inertial sample and its age; refused when stale or on a robot without a sensor."""
         imu = self.connection.feed.imu()
         if imu is None:
-            why = self.connection.refusal()
-            return error(f"No IMU data: {why}." if why else "This Reachy Mini has no IMU.")
+            reason = self.connection.refusal()
+            return error(f"No IMU data: {reason}." if reason else "This Reachy Mini has no IMU.")
         age = time.monotonic() - imu.at
         if age > FRESH_S:
             return error(f"IMU data is stale: {age:.1f} s old.", age_s=round(age, 3))
@@ -262,10 +405,10 @@ class ReachyDriver:
         )
 
     def facts(self) -> dict[str, Any]:
-        """The driver's whole truth: link, daemon, motors, application, data age, motion, and how far off target."""
+        """Return the state of link, daemon, motors, application, data, motion, and the head's error in radians."""
         connection, info, feed = self.connection, self.connection.info, self.connection.feed
         motion, joints = self.motions.current, feed.joints
-        off = head_distance(self.motions.sent_head, feed.pose())
+        sent, measured = self.motions.sent_head, feed.pose()
         return {
             "connected": connection.alive,
             "unavailable": connection.refusal() or "",
@@ -274,12 +417,12 @@ class ReachyDriver:
             "daemon_state": info.state if info else "",
             "daemon_error": info.error if info else "",
             "motor_mode": connection.motor_mode,
-            "app": connection.polled.holder,
+            "app": connection.last_poll.holder,
             "data_age_s": round(time.monotonic() - joints.at, 3) if joints else None,
             "moving": motion.name if motion and motion.running else "",
             "last_motion": motion.facts() if motion else None,
-            "foreign_moves": len(connection.polled.moves - {motion.uuid if motion else ""}),
-            "head_error_rad": round(off, 4) if off is not None else None,
+            "foreign_moves": len(connection.last_poll.moves - {motion.uuid if motion else ""}),
+            "head_error_rad": round(sent.angle_to(measured), 4) if sent and measured else None,
             "unusable_frames": feed.unusable_frames,
         }
 

@@ -1,7 +1,11 @@
-"""The two ways to stream to a daemon: a WebSocket since 1.5, Zenoh before.
+"""Streams to a daemon: a WebSocket since 1.5, Zenoh before, chosen by the status that the daemon reports.
 
-A link sends and hands what it hears to a sink; it neither judges liveness nor reconnects, the driver does. Nothing is
-acknowledged by the daemon on either. Third parties are loaded by ``open``.
+A link sends, and hands every received message to a sink; the connection judges liveness and reconnects. The daemon
+acknowledges nothing on either. Third parties are loaded by ``open``.
+
+The badge ``wireless_version`` does not decide: daemons 1.0.0 to 1.4.1 speak Zenoh on every robot, 1.5.0 and newer a
+WebSocket on every robot (measured on 1.4.1, 1.5.0, 1.9.0 and 1.13.0). The badge is used only where the daemon reports
+neither a version nor a type.
 """
 
 from __future__ import annotations
@@ -9,20 +13,41 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import re
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
 
-from strands_robots.drivers.reachy.envelope import Target
-from strands_robots.drivers.reachy.feed import Sink
-from strands_robots.drivers.reachy.rest import CONNECT_S, DaemonUnreachable, checked_host, dialled
-from strands_robots.drivers.reachy.websocket import open_socket
+from strands_robots.drivers.reachy.rest import (
+    CONNECT_S,
+    DaemonFaultError,
+    DaemonUnreachableError,
+    checked_host,
+    url_host,
+)
+from strands_robots.drivers.reachy.target import Target
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
 
 logger = logging.getLogger(__name__)
 
 ZENOH_PORT = 7447
+DEFAULT_PREFIX = "reachy_mini"
 OUT_TOPICS = ("joint_positions", "head_pose", "imu_data", "daemon_status")
+TRANSPORTS = ("auto", "websocket", "zenoh")
+
+WEBSOCKET_SINCE = (1, 5)
+PREFIX_SINCE = (1, 2)
+FULL_TARGET_SINCE = (1, 6)
+APP_LOCK_SINCE = (1, 7)
+STOP_MOVE_SINCE = (1, 10)
+SLEEP_DISABLES_SINCE = (1, 10)
+
+_VERSION = re.compile(r"(\d+)\.(\d+)(?:\.(\d+))?")
+
+Sink = Callable[[str, str | bytes], None]
+"""Takes the kind and the text of a received message."""
 
 
 class Link(Protocol):
@@ -31,26 +56,43 @@ class Link(Protocol):
     kind: str
 
     def open(self, sink: Sink) -> None:
-        """Connect and hand every message to ``sink``. Raises :class:`DaemonUnreachable`."""
+        """Connect and hand every message to ``sink``. Raises :class:`DaemonUnreachableError`."""
 
     def close(self) -> None:
-        """Let go; sending afterwards raises :class:`DaemonUnreachable`."""
+        """Disconnect; sending afterwards raises :class:`DaemonUnreachableError`."""
 
     @property
     def closed(self) -> bool:
-        """The transport itself knows that it is gone. Only data says that it is alive."""
+        """The transport itself reports that it is closed; an open one may still be dead."""
 
     def send_target(self, target: Target) -> None:
         """Go there with the next control tick. Checked values only."""
 
     def send_torque(self, on: bool, ids: Sequence[str] | None) -> None:
-        """Torque of some motors by name, None all."""
+        """Switch the torque of some motors by name, or of all for None."""
 
     def send_automatic_body_yaw(self, on: bool) -> None:
         """Let the daemon turn the body along with the head."""
 
     def stop_move(self) -> bool:
-        """End the daemon's current move where the link has a word for it; False where it has none."""
+        """End the daemon's current move; False where the link has no such message."""
+
+
+def open_socket(stack: contextlib.ExitStack, host: str, api_port: int, path: str) -> Any:
+    """Open a WebSocket that closes with ``stack``. Raises :class:`DaemonUnreachableError`."""
+    try:
+        from websockets.exceptions import WebSocketException  # noqa: PLC0415 - optional, loaded by the first link
+        from websockets.sync.client import connect  # noqa: PLC0415 - the same
+    except ImportError as exc:
+        raise missing_extra("Reachy Mini", "reachy") from exc
+    url = f"ws://{url_host(host)}:{api_port}{path}"
+    try:
+        # No compression: a frame of 300 bytes costs more to inflate than to carry. No keepalive: data shows life.
+        return stack.enter_context(
+            connect(url, compression=None, ping_interval=None, open_timeout=CONNECT_S, close_timeout=0.5, proxy=None)
+        )
+    except (OSError, WebSocketException) as exc:
+        raise DaemonUnreachableError(f"{url} did not open: {exc}.") from exc
 
 
 class WebSocketLink:
@@ -68,22 +110,22 @@ class WebSocketLink:
         self._full_target, self._can_stop = full_target, can_stop
         self._socket: Any = None
         self._stack = contextlib.ExitStack()
-        self._gone = threading.Event()
+        self._closed = threading.Event()
 
     def open(self, sink: Sink) -> None:
         self._stack = contextlib.ExitStack()
         self._socket = open_socket(self._stack, self._host, self._port, "/ws/sdk")
-        self._gone.clear()
+        self._closed.clear()
         threading.Thread(target=self._read, args=(self._socket, sink), name="reachy-link", daemon=True).start()
 
     def close(self) -> None:
-        self._gone.set()
+        self._closed.set()
         self._socket = None
         self._stack.close()
 
     @property
     def closed(self) -> bool:
-        return self._gone.is_set()
+        return self._closed.is_set()
 
     def send_target(self, target: Target) -> None:
         parts: dict[str, Any] = {}
@@ -112,18 +154,17 @@ class WebSocketLink:
         return self._can_stop
 
     def send(self, message: dict[str, Any]) -> None:
-        """One object as a text frame: the daemon drops the connection at a binary one."""
+        """Send one object as a text frame: the daemon drops the connection at a binary one."""
         current = self._socket
-        if current is None or self._gone.is_set():
-            raise DaemonUnreachable("The link to the daemon is closed.")
+        if current is None or self._closed.is_set():
+            raise DaemonUnreachableError("The link to the daemon is closed.")
         try:
             current.send(json.dumps(message, allow_nan=False, separators=(",", ":")))
         except Exception as exc:
-            self._gone.set()
-            raise DaemonUnreachable(f"The link to the daemon broke: {exc}.") from exc
+            self._closed.set()
+            raise DaemonUnreachableError(f"The link to the daemon broke: {exc}.") from exc
 
     def _read(self, socket: Any, sink: Sink) -> None:
-        """Hand on each frame until the connection ends, whatever ends it."""
         try:
             for frame in socket:
                 sink(_kind(frame), frame)
@@ -131,28 +172,27 @@ class WebSocketLink:
             logger.info("The link to %s ended: %s", self._host, exc)
         finally:
             if socket is self._socket or self._socket is None:
-                self._gone.set()
+                self._closed.set()
 
 
 def _kind(frame: str | bytes) -> str:
-    """The ``type`` of a frame; it stands first in every one of the daemon's but the IMU's, where it is last."""
+    """Return the ``type`` of a frame; it is the first key of every frame but the IMU's, where it is the last."""
     if isinstance(frame, bytes):
         return ""
     if frame.startswith('{"type":"'):
         return frame[9 : frame.find('"', 9)]
     try:
-        found = json.loads(frame)
+        message = json.loads(frame)
     except ValueError:
         return ""
-    return str(found.get("type", "")) if isinstance(found, dict) else ""
+    return str(message.get("type", "")) if isinstance(message, dict) else ""
 
 
-@runtime_checkable
 class PubSub(Protocol):
-    """What a :class:`ZenohLink` needs of a session."""
+    """The part of a pub/sub session that :class:`ZenohLink` uses."""
 
-    def subscribe(self, key: str, heard: Callable[[bytes], None]) -> Callable[[], None]:
-        """Call ``heard`` with each payload under ``key``; the result unsubscribes."""
+    def subscribe(self, key: str, on_payload: Callable[[bytes], None], /) -> Callable[[], None]:
+        """Call ``on_payload`` with each payload under ``key``; the result unsubscribes."""
 
     def publish(self, key: str, payload: bytes) -> None:
         """Put one payload."""
@@ -162,10 +202,10 @@ class PubSub(Protocol):
 
 
 def key_prefix(value: object) -> str:
-    """A ``/``-joined sequence of identifiers; a wildcard would reach every robot under it.
+    """Return a ``/``-joined sequence of identifiers; a wildcard would reach every robot under it.
 
     Raises:
-        ValidationError: naming the part that is none.
+        ValidationError: naming the part that is no identifier.
     """
     if not isinstance(value, str) or not value:
         raise ValidationError(f"prefix must be identifiers joined by '/', not {shown(value)}.")
@@ -175,10 +215,10 @@ def key_prefix(value: object) -> str:
 
 
 class ZenohLink:
-    """Keys under a prefix, on a session that it is given or on a client session of its own to the daemon.
+    """Keys under a prefix, on a given session or on a client session of its own to the daemon.
 
     Args:
-        host: where the daemon's Zenoh router listens, port 7447, when no ``session`` is given.
+        host: of the daemon's Zenoh router, port 7447, when no ``session`` is given.
         prefix: of the robot's keys.
         session: a :class:`PubSub` to use in place of an own one; it stays open when the link closes.
     """
@@ -186,25 +226,25 @@ class ZenohLink:
     kind = "zenoh"
 
     def __init__(
-        self, host: str, prefix: str = "reachy_mini", *, session: PubSub | None = None, zenoh_port: int = ZENOH_PORT
+        self, host: str, prefix: str = DEFAULT_PREFIX, *, session: PubSub | None = None, zenoh_port: int = ZENOH_PORT
     ) -> None:
         self._host, self._port, self._prefix = checked_host(host), zenoh_port, key_prefix(prefix)
         self._given, self._session = session, session
-        self._leave: list[Callable[[], None]] = []
+        self._unsubscribe: list[Callable[[], None]] = []
         self._open = False
 
     def open(self, sink: Sink) -> None:
-        session = self._given or ClientSession(f"tcp/{dialled(self._host)}:{self._port}")
+        session = self._given or ClientSession(f"tcp/{url_host(self._host)}:{self._port}")
         self._session = session
         for topic in OUT_TOPICS:
-            self._leave.append(session.subscribe(f"{self._prefix}/{topic}", _Into(topic, sink)))
+            self._unsubscribe.append(session.subscribe(f"{self._prefix}/{topic}", partial(sink, topic)))
         self._open = True
 
     def close(self) -> None:
         self._open = False
-        leave, self._leave = self._leave, []
+        subscriptions, self._unsubscribe = self._unsubscribe, []
         session, self._session = self._session, self._given
-        for unsubscribe in leave:
+        for unsubscribe in subscriptions:
             unsubscribe()
         if session is not None and session is not self._given:
             session.close()
@@ -235,24 +275,14 @@ class ZenohLink:
         return False
 
     def send_cmd(self, command: dict[str, Any]) -> None:
-        """One object to ``<prefix>/command``."""
+        """Publish one object to ``<prefix>/command``."""
         session = self._session
         if session is None or not self._open:
-            raise DaemonUnreachable("The link to the daemon is closed.")
+            raise DaemonUnreachableError("The link to the daemon is closed.")
         try:
             session.publish(f"{self._prefix}/command", json.dumps(command, allow_nan=False).encode())
         except Exception as exc:
-            raise DaemonUnreachable(f"The link to the daemon broke: {exc}.") from exc
-
-
-class _Into:
-    """Hands payloads of one topic to the sink."""
-
-    def __init__(self, topic: str, sink: Sink) -> None:
-        self._topic, self._sink = topic, sink
-
-    def __call__(self, payload: bytes) -> None:
-        self._sink(self._topic, payload)
+            raise DaemonUnreachableError(f"The link to the daemon broke: {exc}.") from exc
 
 
 class ClientSession:
@@ -275,14 +305,14 @@ class ClientSession:
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as exc:
-            raise DaemonUnreachable(f"{endpoint} did not open: {exc}.") from exc
+            raise DaemonUnreachableError(f"{endpoint} did not open: {exc}.") from exc
         self._zenoh_error = zenoh.ZError
 
-    def subscribe(self, key: str, heard: Callable[[bytes], None]) -> Callable[[], None]:
-        subscriber = self._session.declare_subscriber(key, lambda sample: heard(sample.payload.to_bytes()))
+    def subscribe(self, key: str, on_payload: Callable[[bytes], None], /) -> Callable[[], None]:
+        subscriber = self._session.declare_subscriber(key, lambda sample: on_payload(sample.payload.to_bytes()))
 
         def unsubscribe() -> None:
-            # A session that already ended has dropped its subscribers with it.
+            # A session that has ended has dropped its subscribers with it.
             with contextlib.suppress(self._zenoh_error):
                 subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's own stub lacks it
 
@@ -294,3 +324,74 @@ class ClientSession:
     def close(self) -> None:
         with contextlib.suppress(self._zenoh_error):  # closing twice is fine
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's own stub lacks it
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonInfo:
+    """The daemon's status object; ``version`` is empty where it reports none."""
+
+    raw: dict[str, Any]
+    version: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, status: object) -> DaemonInfo:
+        """Read a status. Raises :class:`DaemonFaultError` for anything but an object."""
+        if not isinstance(status, dict):
+            raise DaemonFaultError(f"the daemon's status is no object: {shown(status)}.")
+        match = _VERSION.match(str(status.get("version") or ""))
+        return cls(status, tuple(int(part or 0) for part in match.groups()) if match else ())
+
+    def since(self, version: tuple[int, ...]) -> bool:
+        """Whether the daemon is that version or newer; without a version, whether its status has the new type."""
+        return self.version >= version if self.version else self.raw.get("type") == "daemon_status"
+
+    @property
+    def state(self) -> str:
+        """One of not_initialized, starting, running, stopping, stopped, error; empty where none is reported."""
+        return str(self.raw.get("state") or "")
+
+    @property
+    def error(self) -> str:
+        return str(self.raw.get("error") or "")
+
+    @property
+    def motor_mode(self) -> str:
+        """One of enabled, disabled, gravity_compensation; empty while no backend runs."""
+        backend = self.raw.get("backend_status")
+        return str(backend.get("motor_control_mode") or "") if isinstance(backend, dict) else ""
+
+    @property
+    def link(self) -> str:
+        """The link that this daemon serves: websocket or zenoh."""
+        if self.raw.get("type") == "daemon_status" or self.version >= WEBSOCKET_SINCE:
+            return "websocket"
+        return "zenoh" if self.version or self.raw.get("wireless_version") is True else "websocket"
+
+    def prefix(self, requested: str) -> str:
+        """Return the prefix of the robot's keys: the caller's own, else the robot's name where the daemon uses it."""
+        name = self.raw.get("robot_name")
+        if requested != DEFAULT_PREFIX or not isinstance(name, str) or self.version < PREFIX_SINCE:
+            return requested
+        try:
+            return key_prefix(name)
+        except ValidationError as exc:
+            raise DaemonFaultError(f"the daemon's robot_name cannot be a key prefix: {exc}") from exc
+
+
+def make_link(
+    info: DaemonInfo,
+    host: str,
+    api_port: int,
+    *,
+    prefix: str,
+    transport: str = "auto",
+    session: PubSub | None = None,
+    zenoh_port: int = ZENOH_PORT,
+) -> Link:
+    """Return the link for a daemon, not yet open; ``transport`` other than auto overrides the rule."""
+    kind = info.link if transport == "auto" else transport
+    if kind == "zenoh":
+        return ZenohLink(host, info.prefix(prefix), session=session, zenoh_port=zenoh_port)
+    return WebSocketLink(
+        host, api_port, full_target=info.since(FULL_TARGET_SINCE), can_stop=info.since(STOP_MOVE_SINCE)
+    )

@@ -1,29 +1,29 @@
-"""One move at a time, and the stop.
+"""Motions of one Reachy Mini, one at a time, and their stop.
 
-The daemon runs every move that it is asked for, together, and lets them fight. So the order is kept here: a new motion
-stops the one before it, whatever it is; each write asks its permit under the lock of the write; and a halt voids all
-permits, waits for the write in flight, and stops every move that the daemon says is running.
+The daemon runs every move that it is asked for at the same time, and lets them fight. So the order is kept here: a new
+motion stops the one before it; each write checks its permit under the lock of the write; and a halt voids all permits,
+waits for the write in flight, and stops every move that the daemon reports as running.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 from strands_robots import settings
-from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
-from strands_robots.drivers.reachy.connection import Connection
-from strands_robots.drivers.reachy.envelope import STREAM_HZ, Target
-from strands_robots.drivers.reachy.gestures import Frames, Gesture, ramp
-from strands_robots.drivers.reachy.moves import DaemonMoves
-from strands_robots.drivers.reachy.pose import HeadPose
-from strands_robots.drivers.reachy.rest import DaemonError, DaemonFault, DaemonUnreachable
-from strands_robots.drivers.reachy.updates import End, MoveUpdates
+from strands_robots.contract import RolloutEvent
+from strands_robots.drivers.reachy.connection import RUNNING_PATH, Connection, running_moves
+from strands_robots.drivers.reachy.links import open_socket
+from strands_robots.drivers.reachy.rest import DaemonError, DaemonFaultError, DaemonUnreachableError
+from strands_robots.drivers.reachy.target import STREAM_HZ, Frames, Gesture, HeadPose, Target, ramp
 from strands_robots.envelope import error, success
+from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.utils import ValidationError
@@ -31,16 +31,26 @@ from strands_robots.utils import ValidationError
 logger = logging.getLogger(__name__)
 
 FRAME_S = 1 / STREAM_HZ
+JITTER_SHARE = 0.75
+"""Part of a frame's time that frames must be apart; the rest is for a caller's own jitter."""
 POLL_S = 0.1
+REPLACE_S = 2.0
+"""Longest time that the motion before may take to end, in seconds."""
 REST_MOVE_LONGEST_S = 600.0
 
-Reached = Callable[[], str]
-"""Why a finished move is not where it should be; empty when it is."""
+STOP_PATH, UPDATES_PATH = "/api/move/stop", "/api/move/ws/updates"
+MOVE_ENDS = {"move_completed": "completed", "move_failed": "error", "move_cancelled": "stopped"}
+
+ArrivalCheck = Callable[[], str]
+"""Returns the reason why a finished move is not where it should be; empty when it is."""
 
 
 @dataclass(eq=False)
-class Motion:
-    """One motion that runs, or the last one that ran. ``uuid`` only for a move of the daemon, ``brief`` for a frame."""
+class ReachyMotion:
+    """One motion that runs, or the last one that ran.
+
+    ``uuid`` is set for a move of the daemon only; ``brief`` marks a motion of a single frame.
+    """
 
     name: str
     permit: Permit
@@ -58,17 +68,99 @@ class Motion:
     def running(self) -> bool:
         return not self.done.is_set()
 
-    def still_permitted(self) -> None:
-        """Raises :class:`MotionRefused` once halted, locked or replaced."""
+    def check(self) -> None:
+        """Raise :class:`MotionRefused` once halted, locked or replaced."""
         if self.cancelled.is_set() or not self.permit.valid:
             raise MotionRefused(error(f"{self.name} was halted."))
 
     def facts(self) -> dict[str, str]:
+        """Return name, state and detail."""
         return {"name": self.name, "state": self.state, "detail": self.detail}
 
 
-class Motions:
-    """The motions of one robot."""
+class DaemonMoves:
+    """Moves that the daemon plays, over the stop's own connection.
+
+    A ``deadline`` is a moment of ``time.monotonic``; every method raises :class:`DaemonError`.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def running(self, deadline: float) -> frozenset[str]:
+        """Return the uuids that run now."""
+        return running_moves(self._connection.stop_rest.get(RUNNING_PATH, deadline - time.monotonic()))
+
+    def stop(self, uuid: str, deadline: float) -> None:
+        """Stop one; the daemon answers a move that has ended meanwhile with a bare 500."""
+        try:
+            self._connection.stop_rest.post(STOP_PATH, {"uuid": uuid}, deadline - time.monotonic())
+        except DaemonFaultError:
+            if uuid in self.running(deadline):
+                raise
+
+    def stop_all(self, own: str, deadline: float) -> tuple[frozenset[str], frozenset[str]]:
+        """Stop the move ``own`` (may be empty) first, then every other one, and list again.
+
+        Returns:
+            The uuids that were asked to stop, and those that still run.
+        """
+        stopped = frozenset({own} if own else ())
+        if own:
+            self.stop(own, deadline)
+        others = self.running(deadline) - stopped
+        for uuid in others:
+            self.stop(uuid, deadline)
+        if self._connection.alive:
+            self._connection.link().stop_move()
+        stopped |= others
+        return stopped, self.running(deadline) if stopped else frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class MoveEnd:
+    """End of a move: completed, error, stopped or unknown, and the daemon's message."""
+
+    state: str
+    detail: str = ""
+
+
+class MoveUpdates:
+    """Subscription to ``/api/move/ws/updates``, the only place where the daemon reports how a move ended.
+
+    It is opened before a move is asked for, so that not even a short one is missed.
+    """
+
+    def __init__(self, host: str, api_port: int) -> None:
+        self._stack = contextlib.ExitStack()
+        self._socket: Any = open_socket(self._stack, host, api_port, UPDATES_PATH)
+
+    def wait(self, uuid: str, within_s: float) -> MoveEnd | None:
+        """Return the end of that move, or None when it does not come in time.
+
+        Raises:
+            DaemonUnreachableError: the subscription broke.
+        """
+        deadline = time.monotonic() + within_s
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                update = json.loads(self._socket.recv(left))
+            except TimeoutError:
+                return None
+            except ValueError:
+                continue
+            except Exception as exc:
+                raise DaemonUnreachableError(f"The daemon's updates of moves broke: {exc}.") from exc
+            if isinstance(update, dict) and update.get("uuid") == uuid and update.get("type") in MOVE_ENDS:
+                return MoveEnd(MOVE_ENDS[update["type"]], str(update.get("details") or ""))
+        return None
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+class MotionController:
+    """The motions of one robot: frames that are streamed, and moves that the daemon plays."""
 
     def __init__(self, connection: Connection, gate: MotionGate, robot: str, *, automatic_body_yaw: bool) -> None:
         self._connection, self._gate, self._robot = connection, gate, robot
@@ -76,17 +168,17 @@ class Motions:
         self._automatic_body_yaw = automatic_body_yaw
         self._turn = threading.Lock()
         self._write = threading.Lock()
-        self._slot = 0.0
-        self._current: Motion | None = None
+        self._next_frame_at = 0.0
+        self._current: ReachyMotion | None = None
         self._sent = Target()
         self._sent_on = 0
-        self._told_yaw_on = 0
-        self._observers: list[Observer] = []
+        self._body_yaw_sent_on = 0
+        self.observers = RolloutObservers()
         self.frames_sent = 0
         self.last_write = 0.0
 
     @property
-    def current(self) -> Motion | None:
+    def current(self) -> ReachyMotion | None:
         """The running motion, else the last one, else None."""
         return self._current
 
@@ -95,13 +187,8 @@ class Motions:
         """The head pose that was last sent and still counts."""
         return self._sent.head if self._sent_on == self._connection.connects else None
 
-    def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Tell ``observer`` of every motion's start and end."""
-        self._observers.append(observer)
-        return lambda: self._observers.remove(observer) if observer in self._observers else None
-
     def present(self) -> Target:
-        """Where the robot is: what was last sent while nobody else moved it, else what it measures."""
+        """Return the robot's position: the last target sent while nothing else moved it, else the measured one."""
         feed = self._connection.feed
         joints = feed.fresh_joints
         measured = Target(feed.pose(), joints.body_yaw if joints else None, (joints.antennas if joints else None))
@@ -109,9 +196,14 @@ class Motions:
             self._sent = Target()
         return self._sent.over(measured)
 
+    def moving(self) -> bool:
+        """Whether a motion of ours runs or the daemon plays a move now. Raises :class:`DaemonError`."""
+        motion = self._current
+        return (motion is not None and motion.running) or bool(self._moves.running(time.monotonic() + 1.0))
+
     def stream(self, target: Target, name: str) -> Target:
-        """Send one frame now; a longer way is cut to what one frame may do. Returns what was sent."""
-        with self._taken(name) as motion:
+        """Send one frame now; a longer way is cut to one frame's. Returns the target that was sent."""
+        with self._started(name) as motion:
             start = self.present()
             steps = target.step_from(start)
             sent = start.toward(target, 1 / steps) if steps > 1 else target
@@ -121,30 +213,40 @@ class Motions:
             return sent
 
     def go(self, target: Target, name: str) -> bool:
-        """Go there: at once when one frame may, else by a ramp whose first frame is sent now. True for a ramp."""
-        with self._taken(name) as motion:
+        """Go there: at once where one frame may, else by a ramp whose first frame is sent now. True for a ramp."""
+        with self._started(name) as motion:
             start = self.present()
-            far = target.step_from(start) > 1
-            self._play(motion, ramp(start, target) if far else iter((target,)))
-            return far
+            ramped = target.step_from(start) > 1
+            self._play(motion, ramp(start, target) if ramped else iter((target,)))
+            return ramped
 
     def gesture(self, frames: Gesture, name: str) -> None:
         """Play frames at 50 Hz; the first one is sent now."""
-        with self._taken(name) as motion:
+        with self._started(name) as motion:
             self._play(motion, frames(self.present()))
 
-    def daemon_move(self, name: str, path: str, *, reached: Reached, before: Callable[[], None] | None = None) -> str:
+    def daemon_move(
+        self, name: str, path: str, *, arrived: ArrivalCheck, before: Callable[[], None] | None = None
+    ) -> str:
         """Let the daemon play a move and watch it end; returns its uuid at once.
 
-        ``before`` runs once the turn is ours and earlier motions are stopped. Raises :class:`DaemonError`.
+        Args:
+            name: of the motion, in events and answers.
+            path: posted to the daemon.
+            arrived: checked at the end, because the daemon reports `completed` for a move that did not arrive.
+            before: runs once earlier motions are stopped; with it the motors may be off.
+
+        Raises:
+            DaemonError: the daemon did not start it.
+            MotionRefused: halted, locked, or the robot is not available.
         """
-        with self._taken(name, of_daemon=True, limp=before is not None) as motion:
+        with self._started(name, of_daemon=True, motors_may_be_off=before is not None) as motion:
             updates = None
             try:
                 updates = MoveUpdates(self._connection.host, self._connection.port)
                 if before is not None:
                     before()
-                motion.still_permitted()
+                motion.check()
                 motion.uuid = _uuid(path, self._connection.rest.post(path))
             except Exception as exc:
                 if updates is not None:
@@ -154,110 +256,109 @@ class Motions:
                 raise
             motion.brief = False
             motion.posted.set()
-            self._forget()
+            self._forget_sent()
             try:
-                motion.still_permitted()
+                motion.check()
             except MotionRefused:
                 updates.close()
                 self._moves.stop(motion.uuid, time.monotonic() + 1.0)
                 self._end(motion, "stopped")
                 raise
-            threading.Thread(
-                target=self._watch, args=(motion, updates, reached), name="reachy-move", daemon=True
-            ).start()
+            watch = threading.Thread(
+                target=self._watch, args=(motion, updates, arrived), name="reachy-move", daemon=True
+            )
+            watch.start()
             return motion.uuid
 
     def torque(self, change: Callable[[], None], name: str) -> None:
-        """Run ``change``, a write of the motors' torque, in its turn; what moves is stopped first."""
-        with self._taken(name, limp=True) as motion:
+        """Run ``change``, a write of the motors' torque, after stopping every motion."""
+        with self._started(name, motors_may_be_off=True) as motion:
             try:
                 with self._write:  # so that a halt waits for it as for a frame
-                    motion.still_permitted()
+                    motion.check()
                     change()
             except Exception as exc:
                 self._end(motion, "error", str(exc))
                 raise
-            self._forget()
+            self._forget_sent()
             self._end(motion, "completed")
 
     def halt(self, reason: str) -> StopVerdict:
-        """Stop every motion source and say what it did. Any thread, never waits for a turn."""
+        """Stop every motion source and grade the result. Any thread; never waits for another motion's start."""
         self._gate.revoke()
         deadline = time.monotonic() + 0.85 * settings.number("STRANDS_HALT_DEADLINE_S")
-        motion = self._current
-        running = motion is not None and motion.running
-        if motion is not None and running:
+        motion = self._current if self._current is not None and self._current.running else None
+        if motion is not None:
             motion.detail = motion.detail or reason
             motion.cancelled.set()
-        name = motion.name if motion is not None and running and not motion.of_daemon else "stream"
-        sources: dict[str, Callable[[], object]] = {
-            name: lambda: self._still(motion if running else None, deadline),
-            "moves of the daemon": lambda: self._stop_moves(motion if running else None, deadline),
-        }
-        return halt_each(sources)
+        streamed = motion.name if motion is not None and not motion.of_daemon else "stream"
+        return halt_each(
+            {
+                streamed: lambda: self._stop_frames(motion, deadline),
+                "moves of the daemon": lambda: self._stop_moves(motion, deadline),
+            }
+        )
 
-    # Turns.
+    @contextlib.contextmanager
+    def _started(
+        self, name: str, *, of_daemon: bool = False, motors_may_be_off: bool = False
+    ) -> Iterator[ReachyMotion]:
+        """Start a motion once nothing else moves, with other starts waiting.
 
-    def moving(self) -> bool:
-        """A motion of ours runs, or the daemon plays a move, by its own word now. Raises :class:`DaemonError`."""
-        motion = self._current
-        return (motion is not None and motion.running) or bool(self._moves.running(time.monotonic() + 1.0))
-
-    @contextmanager
-    def _taken(self, name: str, *, of_daemon: bool = False, limp: bool = False) -> Iterator[Motion]:
-        """The turn, with a new motion once nothing else moves. Leave comes first: a stop is newer than what waits."""
+        The permit is taken first, so that a stop voids a start that still waits.
+        """
         permit = self._gate.permit(name)
         with self._turn:
             permit.check()
             refusal = self._connection.refusal()
             if refusal is not None:
                 raise MotionRefused(error(f"{name} refused: {refusal}.", connected=self._connection.alive))
-            if not limp and self._connection.motor_mode == "disabled":
+            if not motors_may_be_off and self._connection.motor_mode == "disabled":
                 raise MotionRefused(error(f"{name} refused: the motors are disabled; first wakeUp or enableMotors."))
             self._replace(name)
-            motion = self._current = Motion(name, permit, of_daemon)
+            motion = self._current = ReachyMotion(name, permit, of_daemon)
             try:
-                self._ready(motion)
-            except (MotionRefused, DaemonUnreachable) as exc:
+                motion.check()
+                self._send_body_yaw_mode()
+            except (MotionRefused, DaemonUnreachableError) as exc:
                 self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
                 raise
             yield motion
 
-    def _ready(self, motion: Motion) -> None:
-        """What a new connection has to be told before its first motion."""
-        motion.still_permitted()
-        if self._told_yaw_on != self._connection.connects:
+    def _send_body_yaw_mode(self) -> None:
+        """Tell the daemon once for each connection whether the body turns along."""
+        if self._body_yaw_sent_on != self._connection.connects:
             with self._write:
                 self._connection.link().send_automatic_body_yaw(self._automatic_body_yaw)
-            self._told_yaw_on = self._connection.connects
+            self._body_yaw_sent_on = self._connection.connects
 
     def _replace(self, name: str) -> None:
-        """Stop what runs: our own motion, and the moves that somebody else had the daemon play."""
+        """Stop our own running motion, and the moves of the daemon that another client started."""
         before = self._current
-        ours = before is not None and before.running
-        if before is not None and ours:
+        running = before is not None and before.running
+        if before is not None and running:
             before.detail = f"replaced by {name}"
             before.cancelled.set()
-        moves = set(self._connection.polled.moves)
+        moves = set(self._connection.last_poll.moves)
         if before is not None and before.uuid:
-            if ours:
+            if running:
                 moves.add(before.uuid)
             else:
                 moves.discard(before.uuid)
         for uuid in moves:
-            self._moves.stop(uuid, time.monotonic() + 2.0)
-            self._forget()
-        if before is not None and ours and not before.done.wait(2.0):
+            self._moves.stop(uuid, time.monotonic() + REPLACE_S)
+            self._forget_sent()
+        if before is not None and running and not before.done.wait(REPLACE_S):
             raise MotionRefused(error(f"{name} refused: {before.name} did not end.", running=before.name))
 
-    def _end(self, motion: Motion, state: str, detail: str = "") -> None:
+    def _end(self, motion: ReachyMotion, state: str, detail: str = "") -> None:
         if motion.done.is_set():
             return
         motion.state, motion.detail = state, detail or motion.detail
         motion.done.set()
         if motion.brief and state == "completed":
             return
-        self._tell(
+        self.observers.notify(
             RolloutEvent(
                 kind="finished",
                 robot=self._robot,
@@ -269,33 +370,27 @@ class Motions:
             )
         )
 
-    def _tell(self, event: RolloutEvent) -> None:
-        for observer in tuple(self._observers):
-            observer(event)
-
-    # Frames.
-
     def _pace(self) -> None:
-        """Keep frames 20 ms apart, with a quarter of that for a caller's own jitter."""
-        wait = self._slot - time.monotonic()
+        """Keep frames 20 ms apart, less the share for jitter."""
+        wait = self._next_frame_at - time.monotonic()
         if wait > 0:
             time.sleep(wait)
-        self._slot = max(self._slot + FRAME_S, time.monotonic() + 0.75 * FRAME_S)
+        self._next_frame_at = max(self._next_frame_at + FRAME_S, time.monotonic() + JITTER_SHARE * FRAME_S)
 
-    def _send(self, motion: Motion, target: Target) -> None:
+    def _send(self, motion: ReachyMotion, target: Target) -> None:
         try:
             with self._write:
-                motion.still_permitted()
+                motion.check()
                 self._connection.link().send_target(target)
                 self.last_write = time.monotonic()
-        except (DaemonUnreachable, MotionRefused) as exc:
+        except (DaemonUnreachableError, MotionRefused) as exc:
             self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
             raise
         self.frames_sent += 1
         self._sent = target.over(self.present())
         self._sent_on = self._connection.connects
 
-    def _play(self, motion: Motion, frames: Frames) -> None:
+    def _play(self, motion: ReachyMotion, frames: Frames) -> None:
         self._pace()
         self._send(motion, next(frames))
         second = next(frames, None)
@@ -305,17 +400,17 @@ class Motions:
             return
         threading.Thread(target=self._run, args=(motion, second, frames), name="reachy-frames", daemon=True).start()
 
-    def _run(self, motion: Motion, target: Target | None, frames: Frames) -> None:
+    def _run(self, motion: ReachyMotion, target: Target, frames: Frames) -> None:
         try:
             self._stream_frames(motion, target, frames)
         except MotionRefused:
             self._end(motion, "stopped")
-        except DaemonUnreachable as exc:
+        except DaemonUnreachableError as exc:
             logger.warning("%s: %s ended early: %s", self._robot, motion.name, exc)
         finally:
             self._end(motion, "error", "its frames ended with a fault; the log has it")
 
-    def _stream_frames(self, motion: Motion, target: Target | None, frames: Frames) -> None:
+    def _stream_frames(self, motion: ReachyMotion, target: Target | None, frames: Frames) -> None:
         due = time.monotonic()
         while target is not None:
             due += FRAME_S
@@ -323,21 +418,19 @@ class Motions:
                 self._end(motion, "stopped")
                 return
             self._send(motion, target)
-            # A thread that was held up goes on from now: a burst of late frames would be a jump.
+            # A delayed thread continues from now: several late frames at once would be a jump.
             due = max(due, time.monotonic() - FRAME_S)
             target = next(frames, None)
-        self._slot = time.monotonic() + 0.75 * FRAME_S
+        self._next_frame_at = time.monotonic() + JITTER_SHARE * FRAME_S
         self._end(motion, "completed")
 
-    def _forget(self) -> None:
-        """Somebody else moves the robot: only measuring says where it is."""
+    def _forget_sent(self) -> None:
+        """Forget the last target: the robot was moved by something else, so only measuring gives its position."""
         self._sent = Target()
 
-    # The daemon's moves.
-
-    def _watch(self, motion: Motion, updates: MoveUpdates, reached: Reached) -> None:
-        """Follow a move of the daemon to its end, and look whether it arrived: its word `completed` proves nothing."""
-        end: End | None = None
+    def _watch(self, motion: ReachyMotion, updates: MoveUpdates, arrived: ArrivalCheck) -> None:
+        """Follow a move of the daemon to its end and check whether it arrived."""
+        end: MoveEnd | None = None
         deadline = time.monotonic() + REST_MOVE_LONGEST_S
         try:
             while end is None and not motion.cancelled.is_set() and time.monotonic() < deadline:
@@ -345,49 +438,47 @@ class Motions:
             if end is not None and end.state == "completed":
                 # Joints come at 37 to 50 Hz: a tenth of a second later they show the end.
                 motion.cancelled.wait(POLL_S)
-                why = reached()
-                end = End("error", why) if why else end
+                reason = arrived()
+                end = MoveEnd("error", reason) if reason else end
         except (DaemonError, ValidationError) as exc:
-            end = End("unknown", str(exc))
+            end = MoveEnd("unknown", str(exc))
         finally:
             updates.close()
         if motion.cancelled.is_set():
             self._end(motion, "stopped")
         elif end is None:
-            self._end(motion, "unknown", f"no end was told in {REST_MOVE_LONGEST_S:g} s")
+            self._end(motion, "unknown", f"no end was reported within {REST_MOVE_LONGEST_S:g} s")
         else:
-            self._end(motion, end.state, end.detail or ("somebody else stopped it" if end.state == "stopped" else ""))
+            self._end(motion, end.state, end.detail or ("another client stopped it" if end.state == "stopped" else ""))
 
-    def _still(self, motion: Motion | None, deadline: float) -> object:
-        """After this no frame of a permit given before reaches the link. None when nothing was streaming."""
+    def _stop_frames(self, motion: ReachyMotion | None, deadline: float) -> object:
+        """Wait for the write in flight; afterwards no frame of an earlier permit reaches the link.
+
+        Returns None when nothing was streaming.
+        """
         if not self._write.acquire(timeout=max(0.0, deadline - time.monotonic())):
             return error("a write to the daemon does not return", stopped=False)
         self._write.release()
         streaming = motion is not None and not motion.of_daemon
         return success("no frame is sent any more", stopped=True) if streaming else None
 
-    def _stop_moves(self, motion: Motion | None, deadline: float) -> object:
-        """List the running moves, stop each, read every answer, and list again. None when there was none."""
+    def _stop_moves(self, motion: ReachyMotion | None, deadline: float) -> object:
+        """List the running moves, stop each, read every answer, and list again. Returns None when there was none."""
         if motion is not None and motion.of_daemon:
             motion.posted.wait(max(0.0, deadline - time.monotonic()))
         if self._connection.connects == 0 and (motion is None or not motion.of_daemon):
             # Never connected: nothing was ever asked of this daemon.
             return None
-        asked, left = self._moves.stop_all(motion.uuid if motion is not None else "", deadline)
-        if not asked:
+        stopped, left = self._moves.stop_all(motion.uuid if motion is not None else "", deadline)
+        if not stopped:
             return None
-        self._forget()
+        self._forget_sent()
         if left:
             return error(f"the daemon still runs {', '.join(sorted(left))}", stopped=False)
-        return success(f"stopped {len(asked)} moves", stopped=True, moves=sorted(asked))
+        return success(f"stopped {len(stopped)} moves", stopped=True, moves=sorted(stopped))
 
 
 def _uuid(path: str, answer: object) -> str:
     if not isinstance(answer, dict) or not isinstance(answer.get("uuid"), str):
-        raise DaemonFault(f"POST {path}: the answer has no uuid.")
+        raise DaemonFaultError(f"POST {path}: the answer has no uuid.")
     return str(answer["uuid"])
-
-
-def head_distance(a: HeadPose | None, b: HeadPose | None) -> float | None:
-    """Radians between two heads, None where one is unknown."""
-    return a.angle_to(b) if a is not None and b is not None else None

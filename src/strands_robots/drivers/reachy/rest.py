@@ -1,7 +1,7 @@
-"""The daemon's REST interface: one client, exact errors, short time limits.
+"""Client of the daemon's REST interface, with an error for each kind of failure and short time limits.
 
 Importable with the standard library alone; ``httpx`` is loaded by the first request. The daemon has no
-authentication: whoever reaches its port is master of the motors.
+authentication: every client that reaches its port controls the motors.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, choice, dial_host_error, missing_extra, number, port, shown
 
 if TYPE_CHECKING:
@@ -23,61 +24,61 @@ READ_S = 5.0
 METHODS = ("GET", "POST", "PUT", "DELETE")
 
 
-class DaemonError(RuntimeError):
-    """A request that did not do what it asked. ``status`` is the HTTP status, 0 when there was no answer."""
+class DaemonError(StrandsRobotsError, RuntimeError):
+    """A failed request. ``status`` is the HTTP status, 0 when there was no answer."""
 
     def __init__(self, message: str, status: int = 0) -> None:
         super().__init__(message)
         self.status = status
 
 
-class DaemonUnreachable(DaemonError):  # noqa: N818 - the name says the state
+class DaemonUnreachableError(DaemonError):
     """No connection, no answer in time, or a connection lost."""
 
 
-class DaemonRefused(DaemonError):  # noqa: N818
+class DaemonRefusedError(DaemonError):
     """400, 403, 405 or 422: the request itself is not accepted."""
 
 
-class DaemonUnknown(DaemonError):  # noqa: N818
+class DaemonNotFoundError(DaemonError):
     """404: no such path, move or data set."""
 
 
-class DaemonBusy(DaemonError):  # noqa: N818
+class DaemonBusyError(DaemonError):
     """409: the daemon does something else, or cannot do this on this robot."""
 
 
-class DaemonFault(DaemonError):  # noqa: N818
-    """500 and the like: the request failed inside the daemon, which says no more."""
+class DaemonFaultError(DaemonError):
+    """500 and the like: the request failed inside the daemon, which gives no reason."""
 
 
-class BackendDown(DaemonError):  # noqa: N818
+class BackendDownError(DaemonError):
     """503: the daemon answers but drives no robot; it is stopped, failed or not started."""
 
 
 _KINDS: dict[int, type[DaemonError]] = {
-    400: DaemonRefused,
-    403: DaemonRefused,
-    404: DaemonUnknown,
-    405: DaemonRefused,
-    409: DaemonBusy,
-    422: DaemonRefused,
-    503: BackendDown,
+    400: DaemonRefusedError,
+    403: DaemonRefusedError,
+    404: DaemonNotFoundError,
+    405: DaemonRefusedError,
+    409: DaemonBusyError,
+    422: DaemonRefusedError,
+    503: BackendDownError,
 }
 
 
 def checked_host(value: object) -> str:
-    """A bare hostname or IP literal. Raises :class:`ValidationError`."""
+    """Return a bare hostname or IP literal. Raises :class:`ValidationError` for anything else."""
     reason = dial_host_error(value)
     if reason is not None:
         raise ValidationError(reason)
     return str(value)
 
 
-def dialled(host: str) -> str:
-    """The name to put in a URL: since 1.12 the daemon answers only to IPs, localhost and ``*.local``.
+def url_host(host: str) -> str:
+    """Return the name to use in a URL: since 1.12 the daemon answers only to IPs, localhost and ``*.local``.
 
-    Any other name is resolved here, so that the Host header is an IP. Raises :class:`DaemonUnreachable`.
+    Any other name is resolved here, so that the Host header is an IP. Raises :class:`DaemonUnreachableError`.
     """
     bare = host.strip("[]")
     try:
@@ -86,10 +87,10 @@ def dialled(host: str) -> str:
         if bare == "localhost" or bare.rstrip(".").endswith(".local"):
             return bare
         try:
-            found = socket.getaddrinfo(bare, None, type=socket.SOCK_STREAM)
+            addresses = socket.getaddrinfo(bare, None, type=socket.SOCK_STREAM)
         except OSError as exc:
-            raise DaemonUnreachable(f"{host} has no address: {exc}.") from exc
-        literal = ipaddress.ip_address(found[0][4][0])
+            raise DaemonUnreachableError(f"{host} has no address: {exc}.") from exc
+        literal = ipaddress.ip_address(addresses[0][4][0])
     return f"[{literal}]" if literal.version == 6 else str(literal)
 
 
@@ -113,18 +114,18 @@ class RestClient:
         self._pool: _Pool | None = None
 
     def get(self, path: str, within_s: float | None = None) -> Any:
-        """The decoded body of a GET. Raises :class:`DaemonError`."""
+        """Return the decoded body of a GET. Raises :class:`DaemonError`."""
         return self.request("GET", path, within_s=within_s)
 
     def post(self, path: str, body: dict[str, Any] | None = None, within_s: float | None = None) -> Any:
-        """The decoded body of a POST. Raises :class:`DaemonError`."""
+        """Return the decoded body of a POST. Raises :class:`DaemonError`."""
         return self.request("POST", path, body, within_s=within_s)
 
     def request(self, method: str, path: str, body: Any = None, *, within_s: float | None = None) -> Any:
-        """One request and its decoded JSON; ``within_s`` replaces the client's time limits.
+        """Send one request and return its decoded JSON; ``within_s`` replaces the client's time limits.
 
         Raises:
-            DaemonError: by kind: unreachable, refused, unknown, busy, backend down, fault.
+            DaemonError: by kind: unreachable, refused, not found, busy, backend down, fault.
         """
         httpx = _httpx()
         pool = self._enter()
@@ -136,17 +137,17 @@ class RestClient:
                 self._retire(pool)
         except (httpx.HTTPError, httpx.InvalidURL, OSError) as exc:
             self._retire(pool)
-            what = str(exc) or type(exc).__name__
-            raise DaemonUnreachable(f"{self.host}:{self.port} did not answer {method} {path}: {what}.") from exc
+            reason = str(exc) or type(exc).__name__
+            raise DaemonUnreachableError(f"{self.host}:{self.port} did not answer {method} {path}: {reason}.") from exc
         finally:
             self._leave(pool)
         if not answer.is_success:
-            kind = _KINDS.get(answer.status_code, DaemonFault)
+            kind = _KINDS.get(answer.status_code, DaemonFaultError)
             raise kind(f"{method} {path}: {_detail(answer)}", answer.status_code)
         try:
             return answer.json()
         except ValueError as exc:
-            raise DaemonFault(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
+            raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
 
     def close(self) -> None:
         """Drop the connections, those in use when their requests end; the next request opens new ones."""
@@ -161,7 +162,7 @@ class RestClient:
                 httpx = _httpx()
                 self._pool = _Pool(
                     httpx.Client(
-                        base_url=f"http://{dialled(self.host)}:{self.port}",
+                        base_url=f"http://{url_host(self.host)}:{self.port}",
                         timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
                         # A robot is on the local network: a proxy of the environment is not asked.
                         trust_env=False,
@@ -176,11 +177,11 @@ class RestClient:
                 self._pool = None
 
     def _leave(self, pool: _Pool, users: int = 1) -> None:
-        """A retired pool is closed by its last user: a failed poll must not cut off a stop that is under way."""
+        # A retired pool is closed by its last user: a failed poll must not cut off a stop that is under way.
         with self._lock:
             pool.users -= users
-            over = pool.users == 0 and pool is not self._pool
-        if over:
+            unused = pool.users == 0 and pool is not self._pool
+        if unused:
             pool.client.close()
 
 
@@ -195,7 +196,7 @@ class _Pool:
 def api(  # noqa: PLR0917 - the documented order
     host: str, api_port: int, path: str, method: str = "GET", data: Any = None, timeout: float = READ_S
 ) -> Any:
-    """One request over a connection of its own; never raises for what happens on the wire.
+    """Send one request over a connection of its own; never raises for an error on the wire.
 
     Args:
         host: bare hostname or IP literal of the daemon.
@@ -212,7 +213,7 @@ def api(  # noqa: PLR0917 - the documented order
     client = None
     try:
         client = RestClient(host, api_port, read_s=number("timeout", timeout, above=0, high=600))
-        return client.request(choice("method", method, METHODS), _path(path), data)
+        return client.request(choice("method", method, METHODS), _checked_path(path), data)
     except (ValidationError, DaemonError, ImportError, TypeError, ValueError) as exc:
         return {"error": str(exc), "status_code": exc.status if isinstance(exc, DaemonError) else 0}
     finally:
@@ -220,7 +221,7 @@ def api(  # noqa: PLR0917 - the documented order
             client.close()
 
 
-def _path(path: object) -> str:
+def _checked_path(path: object) -> str:
     if not isinstance(path, str) or not path.startswith("/") or not path.isascii() or not path.isprintable():
         raise ValidationError(f"path must be printable ASCII and start with '/', not {shown(path)}.")
     return path
@@ -235,12 +236,12 @@ def _httpx() -> Any:
 
 
 def _detail(answer: httpx.Response) -> str:
-    """The daemon's own words: ``detail`` as text, the first of a validation list, or the bare body."""
+    """Return the daemon's message: ``detail`` as text, the first of a validation list, or the bare body."""
     try:
         detail = json.loads(answer.text).get("detail")
     except (ValueError, AttributeError):
         detail = answer.text
     if isinstance(detail, list) and detail and isinstance(detail[0], dict):
-        where = ".".join(str(part) for part in detail[0].get("loc", ()))
-        detail = f"{where}: {detail[0].get('msg', '')}"
+        location = ".".join(str(part) for part in detail[0].get("loc", ()))
+        detail = f"{location}: {detail[0].get('msg', '')}"
     return f"{answer.status_code} {detail if isinstance(detail, str) else shown(detail)}"

@@ -1,4 +1,4 @@
-"""Stops and what stands in line for its turn with a Reachy."""
+"""A halt and the motions of a Reachy Mini that wait to start."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.drivers.reachy.motion import Motions
+from strands_robots.drivers.reachy.motion import MotionController
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 
 
-class Quiet:
-    """As much of a connection as a write of the motors' torque meets; its daemon plays nothing."""
+class IdleConnection:
+    """The part of a connection that a write of the motors' torque uses; its daemon plays nothing."""
 
     connects, alive, motor_mode = 1, False, "enabled"
-    polled = SimpleNamespace(moves=frozenset())
+    last_poll = SimpleNamespace(moves=frozenset())
     stop_rest = SimpleNamespace(get=lambda path, within_s=None: [])
 
     def refusal(self) -> str | None:
@@ -33,28 +33,28 @@ def gate() -> MotionGate:
 
 
 @pytest.fixture
-def motions(gate: MotionGate) -> Motions:
-    return Motions(Quiet(), gate, "reachy", automatic_body_yaw=True)  # type: ignore[arg-type]
+def motions(gate: MotionGate) -> MotionController:
+    return MotionController(IdleConnection(), gate, "reachy", automatic_body_yaw=True)  # type: ignore[arg-type]
 
 
-def test_a_halt_waits_for_torque_that_is_being_switched_and_voids_what_stands_behind_it(
-    motions: Motions, gate: MotionGate, monkeypatch: pytest.MonkeyPatch
+def test_halt_reports_a_torque_write_that_does_not_return_and_voids_the_motion_behind_it(
+    motions: MotionController, gate: MotionGate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
+    permitted: list[str] = []
     permit = gate.permit
 
-    def noted(name: str) -> Permit:
+    def recorded_permit(name: str) -> Permit:
         given = permit(name)
-        asked.append(name)
+        permitted.append(name)
         return given
 
-    monkeypatch.setattr(gate, "permit", noted)
-    switching, let_go = threading.Event(), threading.Event()
+    monkeypatch.setattr(gate, "permit", recorded_permit)
+    switching, release = threading.Event(), threading.Event()
     done: list[str] = []
 
     def slow() -> None:
         switching.set()
-        let_go.wait(60)
+        release.wait(60)
         done.append("disabled")
 
     refused: list[BaseException] = []
@@ -69,13 +69,13 @@ def test_a_halt_waits_for_torque_that_is_being_switched_and_voids_what_stands_be
     threads[0].start()
     assert switching.wait(20)
     threads[1].start()
-    eventually(lambda: "enableMotors" in asked, what="the second stands in line")
+    eventually(lambda: "enableMotors" in permitted, what="the second waits to start")
     threads[1].join(0.1)
     assert threads[1].is_alive()
     verdict = motions.halt("test")
     assert verdict.stopped is False
     assert "does not return" in str(verdict.not_stopped)
-    let_go.set()
+    release.set()
     for thread in threads:
         thread.join(20)
         assert not thread.is_alive()

@@ -1,0 +1,36 @@
+"""Feed of the daemon's messages."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from strands_robots.drivers.reachy import connection
+from strands_robots.drivers.reachy.connection import Feed
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "{bad",
+        "[]",
+        '{"head_joint_positions":[0,0,0,0,0,0,0]}',
+        '{"head_joint_positions":[0,0,0,0,0,0],"antennas_joint_positions":[0,0]}',
+        '{"head_joint_positions":[0,0,0,0,0,0,null],"antennas_joint_positions":[0,0]}',
+        '{"head_joint_positions":[0,0,0,0,0,0,0],"antennas_joint_positions":[NaN,0]}',
+        '{"head_joint_positions":[0,0,0,0,0,0,true],"antennas_joint_positions":[0,0]}',
+    ],
+)
+def test_joint_frame_without_nine_numbers_is_dropped_and_counted_and_shows_life(
+    frame: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "FRESH_S", 60.0)
+    feed = Feed()
+    feed.take("joint_positions", frame)
+    assert (feed.joints, feed.unusable_frames, feed.alive) == (None, 1, True)
+
+
+def test_feed_is_not_alive_before_its_first_frame() -> None:
+    assert Feed().silent_s == math.inf
+    assert not Feed().alive
