@@ -21,7 +21,8 @@ from strands_robots import settings
 from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.simulation import Simulation
 from strands_robots.simulation.catalog import find
-from strands_robots.simulation.stage import Plan, RobotPlan, compile_stage
+from strands_robots.simulation.plan import Plan, RobotPlan
+from strands_robots.simulation.stage import compile_stage
 
 STEPS = 10_000
 FLEET = 32

@@ -40,7 +40,6 @@ FLOORS: list[set[str]] = [
 ]
 
 KNOWN_CIRCLES: list[set[str]] = [
-    {"simulation.pictures", "simulation.scene"},
     {"mesh.transport.posture", "mesh.wire_identity"},
     {"mesh.assembly", "mesh.children", "mesh.core", "mesh.input_receiver", "mesh.teleop"},
     {"drivers.ros.mobile_base", "drivers.ros.posed_base", "drivers.ros.ros_bridge", "drivers.ros.tools"},
@@ -54,7 +53,6 @@ SIBLING_NAMES = {
 
 KNOWN_TWINS = {
     *(
-        "Clock",
         "Credentials",
         "Entry",
         "Event",
@@ -67,7 +65,7 @@ KNOWN_TWINS = {
         "Motion",
         "NoAnswerError",
     ),
-    *("Observers", "Odometry", "Recorder", "Refused", "Seen", "Subscription", "View"),
+    *("Odometry", "Recorder", "Refused", "Seen", "Subscription"),
 }
 """Public class names that still stand for two ideas. The list only ever gets shorter."""
 
@@ -78,7 +76,7 @@ KNOWN_UNROOTED = {
     *("BackendDown", "CallRefusedError", "DaemonBusy", "DaemonError", "DaemonFault", "DaemonRefused", "DaemonUnknown"),
     *("DaemonUnreachable", "DuplicateDeviceError", "EarlierRefusedError", "Failure", "IdentityError", "LaneFullError"),
     *("LeaderDone", "MotionRefused", "NoAnswerError", "NoReadingError", "NoResponderError", "NoSuchDeviceError"),
-    *("PermitVoidError", "PolicyError", "PolicyServerError", "Refused", "RenderingError", "RosError", "TooLargeError"),
+    *("PermitVoidError", "Refused", "RosError", "TooLargeError"),
     *("TransportError", "UnreadableError", "WireError"),
 }
 """Public exceptions that do not derive from StrandsRobotsError yet. The list only ever gets shorter."""

@@ -1,7 +1,7 @@
 """Robots in a MuJoCo world: arms, a rover and any MJCF or URDF, behind the same contract as real ones.
 
-``from strands_robots.simulation import Simulation`` is the door. Importing this package alone loads neither
-numpy nor MuJoCo; without the ``sim`` extra, asking for :class:`Simulation` says so in one sentence.
+Importing this package alone loads neither numpy nor MuJoCo; :class:`Simulation` is loaded when it is first used, and
+without the ``sim`` extra that raises one sentence.
 """
 
 from __future__ import annotations

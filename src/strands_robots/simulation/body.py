@@ -1,20 +1,31 @@
-"""One robot of a world, seen as a single body: what a rollout or a teleoperation session drives."""
+"""One robot of a simulated world: its observations, its actions, its base and the units of its commands."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any
 
+import numpy as np
+
+from strands_robots.quaternions import w_positive, yaw_of
 from strands_robots.safety.gate import Permit
+from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.pacing import WorldClock
-from strands_robots.simulation.parts import RobotParts
-from strands_robots.simulation.physics import Physics
+from strands_robots.simulation.physics import Physics, Snapshot
+from strands_robots.simulation.stage import Actuator, RobotParts
 from strands_robots.utils import ValidationError, mapping, number
+
+PLANAR = 2
+"""Sliding joints of one body that make it a mobile base; one alone is a rail, or an arm's first joint."""
 
 
 class RobotBody:
-    """Observations and actions of one robot by joint and actuator name, without its prefix in the world."""
+    """One robot by joint and actuator name, without its prefix in the world.
+
+    A rollout or a teleoperation drives it. Every method raises :class:`ValidationError` once the robot was removed.
+    """
 
     def __init__(self, name: str, physics: Physics, clock: WorldClock) -> None:
         self.name = name
@@ -23,20 +34,17 @@ class RobotBody:
 
     @property
     def parts(self) -> RobotParts:
-        """Where the robot is in the present model. Raises :class:`ValidationError` once it was removed."""
-        parts = self._physics.stage.robots.get(self.name)
-        if parts is None:
-            raise ValidationError(f"robot {self.name} is not in the world any more.")
-        return parts
+        """The robot's places in the present model."""
+        return self._present()[1]
 
     @property
     def action_features(self) -> dict[str, Any]:
-        """Each action key with its type, as LeRobot robots give it."""
+        """Type of each action key, as LeRobot robots give it."""
         return dict.fromkeys(self.parts.actuators, float)
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        """Each observation key with its type."""
+        """Type of each observation key."""
         return dict.fromkeys(self.get_observation(), float)
 
     @property
@@ -46,27 +54,30 @@ class RobotBody:
 
     @property
     def targets(self) -> dict[str, float]:
-        """The setpoints that physics follows now, by action key."""
+        """Present setpoint of each action key."""
         setpoints = self._physics.setpoints
         return {key: float(setpoints[actuator.index]) for key, actuator in self.parts.actuators.items()}
 
-    def get_observation(self) -> dict[str, float]:
-        """Joint positions (rad, or m for a sliding joint), and the base's pose where there is one. Never waits."""
-        snapshot = self._physics.snapshot
-        parts = snapshot.stage.robots.get(self.name)
-        if parts is None:
-            raise ValidationError(f"robot {self.name} is not in the world any more.")
-        return {**snapshot.joints(parts), **snapshot.base_pose(parts)}
+    @property
+    def joint_units(self) -> dict[str, str]:
+        """``radians`` or ``metres`` of each action key whose position servo is commanded in its joint's own unit."""
+        snapshot, parts = self._present()
+        units = {key: _unit(snapshot.stage.model, actuator) for key, actuator in parts.actuators.items()}
+        return {key: unit for key, unit in units.items() if unit}
 
-    def get_joints(self) -> dict[str, float]:
-        """The same: an observation of a simulated robot holds numbers alone."""
-        return self.get_observation()
+    def get_observation(self) -> dict[str, float]:
+        """Return joint positions (rad, or m for a sliding joint) and the pose of a free base. Never waits."""
+        snapshot, parts = self._present()
+        return snapshot.observation(parts)
+
+    get_joints = get_observation
+    """An observation of a simulated robot holds numbers alone."""
 
     def send_action(self, action: Mapping[str, float], permit: Permit | None = None) -> dict[str, float]:
-        """Set targets and let physics follow; returns what was really set, clamped to the actuators' ranges.
+        """Set targets for physics to follow, clamped to the actuators' ranges, and return them.
 
         Raises:
-            ValidationError: a key the robot has not, or a value that is no finite number; nothing was written.
+            ValidationError: an unknown key, or a value that is no finite number; nothing was written.
             PermitVoidError: ``permit`` is void; nothing was written.
         """
         checked = {key: number(f"action[{key!r}]", value) for key, value in mapping("action", action).items()}
@@ -75,9 +86,77 @@ class RobotBody:
         return sent
 
     def hold(self, permit: Permit | None = None) -> None:
-        """Freeze where it is now; nothing when ``permit`` was revoked, for then the halt has frozen it."""
+        """Freeze the robot where it is; do nothing when ``permit`` was revoked, because that halt froze it."""
         self._physics.hold(self.name, permit)
 
     def running(self) -> AbstractContextManager[None]:
-        """Held while a loop drives this robot: physics keeps real time."""
+        """Return a context in which physics keeps real time, for a loop that drives this robot."""
         return self._clock.running()
+
+    def tip_position(self) -> tuple[float, float, float]:
+        """Return the gripper tip's place in the world, metres; the base's where there is no gripper."""
+        snapshot, parts = self._present()
+        data = snapshot.data()
+        x, y, z = data.site(parts.tip).xpos if parts.tip else data.body(parts.root).xpos
+        return float(x), float(y), float(z)
+
+    def base_pose(self) -> dict[str, Any]:
+        """Return ``x``, ``y``, ``z`` (m), ``theta`` (yaw, rad) and ``quat`` (w, x, y, z) of the base in the world.
+
+        The base of a mobile robot is its first body; any other stands where it was placed.
+        """
+        snapshot, parts = self._present()
+        if _mobile(snapshot, parts):
+            base = snapshot.data().body(parts.root)
+            position, quat = [float(v) for v in base.xpos], [float(v) for v in base.xquat]
+        else:
+            plan = next(each for each in snapshot.stage.plan.robots if each.name == self.name)
+            position, quat = list(plan.position), [math.cos(plan.yaw / 2), 0.0, 0.0, math.sin(plan.yaw / 2)]
+        x, y, z = position
+        return {"x": x, "y": y, "z": z, "theta": yaw_of(quat), "quat": w_positive(quat)}
+
+    def base_velocity(self) -> dict[str, list[float]] | None:
+        """Return ``linear`` (m/s) and ``angular`` (rad/s) of a mobile base along its own axes, x forwards, z up.
+
+        The axes are those of the twist in ROS's ``nav_msgs/Odometry``. None where the base does not move.
+        """
+        snapshot, parts = self._present()
+        if not _mobile(snapshot, parts):
+            return None
+        model, data = snapshot.stage.model, snapshot.data()
+        mujoco.mj_comVel(model, data)
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, model.body(parts.root).id, velocity, 1)
+        # MuJoCo writes the rotation first.
+        return {"linear": [float(v) for v in velocity[3:]], "angular": [float(v) for v in velocity[:3]]}
+
+    def _present(self) -> tuple[Snapshot, RobotParts]:
+        snapshot = self._physics.snapshot
+        parts = snapshot.stage.robots.get(self.name)
+        if parts is None:
+            raise ValidationError(f"robot {self.name} is not in the world any more.")
+        return snapshot, parts
+
+
+def _mobile(snapshot: Snapshot, robot: RobotParts) -> bool:
+    """Return True for a robot whose base is free, or slides in a plane."""
+    if robot.base is not None:
+        return True
+    model = snapshot.stage.model
+    body = model.body(robot.root).id
+    first = int(model.body_jntadr[body])
+    joints = range(first, first + int(model.body_jntnum[body]))
+    slides = [joint for joint in joints if int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE]
+    return len(slides) >= PLANAR
+
+
+def _unit(model: Any, actuator: Actuator) -> str:
+    """Return the unit of a position servo's command, empty where it is not its joint's own."""
+    index = actuator.index
+    gain, bias = model.actuator_gainprm[index][0], model.actuator_biasprm[index][1]
+    direct = model.actuator_gear[index][0] == 1.0 and math.isclose(gain, -bias)
+    on_joint = int(model.actuator_trntype[index]) == mujoco.mjtTrn.mjTRN_JOINT
+    if not (actuator.servo and direct and on_joint):
+        return ""
+    joint = int(model.jnt_type[int(model.actuator_trnid[index][0])])
+    return {mujoco.mjtJoint.mjJNT_HINGE.value: "radians", mujoco.mjtJoint.mjJNT_SLIDE.value: "metres"}.get(joint, "")

@@ -1,4 +1,4 @@
-"""Where a robot's model comes from: ours by name, a file, or the ``robot_descriptions`` package."""
+"""Sources of robot models: built-in ones by name, files, and the ``robot_descriptions`` package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from strands_robots.simulation.engine import mujoco
 from strands_robots.utils import ValidationError, shown
 
 MODELS = Path(__file__).parent / "models"
-OURS = ("so100", "so101", "rover")
+BUILT_IN = ("so100", "so101", "rover")
 """Models that come with the package; nothing is downloaded for them."""
 
 ALIASES = {
@@ -30,13 +30,13 @@ _SUFFIXES = (".xml", ".mjcf", ".urdf")
 
 @dataclass(frozen=True, slots=True)
 class ModelSource:
-    """A model that was found: what the caller asked for and the file that holds it."""
+    """A model's label and its file."""
 
     label: str
     path: Path
 
     def load(self) -> Any:
-        """A fresh ``MjSpec`` of the file. Raises :class:`ValidationError` with MuJoCo's reason when it cannot."""
+        """Return a fresh ``MjSpec`` of the file. Raises :class:`ValidationError` with MuJoCo's reason."""
         try:
             return mujoco.MjSpec.from_file(str(self.path))
         except (ValueError, OSError, mujoco.FatalError) as exc:
@@ -44,29 +44,24 @@ class ModelSource:
 
 
 def find(model: object) -> ModelSource:
-    """The source of ``model``: one of ours, a path to MJCF or URDF, or a ``robot_descriptions`` name.
+    """Return the source of ``model``: a built-in one, a path to MJCF or URDF, or a ``robot_descriptions`` name.
 
     Raises:
-        ValidationError: naming the near ones when nothing of that name is known.
+        ValidationError: no such model; the message names similar ones.
     """
     if isinstance(model, Path):
         model = str(model)
     if not isinstance(model, str) or not model.strip() or len(model) > 4096 or "\0" in model:
         raise ValidationError(f"model must be a model's name or the path of an MJCF or URDF file, not {shown(model)}.")
     name = ALIASES.get(model.lower(), model.lower())
-    if name in OURS:
+    if name in BUILT_IN:
         return ModelSource(name, MODELS / f"{name}.xml")
     if model.lower().endswith(_SUFFIXES) or "/" in model:
-        return _file(model)
-    return _described(model)
+        return _find_file(model)
+    return _find_description(model)
 
 
-def known() -> list[str]:
-    """Every model name that :func:`find` takes: ours first, then those of ``robot_descriptions`` when it is there."""
-    return [*OURS, *_description_names()]
-
-
-def _file(model: str) -> ModelSource:
+def _find_file(model: str) -> ModelSource:
     path = Path(model).expanduser()
     if not path.is_file():
         raise ValidationError(f"model must be an existing MJCF or URDF file; there is no {shown(model)}.")
@@ -75,11 +70,11 @@ def _file(model: str) -> ModelSource:
     return ModelSource(path.stem, path)
 
 
-def _described(model: str) -> ModelSource:
+def _find_description(model: str) -> ModelSource:
     names = _description_names()
     for candidate in (model, f"{model}_mj_description", f"{model}_description"):
         if candidate in names:
-            # Importing one of these modules fetches the description when it is not in its cache yet.
+            # Importing one of these modules fetches the description unless its cache has it.
             try:
                 module = importlib.import_module(f"robot_descriptions.{candidate}")
             except Exception as exc:  # that package clones with git, whose failures have no common type
@@ -87,8 +82,8 @@ def _described(model: str) -> ModelSource:
             path = getattr(module, "MJCF_PATH", None) or getattr(module, "URDF_PATH", None)
             if isinstance(path, str):
                 return ModelSource(model, Path(path))
-    near = difflib.get_close_matches(model.lower(), [*OURS, *ALIASES, *names], n=5, cutoff=0.4)
-    hint = f"near it: {', '.join(near)}" if near else f"known: {', '.join(OURS)}"
+    similar = difflib.get_close_matches(model.lower(), [*BUILT_IN, *ALIASES, *names], n=5, cutoff=0.4)
+    hint = f"near it: {', '.join(similar)}" if similar else f"known: {', '.join(BUILT_IN)}"
     raise ValidationError(f"model {shown(model)} is not known; {hint}. A path to an MJCF or URDF file works too.")
 
 

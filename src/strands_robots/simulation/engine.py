@@ -1,4 +1,4 @@
-"""MuJoCo itself, imported in one place so that the OpenGL choice always comes first."""
+"""MuJoCo, imported in one place so that the OpenGL backend is always chosen first."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ logger = logging.getLogger(__name__)
 _LATE = "mujoco" in sys.modules and gl.undecided()
 
 BACKEND: str = gl.prepare()
-"""The OpenGL backend in use: egl, osmesa, disable, the user's own word, or empty for MuJoCo's default."""
+"""The OpenGL backend in use: egl, osmesa, disable, the user's own value, or empty for MuJoCo's default."""
 
 import mujoco  # noqa: E402 - MuJoCo reads MUJOCO_GL while it is imported
 
 
-def _make_up() -> None:
-    """Give a MuJoCo that was imported before the choice the context class that it would have taken."""
+def _set_context_class() -> None:
+    """Give a MuJoCo that was imported before the choice the context class of the chosen backend."""
     contexts = sys.modules.get("mujoco.rendering.classic.gl_context") or sys.modules.get("mujoco.gl_context")
     if contexts is not None:
         vars(contexts)["GLContext"] = importlib.import_module(f"mujoco.{BACKEND}").GLContext
 
 
 if _LATE and BACKEND in gl.LIBRARIES:
-    _make_up()
+    _set_context_class()
 
 if mujoco.get_mju_user_warning() is None:
-    # MuJoCo's own way is a file in whatever folder the program was started.
+    # By default MuJoCo writes warnings to a file in the current folder.
     mujoco.set_mju_user_warning(lambda message: logger.warning("MuJoCo: %s", message.strip()))
 
 __all__ = ["BACKEND", "mujoco"]

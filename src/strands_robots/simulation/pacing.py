@@ -1,10 +1,9 @@
 """Real time: one thread for all the worlds of a process, alive only while one of them runs.
 
 Stepping releases the GIL, and thirty worlds that each wake a thread two hundred times a second would spend more
-time handing it round than computing; one thread visits them in turn instead. A world runs while somebody holds a
-:meth:`WorldClock.running` lease (a rollout, a teleoperation session) or was commanded within the last
-:data:`SETTLE_S`. Whoever steps by hand owns the clock until the next lease: then commands alone start nothing,
-and the same steps give the same numbers.
+time passing it on than computing; one thread visits them in turn instead. A world runs while a rollout or a
+teleoperation holds a lease (:meth:`WorldClock.running`), and for :data:`SETTLE_S` after a command. After a step by
+hand commands alone start nothing until the next lease, so the same steps give the same numbers.
 """
 
 from __future__ import annotations
@@ -20,26 +19,26 @@ from strands_robots.simulation.physics import Physics
 logger = logging.getLogger(__name__)
 
 TICK_S = 0.005
-"""How often the pacing thread visits each running world."""
+"""Period in which the pacing thread visits each running world."""
 
 WORLDS_A_TICK = 10
-"""So many worlds are visited every tick. More are visited less often, in longer steps: every visit has to win the
+"""Worlds visited every tick. More are visited less often, in longer steps, because every visit has to get the
 interpreter back from the threads that ran meanwhile."""
 
 SETTLE_S = 2.0
-"""How long physics goes on after a single command."""
+"""Seconds that physics goes on after a single command."""
 
 MAX_BEHIND_S = 1.0
-"""A world that is further behind real time than this lets the rest go: it will not catch up."""
+"""A world that is further behind real time than this drops the rest: it will not catch up."""
 
 VISIT_S = 0.01
-"""How long one visit may take while a world catches up, so that it does not starve the others."""
+"""Longest visit while a world catches up, so that it does not starve the others."""
 
 _CHUNK = 16
 
 
 class WorldClock:
-    """Paces one world. ``slipped_s`` is the simulated time that was let go because the machine was too slow."""
+    """Pacing of one world. ``slipped_s`` is the simulated time dropped because the machine was too slow."""
 
     def __init__(self, physics: Physics, *, on_command: bool = True) -> None:
         self._physics = physics
@@ -55,28 +54,20 @@ class WorldClock:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        """Real time passes while this is held."""
-        self.acquire()
-        try:
-            yield
-        finally:
-            self.release()
-
-    def acquire(self) -> None:
-        """Take a lease; every one needs its :meth:`release`."""
+        """Take a lease: real time passes while it is held, and for a moment afterwards."""
         with self._lock:
             self._leases += 1
             self._by_hand = False
         _pacer.wake(self)
-
-    def release(self) -> None:
-        """Give a lease back; physics settles for a moment longer."""
-        with self._lock:
-            self._leases -= 1
-            self._until = time.monotonic() + SETTLE_S / 4
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._leases -= 1
+                self._until = time.monotonic() + SETTLE_S / 4
 
     def commanded(self) -> None:
-        """A setpoint was written: let physics follow it, unless somebody steps by hand."""
+        """Let physics follow a setpoint that was written, unless the world is stepped by hand."""
         with self._lock:
             if self.closed or self._by_hand or not self._on_command:
                 return
@@ -84,13 +75,13 @@ class WorldClock:
         _pacer.wake(self)
 
     def by_hand(self) -> None:
-        """Somebody steps: commands alone do not start the clock from now on."""
+        """Mark a step by hand: commands alone do not start the clock from now on."""
         with self._lock:
             self._by_hand = True
             self._until = 0.0
 
     def close(self) -> None:
-        """Never run again; returns when the pacing thread has let go of this world."""
+        """Stop for good; return when the pacing thread does not visit this world any more."""
         with self._lock:
             self.closed = True
         _pacer.forget(self)
@@ -133,12 +124,12 @@ class WorldClock:
                 return
 
     def rest(self) -> None:
-        """Nothing runs any more: forget when the next step was due."""
+        """Forget when the next step was due, because nothing runs any more."""
         self._due = None
 
 
 class _Pacer:
-    """The thread and the worlds it visits."""
+    """The pacing thread and the worlds it visits."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -156,7 +147,7 @@ class _Pacer:
                 self._thread.start()
 
     def forget(self, clock: WorldClock) -> None:
-        """Wait until ``clock`` is visited no more, and until the thread is gone when it was the last."""
+        """Remove ``clock``, and wait for the end of the thread when it was the last."""
         with self._lock:
             thread = self._thread
             if clock in self._clocks:
@@ -168,7 +159,7 @@ class _Pacer:
     def _run(self) -> None:
         due = time.monotonic()
         while True:
-            clocks = self._visited()
+            clocks = self._still_running()
             if not clocks:
                 return
             now = time.monotonic()
@@ -177,8 +168,8 @@ class _Pacer:
             due = max(due + TICK_S * max(1.0, len(clocks) / WORLDS_A_TICK), time.monotonic())
             time.sleep(max(0.0, due - time.monotonic()))
 
-    def _visited(self) -> list[WorldClock]:
-        """The clocks that still run; the thread ends when there is none, and says so under the lock."""
+    def _still_running(self) -> list[WorldClock]:
+        """Return the clocks that still run; without any, mark the thread as ended under the lock."""
         with self._lock:
             for clock in [c for c in self._clocks if not c.wanted]:
                 self._clocks.remove(clock)
@@ -191,7 +182,7 @@ class _Pacer:
         try:
             clock.tick(now)
         except Exception:
-            logger.exception("A simulated world cannot be stepped; it stands still from now on.")
+            logger.exception("A simulated world cannot be stepped and is paused for good.")
             with self._lock:
                 clock.closed = True
 

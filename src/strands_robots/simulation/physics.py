@@ -1,15 +1,19 @@
-"""The physics of one world, and its lock discipline, which is written down here and nowhere else.
+"""The physics of one world, and the lock discipline of the whole simulation, which is documented only here.
 
-There are two locks, always taken in this order, and one published value:
+There are three locks of a world, always taken in this order, and one published value:
 
-1. The *step lock* owns the model and the data. Whoever advances physics holds it for one chunk of steps.
-2. The *command lock* owns the setpoints. A writer holds it for the few microseconds of a write, and checks its
-   permit under it; the stepper holds it just as briefly, to copy the setpoints, before each chunk. So a command
-   never waits for physics, and once :meth:`Physics.hold` has returned no earlier command can follow it.
-3. The *snapshot* is an immutable copy of the state, replaced whole after each chunk. Every read (observations,
-   state, pictures) takes the reference and no lock: a read never waits at all, and never sees half a step.
+1. The *starting lock* (``Simulation.starting``, re-entrant) is held while the world is rebuilt or reset, and while a
+   rollout or a teleoperation starts. A stop never takes it, so nothing that is built or loaded delays a stop.
+2. The *step lock* protects the model and the data. The stepping thread holds it for one chunk of steps.
+3. The *command lock* protects the setpoints. A writer holds it for the few microseconds of a write, and checks its
+   permit under it; the stepping thread holds it just as briefly, to copy the setpoints, before each chunk. So a
+   command never waits for physics, and once :meth:`Physics.hold` has returned no earlier command can follow it.
+4. The *snapshot* is an immutable copy of the state, replaced as a whole after each chunk. Every read (observations,
+   state, pictures) takes the reference and no lock: a read never waits, and never sees half a step.
 
-The holder of the command lock never asks for the step lock. Nothing calls foreign code under either.
+The holder of the command lock never asks for the step lock. Nothing calls foreign code under either. The locks of
+:mod:`~strands_robots.simulation.pacing` protect only counters and the list of worlds; physics never runs under them.
+Pictures are drawn from a snapshot, on a thread of their own, without any of these locks.
 """
 
 from __future__ import annotations
@@ -19,26 +23,23 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from strands_robots.quaternions import yaw_of
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.simulation.engine import mujoco
-from strands_robots.simulation.parts import Actuator, RobotParts
-from strands_robots.simulation.stage import Floats, Stage
+from strands_robots.simulation.stage import Floats, RobotParts, Stage
 from strands_robots.utils import ValidationError, shown
 
 CHUNK = 128
 """Steps between two snapshots when stepping by hand: about a millisecond for an arm, 1 % of it for the snapshot."""
 
-
-# Numbers a joint has in qpos and in qvel, by mjtJoint: free, ball, slide, hinge.
+# Numbers of a joint in qpos and in qvel, by mjtJoint: free, ball, slide, hinge.
 _QPOS = {0: 7, 1: 4, 2: 1, 3: 1}
 _QVEL = {0: 6, 1: 3, 2: 1, 3: 1}
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The state after some step. ``time`` in seconds, ``steps`` since the world was made; the arrays never change."""
+    """State after some step. ``time`` in seconds, ``steps`` since the world was made; the arrays never change."""
 
     stage: Stage
     time: float
@@ -48,25 +49,35 @@ class Snapshot:
     lengths: Floats
 
     def joints(self, robot: RobotParts) -> dict[str, float]:
-        """Joint positions by name: radians, or metres for a sliding joint."""
+        """Return the joint positions by name: radians, or metres for a sliding joint."""
         qpos = self.qpos
         return {key: float(qpos[joint.qpos]) for key, joint in robot.joints.items()}
 
-    def velocities(self, robot: RobotParts) -> dict[str, float]:
-        """Joint velocities by name: rad/s, or m/s for a sliding joint."""
-        return {key: float(self.qvel[joint.qvel]) for key, joint in robot.joints.items()}
-
-    def base_pose(self, robot: RobotParts) -> dict[str, float]:
-        """``base_x`` and ``base_y`` (m) and ``base_yaw`` (rad) of a robot that moves about; else nothing."""
+    def observation(self, robot: RobotParts) -> dict[str, float]:
+        """Return the joint positions, and ``base_x``, ``base_y`` (m) and ``base_yaw`` (rad) of a free base."""
         if robot.base is None:
-            return {}
-        x, y, _, w, i, j, k = (float(v) for v in self.qpos[robot.base : robot.base + 7])
-        yaw = float(np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k)))
-        return {"base_x": x, "base_y": y, "base_yaw": yaw}
+            return self.joints(robot)
+        x, y, _, *quat = (float(v) for v in self.qpos[robot.base : robot.base + 7])
+        return {**self.joints(robot), "base_x": x, "base_y": y, "base_yaw": yaw_of(quat)}
+
+    def pose(self, data: Any) -> None:
+        """Put this state into ``data`` of the same model, and compute its bodies, sites, cameras and lights."""
+        model = self.stage.model
+        data.qpos[:] = self.qpos
+        data.qvel[:] = self.qvel
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+
+    def data(self) -> Any:
+        """Return fresh MuJoCo data in this state; physics' own data is not touched."""
+        data = mujoco.MjData(self.stage.model)
+        self.pose(data)
+        return data
 
 
 class Physics:
-    """One world's model, data and setpoints. Thread-safe as the module's text says."""
+    """Model, data and setpoints of one world. Thread-safe; the module's docstring has the lock discipline."""
 
     def __init__(self, stage: Stage) -> None:
         self._step_lock = threading.Lock()
@@ -79,6 +90,7 @@ class Physics:
 
     @property
     def stage(self) -> Stage:
+        """The compiled world of the last snapshot."""
         return self.snapshot.stage
 
     @property
@@ -88,20 +100,20 @@ class Physics:
             return self._setpoints.copy()
 
     def advance(self, steps: int) -> None:
-        """Take ``steps`` time steps in one chunk, with the setpoints as they are at its start."""
+        """Take ``steps`` time steps in one chunk, with the setpoints of its start."""
         with self._step_lock:
             with self._command_lock:
                 self._data.ctrl[:] = self._setpoints
             mujoco.mj_step(self._model, self._data, nstep=steps)
             self._steps += steps
-            self.snapshot = self._seen(self.stage)
+            self.snapshot = self._copy_state(self.stage)
 
     def command(self, robot_name: str, action: Mapping[str, float], permit: Permit | None = None) -> dict[str, float]:
-        """Set targets of one robot; the answer is what was really set, clamped to each actuator's range.
+        """Set targets of one robot, clamped to each actuator's range, and return them.
 
         Raises:
             PermitVoidError: ``permit`` is void; nothing was written.
-            ValidationError: the robot or a key is not there; nothing was written.
+            ValidationError: no such robot or key; nothing was written.
         """
         with self._command_lock:
             actuators = self._robot(robot_name).actuators
@@ -118,9 +130,9 @@ class Physics:
             return sent
 
     def hold(self, robot_name: str | None = None, permit: Permit | None = None) -> None:
-        """Freeze one robot, or all: servos hold where they are now, everything else is commanded to zero.
+        """Freeze one robot, or all: servos keep their present position, everything else is commanded to zero.
 
-        Nothing is written when ``permit`` was revoked: the halt that did it has frozen the robot.
+        Nothing is written when ``permit`` was revoked: the halt that revoked it has frozen the robot.
         """
         with self._command_lock:
             if permit is not None and permit.revoked:
@@ -131,16 +143,21 @@ class Physics:
             lengths = self.snapshot.lengths
             for robot in robots:
                 for actuator in robot.actuators.values():
-                    self._setpoints[actuator.index] = _still(actuator, lengths)
+                    still = float(lengths[actuator.index]) if actuator.servo else 0.0
+                    self._setpoints[actuator.index] = actuator.clamp(still)
 
     def reset(self, permit: Permit) -> None:
-        """Back to the start state; the step count goes on. Raises :class:`MotionRefused` when ``permit`` is void."""
+        """Go back to the start state; the step count goes on.
+
+        Raises:
+            MotionRefused: ``permit`` is void; nothing was changed.
+        """
         with self._step_lock, self._command_lock:
             permit.check()
             self.snapshot = self._start(self.stage)
 
     def replace(self, stage: Stage) -> None:
-        """Go on with another stage: what is in both, by name, keeps its position, velocity and setpoint."""
+        """Go on with another stage. What both have by name keeps its position, velocity and setpoint."""
         with self._step_lock, self._command_lock:
             old_model, old_data, old_setpoints = self._model, self._data, self._setpoints
             self._model = stage.model
@@ -151,7 +168,7 @@ class Physics:
             _carry_state(old_model, old_data, self._model, self._data)
             _carry_setpoints(old_model, old_setpoints, self._model, self._setpoints)
             mujoco.mj_forward(self._model, self._data)
-            self.snapshot = self._seen(stage)
+            self.snapshot = self._copy_state(stage)
 
     @property
     def diverged(self) -> bool:
@@ -172,29 +189,19 @@ class Physics:
         self._data.ctrl[:] = stage.start_ctrl
         self._setpoints = stage.start_ctrl.copy()
         mujoco.mj_forward(self._model, self._data)
-        return self._seen(stage)
+        return self._copy_state(stage)
 
-    def _seen(self, stage: Stage) -> Snapshot:
+    def _copy_state(self, stage: Stage) -> Snapshot:
         data = self._data
-        return Snapshot(
-            stage,
-            data.time,
-            self._steps,
-            data.qpos.copy(),
-            data.qvel.copy(),
-            data.actuator_length.copy(),
-        )
-
-
-def _still(actuator: Actuator, lengths: Floats) -> float:
-    return actuator.clamp(float(lengths[actuator.index]) if actuator.servo else 0.0)
+        lengths = data.actuator_length.copy()
+        return Snapshot(stage, data.time, self._steps, data.qpos.copy(), data.qvel.copy(), lengths)
 
 
 def _carry_state(old_model: Any, old: Any, new_model: Any, new: Any) -> None:
     """Copy position and velocity of the joints that both models have by name."""
-    theirs = {old_model.joint(i).name: i for i in range(old_model.njnt)}
+    before = {old_model.joint(i).name: i for i in range(old_model.njnt)}
     for index in range(new_model.njnt):
-        source = theirs.get(new_model.joint(index).name)
+        source = before.get(new_model.joint(index).name)
         if source is None or old_model.jnt_type[source] != new_model.jnt_type[index]:
             continue
         kind = int(new_model.jnt_type[index])

@@ -1,19 +1,22 @@
 """A software picture of a world, without OpenGL: shaded faces through a depth buffer, in numpy alone.
 
-Good for machines that have no OpenGL at all; slower than it and plainer: one light, its shadow on the floor, flat
-faces. Every primitive and mesh is drawn, textures other than the floor's are not.
+It serves machines without OpenGL. It is slower and plainer: one light, its shadow on the floor, flat faces. Every
+primitive and mesh is drawn; textures other than the floor's are not.
 """
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from strands_robots.simulation.solids import Face, faces_of
+from strands_robots.simulation.engine import mujoco
+from strands_robots.simulation.rendering import CameraView
 from strands_robots.simulation.stage import Floats, Stage
-from strands_robots.simulation.views import CameraView
 
 Pixels = NDArray[np.float32]
 
@@ -23,13 +26,31 @@ _TILE_M = 0.1
 _TILE_A, _TILE_B, _SEAM = np.array([[206, 211, 218], [197, 203, 212], [178, 186, 196]], dtype=np.float32)
 _SHADOW_CELL_M = 0.004
 _FINE = 2
-"""Drawn this many times larger and averaged: anti-aliasing."""
+"""Anti-aliasing: pictures are drawn this many times larger and averaged."""
+
+_VISIBLE_GROUPS = 3
+"""Geometry groups 0 to 2 are shown, as MuJoCo does by default; 3 is collision shapes."""
+
+_ROUND = 20
+_MESH_FACES_MAX = 1000
+
+Patch = tuple[tuple[float, float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Face:
+    """A flat convex face: corners (n, 3) in metres, anticlockwise seen from outside; ``colour`` 0 to 255."""
+
+    points: Floats
+    normal: Floats
+    colour: Floats
+    shine: float
 
 
 def draw(stage: Stage, data: Any, view: CameraView, width: int, height: int) -> NDArray[np.uint8]:
-    """The picture (height, width, 3) that ``view`` has of the pose in ``data``."""
+    """Draw the picture (height, width, 3) that ``view`` has of the pose in ``data``."""
     wide, high = width * _FINE, height * _FINE
-    faces, floor = faces_of(stage, data)
+    faces, floor = _faces(stage, data)
     image, depth = _background(view, wide, high, faces if floor else None)
     for face in faces:
         _fill(image, depth, face, view)
@@ -39,7 +60,7 @@ def draw(stage: Stage, data: Any, view: CameraView, width: int, height: int) -> 
 
 
 def _fill(image: Pixels, depth: Pixels, face: Face, view: CameraView) -> None:
-    """Draw one convex face where it is nearer than what is there."""
+    """Draw one convex face wherever it is nearer than the faces already drawn."""
     towards = view.position - face.points[0]
     if float(face.normal @ towards) <= 0:
         return
@@ -64,9 +85,9 @@ def _fill(image: Pixels, depth: Pixels, face: Face, view: CameraView) -> None:
     normal = face.normal @ view.rotation
     offset = float(face.normal @ -towards)
     inverse = (normal[0] * rays_x + normal[1] * rays_y - normal[2]) / offset
-    near = depth[y0:y1, x0:x1]
-    visible = inside & (inverse > near)
-    near[visible] = inverse[visible]
+    drawn = depth[y0:y1, x0:x1]
+    visible = inside & (inverse > drawn)
+    drawn[visible] = inverse[visible]
     image[y0:y1, x0:x1][visible] = _shade(face, towards)
 
 
@@ -79,7 +100,7 @@ def _shade(face: Face, towards: Floats) -> Floats:
 
 
 def _background(view: CameraView, wide: int, high: int, shadow_of: list[Face] | None) -> tuple[Pixels, Pixels]:
-    """Sky, and the tiled floor with its shadows where there is one; the depth buffer holds one over depth."""
+    """Draw the sky, and the tiled floor with its shadows where there is one; the depth buffer has one over depth."""
     ramp = np.linspace(0, 1, high, dtype=np.float32)[:, None, None]
     image = np.broadcast_to(_SKY_TOP * (1 - ramp) + _SKY_LOW * ramp, (high, wide, 3)).astype(np.float32)
     depth = np.zeros((high, wide), dtype=np.float32)
@@ -93,7 +114,7 @@ def _background(view: CameraView, wide: int, high: int, shadow_of: list[Face] | 
     rows = np.flatnonzero((slope < -1e-4).any(axis=1))
     if not len(rows) or view.position[2] <= 0:
         return image, depth
-    # Above the first row that meets the floor there is sky alone: nothing to compute.
+    # Rows above the first one that meets the floor show only sky.
     below = slice(int(rows[0]), int(rows[-1]) + 1)
     down, slope, sky = down[below], slope[below], image[below]
     hit = slope < -1e-4
@@ -108,8 +129,10 @@ def _background(view: CameraView, wide: int, high: int, shadow_of: list[Face] | 
 
 
 def _tiles(x: Pixels, y: Pixels, reach: Pixels) -> Pixels:
-    """The floor's colours at points (m), seen from ``reach`` metres: a seam narrower than a pixel would flicker in
-    the distance, so it fades with it."""
+    """Return the floor's colours at points (m), seen from ``reach`` metres.
+
+    A seam narrower than a pixel would flicker, so seams fade with the distance.
+    """
     u, v = x / np.float32(_TILE_M), y / np.float32(_TILE_M)
     column, row = np.floor(u), np.floor(v)
     seam = np.maximum(np.abs(u - column - 0.5), np.abs(v - row - 0.5)) > 0.485
@@ -120,7 +143,7 @@ def _tiles(x: Pixels, y: Pixels, reach: Pixels) -> Pixels:
 
 
 def _shadow(faces: list[Face], x: Pixels, y: Pixels) -> Pixels:
-    """How much of the light is kept from each floor point: the faces laid down along the light, with a soft edge."""
+    """Return the share of light that each floor point lacks: the faces projected along the light, with a soft edge."""
     laid = [f.points[:, :2] - _LIGHT[:2] / _LIGHT[2] * np.maximum(f.points[:, 2:], 0) for f in faces]
     if not laid:
         return np.zeros_like(x)
@@ -141,7 +164,7 @@ def _shadow(faces: list[Face], x: Pixels, y: Pixels) -> Pixels:
 
 
 def _cover(mask: Pixels, points: Floats) -> None:
-    """Fill one convex polygon, given in cells, whichever way round it is."""
+    """Fill one convex polygon, given in cells in either direction of rotation."""
     x0, y0 = np.maximum(np.floor(points.min(axis=0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(points.max(axis=0)).astype(int) + 1, mask.shape[::-1])
     if x0 >= x1 or y0 >= y1:
@@ -153,3 +176,115 @@ def _cover(mask: Pixels, points: Floats) -> None:
     ]
     inside = np.logical_and.reduce([s >= 0 for s in sides]) | np.logical_and.reduce([s <= 0 for s in sides])
     mask[y0:y1, x0:x1][inside] = 1.0
+
+
+def _faces(stage: Stage, data: Any) -> tuple[list[Face], bool]:
+    """Return every visible face in world coordinates, and True where there is a floor."""
+    model = stage.model
+    faces: list[Face] = []
+    floor = False
+    for index in range(model.ngeom):
+        kind = int(model.geom_type[index])
+        if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+            floor = True
+            continue
+        colour, shine = _look(model, index)
+        if int(model.geom_group[index]) >= _VISIBLE_GROUPS or colour[3] < 0.05:
+            continue
+        rotation, position = data.geom_xmat[index].reshape(3, 3), data.geom_xpos[index]
+        for patch in _patches(model, index, kind):
+            points = np.asarray(patch) @ rotation.T + position
+            normal = np.cross(points[1] - points[0], points[-1] - points[0])
+            length = float(np.linalg.norm(normal))
+            if length > 0:
+                faces.append(Face(points, normal / length, colour[:3] * 255.0, shine))
+    return faces, floor
+
+
+def _look(model: Any, index: int) -> tuple[Floats, float]:
+    material = int(model.geom_matid[index])
+    if material < 0:
+        return np.array(model.geom_rgba[index], dtype=np.float64), 0.3
+    return np.array(model.mat_rgba[material], dtype=np.float64), float(model.mat_specular[material])
+
+
+def _patches(model: Any, index: int, kind: int) -> tuple[Patch, ...]:
+    x, y, z = (float(v) for v in model.geom_size[index])
+    types = mujoco.mjtGeom
+    if kind == types.mjGEOM_BOX:
+        return _box(x, y, z)
+    if kind == types.mjGEOM_SPHERE:
+        return _lathe(_arc(x, 0.0, -1.0, 1.0), x, x)
+    if kind == types.mjGEOM_ELLIPSOID:
+        return _ellipsoid(x, y, z)
+    if kind == types.mjGEOM_CYLINDER:
+        return _lathe(((0.0, -y), (x, -y), (x, y), (0.0, y)), x, y)
+    if kind == types.mjGEOM_CAPSULE:
+        return _lathe(_arc(x, -y, -1.0, 0.0) + _arc(x, y, 0.0, 1.0), x, y)
+    return _mesh(model, int(model.geom_dataid[index])) if kind == types.mjGEOM_MESH else ()
+
+
+@lru_cache(maxsize=512)
+def _box(x: float, y: float, z: float) -> tuple[Patch, ...]:
+    a, b, c, d = (-x, -y), (x, -y), (x, y), (-x, y)
+    sides = tuple(((*p, -z), (*q, -z), (*q, z), (*p, z)) for p, q in ((a, b), (b, c), (c, d), (d, a)))
+    top = tuple((*p, z) for p in (a, b, c, d))
+    bottom = tuple((*p, -z) for p in (d, c, b, a))
+    return (*sides, top, bottom)
+
+
+def _arc(radius: float, height: float, start: float, end: float) -> tuple[tuple[float, float], ...]:
+    """Return the profile of a sphere segment: (radius, z) from ``start`` to ``end`` quarter turns above the equator."""
+    angles = np.linspace(start, end, 9 if end - start > 1 else 5) * np.pi / 2
+    return tuple((float(radius * np.cos(a)), float(height + radius * np.sin(a))) for a in angles)
+
+
+@lru_cache(maxsize=512)
+def _lathe(profile: tuple[tuple[float, float], ...], _radius: float, _half: float) -> tuple[Patch, ...]:
+    """Turn a profile of (radius, z), from the bottom up, about the z axis."""
+    turns = np.linspace(0, 2 * np.pi, _ROUND + 1)
+    circle = [(float(np.cos(t)), float(np.sin(t))) for t in turns]
+    patches: list[Patch] = []
+    for (r0, z0), (r1, z1) in itertools.pairwise(profile):
+        if max(r0, r1) < 1e-9:
+            continue
+        if z0 == z1:
+            ring = tuple((max(r0, r1) * c, max(r0, r1) * s, z0) for c, s in circle[:-1])
+            patches.append(ring if r0 > r1 else tuple(reversed(ring)))
+            continue
+        for (c0, s0), (c1, s1) in itertools.pairwise(circle):
+            corners = [(r0 * c0, r0 * s0, z0), (r0 * c1, r0 * s1, z0), (r1 * c1, r1 * s1, z1), (r1 * c0, r1 * s0, z1)]
+            patches.append(tuple(corners[1:] if r0 < 1e-9 else corners[:3] if r1 < 1e-9 else corners))
+    return tuple(patches)
+
+
+@lru_cache(maxsize=64)
+def _ellipsoid(x: float, y: float, z: float) -> tuple[Patch, ...]:
+    unit = _lathe(_arc(1.0, 0.0, -1.0, 1.0), 1.0, 1.0)
+    return tuple(tuple((px * x, py * y, pz * z) for px, py, pz in patch) for patch in unit)
+
+
+def _hull(model: Any, mesh: int) -> Any:
+    """Return the triangles of a mesh's convex hull, as indices of its vertices.
+
+    ``mesh_graph`` in MuJoCo's ``mjModel`` has two counts, two numbers a vertex, one an edge, then three a face.
+    """
+    start = int(model.mesh_graphadr[mesh])
+    if start < 0:
+        return ()
+    vertices, count = (int(v) for v in model.mesh_graph[start : start + 2])
+    begin = start + 2 + 3 * vertices + 3 * count
+    return model.mesh_graph[begin : begin + 3 * count].reshape(-1, 3)
+
+
+def _mesh(model: Any, mesh: int) -> tuple[Patch, ...]:
+    if mesh < 0:
+        return ()
+    first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    vertices = model.mesh_vert[int(model.mesh_vertadr[mesh]) :]
+    triangles = model.mesh_face[first : first + count]
+    if count > _MESH_FACES_MAX:
+        # Drawing every face would take a minute: use the convex hull where MuJoCo has one, else every nth face.
+        hull = _hull(model, mesh)
+        triangles = hull if len(hull) else triangles[:: count // _MESH_FACES_MAX]
+    return tuple(tuple(tuple(float(v) for v in vertices[i]) for i in corner) for corner in triangles)  # type: ignore[misc]

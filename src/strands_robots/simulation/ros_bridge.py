@@ -1,4 +1,4 @@
-"""A simulated world's joints and cameras on a ROS 2 graph, as a real robot's are."""
+"""Joints and cameras of a simulated world on a ROS 2 graph, as those of a real robot."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from strands_robots.utils import ValidationError
 
 
 class SimRosBridge(RosTelemetryBridge):
-    """Publishes; a simulation takes no commands from a graph, it is driven by its own verbs.
+    """Publisher of a simulation on ROS 2. It takes no commands; the simulation's own verbs drive it.
 
     ``publish_joint_states`` and ``publish_image`` are those of a real robot's bridge. With a simulation,
-    :meth:`publish` tells all its robots at once, and ``start`` does so at a rate.
+    :meth:`publish` publishes all its robots at once, and ``start`` does so at a rate.
 
     Args:
-        simulation: the world whose robots are told; None to publish by hand.
+        simulation: the world whose robots are published; None to publish by hand.
         domain_id: ROS 2 domain, 0 to 232.
         node_name: of the node, ``strands_sim`` by default.
         qos_depth: KEEP_LAST history of each endpoint, 1 to ``MAX_QOS_HISTORY_DEPTH``.
@@ -35,7 +35,7 @@ class SimRosBridge(RosTelemetryBridge):
         self._simulation = simulation
 
     def publish(self, cameras: Sequence[str] = (), *, width: int = 320, height: int = 240) -> None:
-        """Tell the joints of every robot (rad, or m for a sliding joint) and one picture of each of these cameras.
+        """Publish the joints of every robot (rad, or m for a sliding joint) and one picture of each of these cameras.
 
         Raises:
             ValidationError: no simulation, or no such camera.
@@ -44,11 +44,10 @@ class SimRosBridge(RosTelemetryBridge):
         if world is None:
             raise ValidationError("simulation must be given to publish all of it at once, not None.")
         for name in world.list_robots():
-            # A joint's key is its own name; what else a robot observes, such as its base's pose, is no joint.
-            joints = world.get_features()["robots"][name]["joints"]
-            seen = world.get_observation(name)
-            told = [joint for joint in joints if joint in seen]
-            self.publish_joint_states(name, told, [seen[joint] for joint in told])
+            # An observation also has the base's pose, which is no joint.
+            observation = world.get_observation(name)
+            joints = [joint for joint in world.get_features()["robots"][name]["joints"] if joint in observation]
+            self.publish_joint_states(name, joints, [observation[joint] for joint in joints])
         for camera in cameras:
             picture, _ = world.picture(camera, width, height)
             self.publish_image(world.tool_name_str, camera, picture)

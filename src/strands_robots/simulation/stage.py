@@ -1,94 +1,89 @@
-"""What stands in the world, and the MuJoCo model that is compiled from it.
+"""The MuJoCo model that is compiled from a plan, and the place of each robot's parts in it.
 
-A :class:`Plan` lists robots and objects; :func:`compile_stage` turns one into a :class:`Stage`, which never changes
-afterwards: adding or removing something makes a new plan and a new stage. Inside the model a robot's parts carry its
-name and a slash in front (``left/elbow_flex``); outside, each robot's keys are without it.
+A :class:`Stage` never changes: adding or removing something makes a new plan and a new stage. Inside the model the
+names of a robot's parts start with its own name and a slash (``left/elbow_flex``); outside, its keys are without it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from strands_robots.simulation import backdrop
-from strands_robots.simulation.catalog import ModelSource
 from strands_robots.simulation.engine import mujoco
-from strands_robots.simulation.parts import Actuator, RobotParts, is_servo, map_robot
+from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
 from strands_robots.utils import ValidationError
 
 Floats = NDArray[np.float64]
-Triple = tuple[float, float, float]
+
+MAX_WIDTH, MAX_HEIGHT = 1920, 1440
+"""Largest picture, in pixels: the size of the off-screen buffer."""
+
+UNBOUNDED = float("inf")
 
 
 @dataclass(frozen=True, slots=True)
-class RobotPlan:
-    """One robot: ``position`` in metres, ``yaw`` in radians."""
+class Actuator:
+    """One command: its key in actions, its index in ``ctrl``, its range; ``servo`` is true for a position servo."""
+
+    key: str
+    index: int
+    low: float
+    high: float
+    servo: bool
+
+    def clamp(self, value: float) -> float:
+        """Return the nearest value within the range."""
+        return min(max(value, self.low), self.high)
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """One joint with a single coordinate: its index in ``qpos`` and ``qvel``, and its range (rad or m)."""
+
+    key: str
+    qpos: int
+    qvel: int
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class RobotParts:
+    """Parts of one robot in the model. ``base`` is the ``qpos`` address of its free joint, or None."""
 
     name: str
-    source: ModelSource
-    position: Triple = (0.0, 0.0, 0.0)
-    yaw: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectPlan:
-    """One object of primitive shape: sizes in metres, mass in kilograms, colour from 0 to 1."""
-
-    name: str
-    shape: str
-    size: Triple
-    position: Triple
-    color: tuple[float, float, float, float]
-    mass: float
-    fixed: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """Everything in the world; ``timestep`` in seconds, ``gravity`` in m/s² along z."""
-
-    timestep: float = 0.002
-    gravity: float = -9.81
-    robots: tuple[RobotPlan, ...] = ()
-    objects: tuple[ObjectPlan, ...] = ()
-
-    def with_robot(self, robot: RobotPlan) -> Plan:
-        return replace(self, robots=(*self.robots, robot))
-
-    def without_robot(self, name: str) -> Plan:
-        return replace(self, robots=tuple(r for r in self.robots if r.name != name))
-
-    def with_object(self, item: ObjectPlan) -> Plan:
-        return replace(self, objects=(*self.objects, item))
-
-    def without_object(self, name: str) -> Plan:
-        return replace(self, objects=tuple(o for o in self.objects if o.name != name))
+    model: str
+    joints: dict[str, Joint]
+    actuators: dict[str, Actuator]
+    cameras: tuple[str, ...]
+    tip: str
+    root: str
+    base: int | None
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A compiled plan: the model, where each robot's numbers are in it, and the state it starts from."""
+    """A compiled plan: the model, the parts of each robot in it, and its start state."""
 
     plan: Plan
     model: Any
     robots: dict[str, RobotParts]
     start_qpos: Floats
     start_ctrl: Floats
-    actuators: tuple[Actuator, ...] = field(default_factory=tuple)
-
-
-_SHAPES = {"box": "BOX", "sphere": "SPHERE", "cylinder": "CYLINDER", "capsule": "CAPSULE"}
-SHAPES = tuple(_SHAPES)
 
 
 def compile_stage(plan: Plan) -> Stage:
-    """Build and compile ``plan``. Raises :class:`ValidationError` naming the robot whose model does not fit."""
+    """Build and compile ``plan``.
+
+    Raises:
+        ValidationError: naming the robot whose model does not fit, or MuJoCo's reason.
+    """
     spec = mujoco.MjSpec()
     spec.modelname = "world"
-    _govern(spec, plan)
+    _set_options(spec, plan)
     homes: dict[str, Floats] = {}
     controls: dict[str, float] = {}
     if hasattr(mujoco, "mjtConflict"):
@@ -97,7 +92,7 @@ def compile_stage(plan: Plan) -> Stage:
     own_floor = own_lights = True
     for robot in plan.robots:
         child = robot.source.load()
-        _govern(child, plan)
+        _set_options(child, plan)
         own_floor = own_floor and not any(g.type == mujoco.mjtGeom.mjGEOM_PLANE for g in child.worldbody.geoms)
         own_lights = own_lights and not child.lights
         home, control = _attach(spec, robot, child)
@@ -105,30 +100,29 @@ def compile_stage(plan: Plan) -> Stage:
         controls.update(control)
     for item in plan.objects:
         _place(spec, item)
-    backdrop.dress(spec, floor=own_floor, lights=own_lights)
+    _furnish(spec, floor=own_floor, lights=own_lights)
     try:
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as exc:
         raise ValidationError(f"the world does not compile: {' '.join(str(exc).split())[:300]}") from exc
     model.opt.timestep = plan.timestep
-    robots = {robot.name: map_robot(model, robot.name, robot.source.label) for robot in plan.robots}
+    robots = {robot.name: _map_robot(model, robot.name, robot.source.label) for robot in plan.robots}
     qpos, ctrl = _start(model, homes, controls)
-    actuators = tuple(sorted((a for parts in robots.values() for a in parts.actuators.values()), key=lambda a: a.index))
-    return Stage(plan, model, robots, qpos, ctrl, actuators)
+    return Stage(plan, model, robots, qpos, ctrl)
 
 
-def _govern(spec: Any, plan: Plan) -> None:
-    """The options that the world decides, for itself and for every model in it."""
+def _set_options(spec: Any, plan: Plan) -> None:
+    """Set the options that the world decides, for itself and for every model in it."""
     spec.option.timestep = plan.timestep
     spec.option.gravity = [0, 0, plan.gravity]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats], dict[str, float]]:
-    """Put ``child`` into ``spec``; its home pose and controls come back by their prefixed names."""
+    """Put ``child`` into ``spec``, and return its home pose and controls by their prefixed names."""
     try:
         if not child.actuators:
-            _motorise(child)
+            _add_servos(child)
         alone = robot.source.load() if child.keys else None
         home, control = ({}, {}) if alone is None else _home(alone.compile(), f"{robot.name}/")
         for key in list(child.keys):
@@ -143,7 +137,7 @@ def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats],
     return home, control
 
 
-def _motorise(child: Any) -> None:
+def _add_servos(child: Any) -> None:
     """Give a model without actuators (a URDF has none) a critically damped position servo at each joint."""
     for joint in child.joints:
         if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) or not joint.name:
@@ -157,13 +151,13 @@ def _motorise(child: Any) -> None:
 
 
 def _home(model: Any, prefix: str) -> tuple[dict[str, Floats], dict[str, float]]:
-    """The pose named home (else the first) of a model on its own, by prefixed joint and actuator name."""
+    """Return a model's pose named home (else its first), by prefixed joint and actuator name."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
     index = max(key, 0)
     pose: dict[str, Floats] = {}
     for joint in range(model.njnt):
         name = model.joint(joint).name
-        # A free joint starts where the robot was placed, not where its own model stood.
+        # A free joint starts where the robot was placed, not where its own file puts it.
         if name and model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             start = int(model.jnt_qposadr[joint])
             width = {1: 4}.get(int(model.jnt_type[joint]), 1)
@@ -178,7 +172,7 @@ def _place(spec: Any, item: ObjectPlan) -> None:
         body.add_freejoint(name=item.name)
     body.add_geom(
         name=item.name,
-        type=getattr(mujoco.mjtGeom, f"mjGEOM_{_SHAPES[item.shape]}"),
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{item.shape.upper()}"),
         size=list(item.size),
         rgba=list(item.color),
         mass=item.mass,
@@ -198,8 +192,132 @@ def _start(model: Any, homes: dict[str, Floats], controls: dict[str, float]) -> 
         name = model.actuator(index).name
         wanted = controls.get(name)
         if wanted is None:
-            # A servo without a given target starts by holding where it is.
-            wanted = float(data.actuator_length[index]) if is_servo(model, index) else 0.0
+            # A servo without a given target starts at its present position.
+            wanted = float(data.actuator_length[index]) if _is_servo(model, index) else 0.0
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-np.inf, np.inf)
         ctrl[index] = min(max(wanted, low), high)
     return np.array(data.qpos), ctrl
+
+
+def _map_robot(model: Any, name: str, label: str) -> RobotParts:
+    """Find the parts whose names start with ``name`` and a slash."""
+    prefix = f"{name}/"
+    joints: dict[str, Joint] = {}
+    base: int | None = None
+    joint_names: dict[int, str] = {}
+    for index in range(model.njnt):
+        full = model.joint(index).name
+        if not full.startswith(prefix):
+            continue
+        kind = int(model.jnt_type[index])
+        address = int(model.jnt_qposadr[index])
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            base = address if base is None else base
+            continue
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            continue
+        key = full[len(prefix) :] or f"joint_{len(joints)}"
+        low, high = model.jnt_range[index] if model.jnt_limited[index] else (-UNBOUNDED, UNBOUNDED)
+        joints[key] = Joint(key, address, int(model.jnt_dofadr[index]), float(low), float(high))
+        joint_names[index] = key
+    actuators: dict[str, Actuator] = {}
+    for index in range(model.nu):
+        full = model.actuator(index).name
+        target = int(model.actuator_trnid[index][0])
+        on_joint = int(model.actuator_trntype[index]) == mujoco.mjtTrn.mjTRN_JOINT and target in joint_names
+        if not full.startswith(prefix):
+            continue
+        key = full[len(prefix) :] or (joint_names[target] if on_joint else f"actuator_{len(actuators)}")
+        low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-UNBOUNDED, UNBOUNDED)
+        # MuJoCo computes an inherited range, which leaves 2.0 as 2.0000000000000004.
+        bounds = round(float(low), 12), round(float(high), 12)
+        actuators[key] = Actuator(key, index, *bounds, _is_servo(model, index))
+    cameras = tuple(n for n in (model.camera(i).name for i in range(model.ncam)) if n.startswith(prefix))
+    return RobotParts(name, label, joints, actuators, cameras, _tip(model, prefix), _root(model, prefix), base)
+
+
+def _is_servo(model: Any, index: int) -> bool:
+    """Return True for a position servo: its bias pulls back in proportion to its length."""
+    return bool(model.actuator_biasprm[index][1] < 0.0)
+
+
+def _root(model: Any, prefix: str) -> str:
+    """Return the robot's first body."""
+    return next((n for n in (str(model.body(i).name) for i in range(model.nbody)) if n.startswith(prefix)), "world")
+
+
+def _tip(model: Any, prefix: str) -> str:
+    """Return the site of the robot's hand: the one called gripper_tip, else its last, else none."""
+    sites = [n for n in (str(model.site(i).name) for i in range(model.nsite)) if n.startswith(prefix)]
+    named = [n for n in sites if n.endswith("gripper_tip")]
+    return (named or sites[-1:] or [""])[0]
+
+
+def _furnish(spec: Any, *, floor: bool, lights: bool) -> None:
+    """Add sky, lights and cameras; ``floor`` and ``lights`` are false where a robot's model brings its own."""
+    visual = spec.visual
+    visual.global_.offwidth, visual.global_.offheight = MAX_WIDTH, MAX_HEIGHT
+    visual.headlight.active = 1
+    visual.headlight.ambient = [0.34, 0.34, 0.36]
+    visual.headlight.diffuse = [0.18, 0.18, 0.18]
+    visual.headlight.specular = [0.10, 0.10, 0.10]
+    visual.rgba.haze = [0.86, 0.89, 0.93, 1]
+    # The shadow map covers this much around the centre; a larger one speckles the floor.
+    spec.stat.extent = 1.0
+    spec.stat.center = [0.1, 0.0, 0.1]
+    visual.map.znear, visual.map.zfar = 0.005, 30
+    visual.map.shadowclip = 2.2
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.62, 0.72, 0.83],
+        rgb2=[0.93, 0.95, 0.97],
+        width=256,
+        height=256,
+    )
+    if floor:
+        _floor(spec)
+    if lights:
+        _lights(spec)
+    world = spec.worldbody
+    world.add_camera(name="front", pos=[0.95, 0, 0.28], xyaxes=[0, 1, 0, -0.16, 0, 0.987], fovy=45)
+    world.add_camera(name="side", pos=[0.15, -0.85, 0.25], xyaxes=[1, 0, 0, 0, 0.12, 0.993], fovy=45)
+    world.add_camera(name="top", pos=[0.12, 0, 1.1], xyaxes=[0, -1, 0, 1, 0, 0], fovy=45)
+
+
+def _lights(spec: Any) -> None:
+    world = spec.worldbody
+    directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    world.add_light(
+        name="key", type=directional, pos=[0.8, -0.9, 1.8], dir=[-0.42, 0.42, -0.8], diffuse=[0.55, 0.53, 0.50]
+    )
+    world.add_light(
+        name="fill",
+        type=directional,
+        pos=[-0.8, 1.0, 1.4],
+        dir=[0.5, -0.5, -0.7],
+        diffuse=[0.20, 0.22, 0.25],
+        castshadow=False,
+    )
+
+
+def _floor(spec: Any) -> None:
+    spec.add_texture(
+        name="tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        rgb1=[0.72, 0.74, 0.77],
+        rgb2=[0.68, 0.705, 0.74],
+        markrgb=[0.60, 0.63, 0.67],
+        width=512,
+        height=512,
+    )
+    material = spec.add_material(name="floor", reflectance=0.0, specular=0.1, shininess=0.1)
+    material.texrepeat = [5, 5]
+    material.texuniform = True
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 0.05], material="floor", friction=[1, 0.005, 0.0001]
+    )

@@ -2,42 +2,86 @@
 
 from __future__ import annotations
 
+import functools
 import logging
+import threading
 import time
-from typing import Any
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, ParamSpec
 
 from strands_robots import settings
+from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.gate import PermitVoidError
+from strands_robots.policies.registry import create_policy
+from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options
+from strands_robots.safety.gate import MotionGate, MotionRefused, PermitVoidError, Waiting
 from strands_robots.safety.stopping import StopVerdict, halt_each
-from strands_robots.simulation import whereabouts
-from strands_robots.simulation.arguments import STEPS_MAX, answered
-from strands_robots.simulation.construction import checked_plan
-from strands_robots.simulation.motion import Rollouts
-from strands_robots.simulation.parts import RobotParts
-from strands_robots.simulation.physics import CHUNK, Snapshot
-from strands_robots.simulation.views import camera_names
-from strands_robots.utils import ValidationError, flag, shown, text, whole
+from strands_robots.simulation import projection
+from strands_robots.simulation.body import RobotBody
+from strands_robots.simulation.pacing import WorldClock
+from strands_robots.simulation.physics import CHUNK, Physics
+from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
+from strands_robots.simulation.rendering import (
+    OVERVIEW,
+    CameraView,
+    Picture,
+    Renderer,
+    RenderingError,
+    camera_names,
+    camera_view,
+    draw_path,
+    picture_size,
+)
+from strands_robots.simulation.stage import compile_stage
+from strands_robots.teleop_mixin import TeleopMixin
+from strands_robots.utils import MissingExtraError, ValidationError, flag, identifier, shown, text, whole
 
 logger = logging.getLogger(__name__)
 
+STEPS_MAX = 1_000_000
+"""Most steps of one call: about half a minute of computing for one arm."""
 
-class _Closed:
-    """The latch of a world that is gone."""
+TEARDOWN_S = 5.0
+"""How much longer than its duration :meth:`Simulation.run_policy` waits for a rollout to end."""
+
+P = ParamSpec("P")
+
+
+def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
+    """Turn a refusal that ``verb`` raises into an envelope."""
+
+    @functools.wraps(verb)
+    def answering(*args: P.args, **kwargs: P.kwargs) -> Envelope:
+        try:
+            return verb(*args, **kwargs)
+        except ValidationError as refused:
+            return error(str(refused))
+        except MotionRefused as refused:
+            return refused.envelope
+
+    return answering
+
+
+class _CleanedUp:
+    """Latch of a world that was cleaned up."""
 
     def refusal(self, verb: str) -> Envelope:
         return error(f"{verb} is refused: this simulation was cleaned up; make a new one.")
 
 
-class Simulation(Rollouts):
+class Simulation(TeleopMixin):
     """A world of simulated robots, each with its own rollout, behind the contract :class:`WorldRobot`.
 
     Physics keeps real time while a rollout or a teleoperation runs, and for a moment after a single command;
-    :meth:`step` advances it as fast as it computes. Verbs answer envelopes; what a caller gets wrong is refused
-    by name and nothing moves.
+    :meth:`step` advances it as fast as it computes. Verbs answer envelopes; a wrong argument is refused by name and
+    nothing moves. The contents of the world change only while no rollout and no teleoperation runs.
+    :mod:`~strands_robots.simulation.physics` documents the locks.
 
     Args:
-        tool_name: what the simulation is called on a network.
+        tool_name: name of the simulation on a network.
         timestep: physics step in seconds, 0.0001 to 0.02.
         gravity: along z, m/s².
         realtime: false if single commands shall start no clock, so that only :meth:`step` and rollouts move time.
@@ -55,41 +99,138 @@ class Simulation(Rollouts):
         realtime: bool = True,
     ) -> None:
         self.tool_name_str = text("tool_name", tool_name, longest=128)
-        super().__init__(checked_plan(timestep, gravity), realtime=flag("realtime", realtime))
+        self.gate = MotionGate()
+        self.starting: AbstractContextManager[Any] = threading.RLock()
+        self.observers = RolloutObservers()
+        self.physics = Physics(compile_stage(Plan.checked(timestep, gravity)))
+        self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime))
+        self._bodies: dict[str, RobotBody] = {}
+        self._rollouts: dict[str, Rollout] = {}
+        self._waiting = Waiting()
+        self._renderer = Renderer()
+        self._closed = False
 
-    def get_observation(self, robot_name: str | None = None) -> dict[str, float]:
-        """Joint positions of one robot (rad, or m for a sliding joint) and its base's pose where it has one.
+    def subscribe(self, observer: Observer) -> Unsubscribe:
+        """Call ``observer`` with every rollout event until the returned callable is called."""
+        return self.observers.subscribe(observer)
+
+    def list_robots(self) -> list[str]:
+        """Return the robots' names, in the order in which they were added."""
+        return list(self._bodies)
+
+    def body(self, robot_name: str | None = None) -> RobotBody:
+        """Return one robot of the world; without a name, the first.
 
         Raises:
-            ValidationError: no such robot.
+            ValidationError: no robot of that name, or none at all.
         """
-        return self.body(robot_name).get_observation()
+        bodies = self._bodies
+        if not bodies:
+            raise ValidationError("there is no robot in this world yet; add_robot(name, model) adds one.")
+        if robot_name is None or robot_name == "":
+            return next(iter(bodies.values()))
+        body = bodies.get(robot_name) if isinstance(robot_name, str) else None
+        if body is None:
+            raise ValidationError(f"robot_name must be one of {', '.join(bodies)}, not {shown(robot_name)}.")
+        return body
 
     @answered
-    def send_action(self, action: dict[str, float], robot_name: str | None = None) -> Envelope:
-        """Set targets of one robot; ``sent`` holds what was really set, clamped to each actuator's range."""
-        self._open()
-        body = self.body(robot_name)
-        permit = self.gate.permit("send_action")
-        with self._waiting.until_begun(permit, body.name):
-            self._idle(body.name)
-            try:
-                sent = body.send_action(action, permit)
-            except PermitVoidError as void:
-                raise ValidationError(f"send_action was overtaken by a stop: {void}.") from None
-        return success(f"Sent {len(sent)} targets to {body.name}.", robot=body.name, sent=sent)
+    def create_world(self, timestep: float = 0.002, gravity: float = -9.81) -> Envelope:
+        """Start over with an empty world. ``timestep`` 0.0001 to 0.02 s, ``gravity`` -100 to 100 m/s² along z."""
+        plan = Plan.checked(timestep, gravity)
+        with self.starting:
+            self._require_idle("create_world")
+            permit = self.gate.permit("create_world")
+            self._rebuild(plan)
+            self.physics.reset(permit)
+        return success("An empty world with a floor.", timestep=plan.timestep, gravity=plan.gravity)
+
+    @answered
+    def add_robot(
+        self, name: str = "so100", model: str | Path | None = None, position: Any = None, yaw: float = 0.0
+    ) -> Envelope:
+        """Put a robot into the world; the others keep their state.
+
+        Args:
+            name: its name in this world, an identifier that no robot or object has.
+            model: ``so100``, ``so101``, ``rover``, the path of an MJCF or URDF file, or a ``robot_descriptions``
+                name; by default ``name``.
+            position: of its base, metres; by default beside the robots that are there.
+            yaw: heading, radians from -2π to 2π.
+        """
+        robot = RobotPlan.checked(name, model, position, yaw)
+        with self.starting:
+            self._require_idle("add_robot")
+            self._rebuild(self.physics.stage.plan.with_robot(robot, beside=position is None))
+            parts = self.body(robot.name).parts
+        return success(
+            f"Added {robot.name} ({robot.source.label}) with {len(parts.actuators)} actuators.",
+            robot=robot.name,
+            model=robot.source.label,
+            joints=list(parts.joints),
+            actuators=list(parts.actuators),
+            cameras=list(parts.cameras),
+        )
+
+    @answered
+    def remove_robot(self, name: str) -> Envelope:
+        """Take a robot out of the world; the others keep their state."""
+        with self.starting:
+            self._require_idle("remove_robot")
+            label = self.body(identifier("name", name)).name
+            self._rebuild(self.physics.stage.plan.without_robot(label))
+        return success(f"Removed {label}.", robot=label, robots=self.list_robots())
+
+    @answered
+    def add_object(
+        self,
+        name: str,
+        shape: str = "box",
+        size: Any = (0.02, 0.02, 0.02),
+        position: Any = (0.2, 0.0, 0.02),
+        *,
+        color: Any = (0.85, 0.2, 0.2, 1.0),
+        mass: float = 0.05,
+        fixed: bool = False,
+    ) -> Envelope:
+        """Put an object of primitive shape into the world.
+
+        Args:
+            name: an identifier that no robot or object has.
+            shape: box, sphere, cylinder or capsule.
+            size: metres from 0.001 to 10: half lengths of a box, radius of a sphere, radius and half length else.
+            position: of its centre, metres.
+            color: red, green, blue and alpha from 0 to 1.
+            mass: kilograms, 0.0001 to 1000.
+            fixed: true for an object that never moves.
+        """
+        item = ObjectPlan.checked(
+            name=name, shape=shape, size=size, position=position, color=color, mass=mass, fixed=fixed
+        )
+        with self.starting:
+            self._require_idle("add_object")
+            self._rebuild(self.physics.stage.plan.with_object(item))
+        return success(f"Added {item.shape} {item.name}.", object=item.name, position=list(item.position))
+
+    @answered
+    def remove_object(self, name: str) -> Envelope:
+        """Take an object out of the world."""
+        with self.starting:
+            self._require_idle("remove_object")
+            self._rebuild(self.physics.stage.plan.without_object(name))
+        return success(f"Removed {name}.", object=name)
 
     @answered
     def step(self, n: int = 1) -> Envelope:
         """Advance physics by ``n`` time steps (1 to 1,000,000) as fast as they compute; setpoints stay as they are."""
         count = whole("n", n, low=1, high=STEPS_MAX)
-        self._open()
+        self._require_open()
         self._clock.by_hand()
         left = count
         while left and not self._closed:
-            self._physics.advance(min(left, CHUNK))
+            self.physics.advance(min(left, CHUNK))
             left -= min(left, CHUNK)
-        snapshot = self._physics.snapshot
+        snapshot = self.physics.snapshot
         return success(
             f"Stepped {count - left} times, to {snapshot.time:.3f} s.",
             steps=count - left,
@@ -100,22 +241,22 @@ class Simulation(Rollouts):
     @answered
     def reset(self) -> Envelope:
         """Halt, then put the world back to its initial state. Refused while the robot is locked."""
-        self._open()
+        self._require_open()
         permit = self.gate.permit("reset")
         with self.starting:
             # Nothing starts a rollout while this lock is held; a stop that comes meanwhile voids the fresh permit.
             permit = self.gate.renew(permit)
-            verdict = self._frozen("reset")
+            verdict = self._freeze("reset")
             if not verdict.stopped:
                 return verdict.envelope()
-            self._physics.reset(permit)
-        return success("The world is back at its start.", sim_time=self._physics.snapshot.time, halted=verdict.halted)
+            self.physics.reset(permit)
+        return success("The world is back at its start.", sim_time=self.physics.snapshot.time, halted=verdict.halted)
 
     @answered
     def get_state(self) -> Envelope:
         """``sim_time`` (s), ``step_count``, ``robots`` (name to joints in radians), ``running_policies``, and more."""
-        snapshot = self._physics.snapshot
-        robots = {name: {**snapshot.joints(p), **snapshot.base_pose(p)} for name, p in snapshot.stage.robots.items()}
+        snapshot = self.physics.snapshot
+        robots = {name: snapshot.observation(parts) for name, parts in snapshot.stage.robots.items()}
         return success(
             f"{_count(robots)} at {snapshot.time:.3f} s of simulated time.",
             sim_time=snapshot.time,
@@ -123,81 +264,164 @@ class Simulation(Rollouts):
             robots=robots,
             running_policies={row["robot"]: row for row in self.list_policies_running()},
             real_time_factor=round(self._clock.real_time_factor, 4),
-            diverged=self._physics.diverged,
+            diverged=self.physics.diverged,
         )
 
     @answered
     def get_features(self) -> Envelope:
         """Joints, actuators and cameras by robot, with ranges in the joint's unit (null where there is no limit)."""
-        stage = self._physics.snapshot.stage
+        snapshot = self.physics.snapshot
+        stage = snapshot.stage
         robots: dict[str, Any] = {
             name: {
                 "model": parts.model,
                 "joints": {key: _range(j.low, j.high) for key, j in parts.joints.items()},
                 "actuators": {key: _range(a.low, a.high) for key, a in parts.actuators.items()},
                 "cameras": list(parts.cameras),
-                "observation_features": list(self.body(name).observation_features),
+                "observation_features": list(snapshot.observation(parts)),
                 "action_features": list(parts.actuators),
             }
             for name, parts in stage.robots.items()
         }
-        objects = [o.name for o in stage.plan.objects]
         return success(
-            f"{len(robots)} robot{'' if len(robots) == 1 else 's'}.",
+            f"{_count(robots)}.",
             robots=robots,
             cameras=camera_names(stage),
-            objects=objects,
+            objects=[o.name for o in stage.plan.objects],
             timestep=stage.plan.timestep,
         )
 
+    def get_observation(self, robot_name: str | None = None) -> dict[str, float]:
+        """Return joint positions of one robot (rad, or m for a sliding joint) and the pose of a free base.
+
+        Raises:
+            ValidationError: no such robot.
+        """
+        return self.body(robot_name).get_observation()
+
     @answered
     def get_pose(self, robot_name: str | None = None) -> Envelope:
-        """Where a robot's base is: ``x``, ``y``, ``z`` (m), ``theta`` (yaw, rad), ``quat`` (w, x, y, z), ``source``
-        and ``frame``. The name may be left out where there is one robot."""
-        snapshot, robot = self._only(robot_name)
-        pose = whereabouts.base_pose(snapshot, robot)
-        where = f"{robot.name} is at {pose['x']:.3f}, {pose['y']:.3f} m."
-        return success(where, **pose, source="simulation", frame="world")
+        """Pose of a robot's base: ``x``, ``y``, ``z`` (m), ``theta`` (yaw, rad), ``quat`` (w, x, y, z), ``source`` and
+        ``frame``. The name may be left out where there is one robot."""
+        body = self._only(robot_name)
+        pose = body.base_pose()
+        summary = f"{body.name} is at {pose['x']:.3f}, {pose['y']:.3f} m."
+        return success(summary, **pose, source="simulation", frame="world")
 
     @answered
     def get_odom(self, robot_name: str | None = None) -> Envelope:
-        """The same of a robot that moves about, with ``linear`` (m/s) and ``angular`` (rad/s) along its own axes."""
-        snapshot, robot = self._only(robot_name)
-        if not whereabouts.moves_about(snapshot, robot):
-            return error(f"{robot.name} does not move about.")
-        pose, velocity = whereabouts.base_pose(snapshot, robot), whereabouts.base_velocity(snapshot, robot)
-        return success(f"{robot.name} moves about.", **pose, **velocity, source="simulation", frame="world")
+        """Pose of a mobile robot as :meth:`get_pose`, with ``linear`` (m/s) and ``angular`` (rad/s), own axes."""
+        body = self._only(robot_name)
+        velocity = body.base_velocity()
+        if velocity is None:
+            return error(f"{body.name} does not move about.")
+        return success(f"{body.name} moves about.", **body.base_pose(), **velocity, source="simulation", frame="world")
 
     @property
     def joint_units(self) -> dict[str, str]:
         """``radians`` or ``metres`` by action key, of the robot that an action without a name goes to."""
-        snapshot = self._physics.snapshot
-        first = next(iter(snapshot.stage.robots.values()), None)
-        return {} if first is None else whereabouts.joint_units(snapshot, first)
+        return self.body().joint_units if self._bodies else {}
 
-    def _only(self, robot_name: str | None) -> tuple[Snapshot, RobotParts]:
-        snapshot = self._physics.snapshot
-        robots = snapshot.stage.robots
-        name = robot_name or (next(iter(robots)) if len(robots) == 1 else "")
-        if name not in robots:
-            raise ValidationError(f"robot_name must be one of {list(robots)}, not {shown(robot_name)}.")
-        return snapshot, robots[name]
+    @answered
+    def send_action(self, action: dict[str, float], robot_name: str | None = None) -> Envelope:
+        """Set targets of one robot; ``sent`` holds what was really set, clamped to each actuator's range."""
+        self._require_open()
+        body = self.body(robot_name)
+        permit = self.gate.permit("send_action")
+        with self._waiting.until_begun(permit, body.name):
+            self._require_undriven(body.name)
+            try:
+                sent = body.send_action(action, permit)
+            except PermitVoidError as void:
+                raise ValidationError(f"send_action was overtaken by a stop: {void}.") from None
+        return success(f"Sent {len(sent)} targets to {body.name}.", robot=body.name, sent=sent)
+
+    @answered
+    def start_policy(
+        self,
+        robot_name: str,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        **policy: Any,
+    ) -> Envelope:
+        """Start a rollout of one robot and return at once.
+
+        Args:
+            robot_name: a robot of this world; empty for the first.
+            instruction: the task, 1 to 2000 characters.
+            policy_provider: a registered policy, such as mock.
+            duration: seconds, above 0 up to a day.
+            policy: arguments of that policy's constructor; besides, ``control_frequency`` (Hz, at most the robot's
+                rate) and ``n_steps`` (actions after which it ends).
+        """
+        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
+        return success(
+            f"{rollout.robot} started: {rollout.instruction}",
+            robot=rollout.robot,
+            instruction=rollout.instruction,
+            policy_provider=rollout.policy_name,
+            duration=rollout.duration,
+        )
+
+    @answered
+    def run_policy(
+        self,
+        robot_name: str,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        **policy: Any,
+    ) -> Envelope:
+        """Run a rollout as :meth:`start_policy` does and wait; an error when it failed or did not end in time."""
+        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
+        if not rollout.join((rollout.duration or 0.0) + TEARDOWN_S):
+            rollout.request_stop()
+            return error(f"{rollout.robot} was still running {TEARDOWN_S:g} s after its time.", **_row(rollout))
+        if rollout.state == "error":
+            return error(f"{rollout.robot} failed: {rollout.error}", **_row(rollout))
+        return success(f"{rollout.robot} {rollout.state} after {rollout.step_count} steps.", **_row(rollout))
+
+    @answered
+    def stop_policy(self, robot_name: str) -> Envelope:
+        """Stop the policy or the leader that drives one robot, and freeze the robot where it is.
+
+        ``stopped`` is false if the loop outlived it. A policy or a leader that is still loading never starts, and the
+        targets of a single action are given up.
+        """
+        body = self.body(robot_name)
+        self._waiting.void(body.name)
+        self.void_leaders(body.name)
+        rollout = self._running().get(body.name) or self.teleoperating().get(self.teleoperated_by(body.name))
+        if rollout is None:
+            # After a single action the servos go on to its targets.
+            body.hold()
+            return success(f"{body.name} ran no policy; it is held.", robot=body.name, stopped=True, was_running=False)
+        rollout.request_stop()
+        body.hold()
+        stopped = rollout.join(STOP_JOIN_S)
+        row = {**_row(rollout), "stopped": stopped, "was_running": True}
+        if not stopped:
+            return error(f"{body.name} is frozen, but its policy {rollout.policy_name} has not returned yet.", **row)
+        return success(f"{body.name} stopped after {rollout.step_count} steps.", **row)
+
+    def list_policies_running(self) -> list[dict[str, Any]]:
+        """Return one row for each running rollout: robot, instruction, policy, step, elapsed_s."""
+        return [rollout.row() for rollout in self._running().values()]
+
+    def occupied(self, robot: str) -> str:
+        """Name the rollout that drives this robot now, for a refusal; empty when none does."""
+        rollout = self._running().get(robot)
+        return "" if rollout is None else f"the policy {rollout.policy_name} ({rollout.instruction!r})"
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop everything that moves a robot of this world, and freeze them where they are.
+        """Stop everything that moves a robot of this world, and freeze the robots where they are.
 
-        The gate goes first and the freeze second; both take microseconds, and after them no action is written,
-        whatever a policy is doing. Waiting for the loops to end, so as to say whether they did, comes last.
+        The gate is revoked first and the setpoints are frozen second; both take microseconds, and after them no
+        action is written, whatever a policy is doing. Last it waits for the loops to end, to report whether they did.
         """
         self.gate.revoke()
-        return self._frozen(reason)
-
-    def _frozen(self, reason: str) -> StopVerdict:
-        deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
-        self._physics.hold()
-        stops = self._stops(deadline)
-        logger.info("Halting %s (%s): %s.", self.tool_name_str, reason or "no reason given", ", ".join(stops) or "-")
-        return halt_each(stops)
+        return self._freeze(reason)
 
     def cleanup(self) -> Envelope:
         """Halt, stop the clock and free the pictures. A second call does nothing."""
@@ -205,11 +429,136 @@ class Simulation(Rollouts):
             return success("Already cleaned up.")
         with self.starting:
             self._closed = True
-            self.gate.attach(_Closed())
+            self.gate.attach(_CleanedUp())
         verdict = self.halt("cleanup")
         self._clock.close()
-        self._close_pictures()
+        self._renderer.close()
         return verdict.envelope()
+
+    def render(self, camera: str = OVERVIEW, width: int = 320, height: int = 240, *, quality: bool = False) -> Picture:
+        """Draw a picture by OpenGL: RGB, (height, width, 3), unsigned bytes.
+
+        Args:
+            camera: overview, front, side, top, or a robot's own (``wrist``, or ``arm/wrist`` where several have one).
+            width: 16 to 1920 pixels.
+            height: 16 to 1440 pixels.
+            quality: with shadows and anti-aliasing, at many times the cost in software.
+
+        Raises:
+            ValidationError: an argument outside its domain.
+            RenderingError: OpenGL does not work on this machine; the message says which package is missing.
+        """
+        size, best = picture_size(width, height), flag("quality", quality)
+        self._require_open()
+        return self._renderer.render(self.physics.snapshot, camera, *size, quality=best)
+
+    def project(self, camera: str = OVERVIEW, width: int = 320, height: int = 240) -> Picture:
+        """Draw the same picture without OpenGL; arguments as for :meth:`render`."""
+        size = picture_size(width, height)
+        snapshot = self.physics.snapshot
+        data = snapshot.data()
+        return projection.draw(snapshot.stage, data, camera_view(snapshot.stage, data, camera), *size)
+
+    def picture(
+        self,
+        camera: str = OVERVIEW,
+        width: int = 640,
+        height: int = 480,
+        *,
+        path: Iterable[tuple[float, float, float]] = (),
+    ) -> tuple[Picture, Literal["opengl", "projection"]]:
+        """Draw the best picture this machine can make, and say how it was made; ``path`` (metres) is drawn over it."""
+        how: Literal["opengl", "projection"] = "opengl"
+        try:
+            picture = self.render(camera, width, height, quality=True)
+        except RenderingError:
+            how, picture = "projection", self.project(camera, width, height)
+        points = list(path)
+        if points:
+            picture = draw_path(picture, self.view(camera).pixels(points, width, height))
+        return picture, how
+
+    def view(self, camera: str = OVERVIEW) -> CameraView:
+        """Return the present view of ``camera``, which puts world points into a picture."""
+        snapshot = self.physics.snapshot
+        return camera_view(snapshot.stage, snapshot.data(), camera)
+
+    def tip_position(self, robot_name: str | None = None) -> tuple[float, float, float]:
+        """Return the place of a robot's gripper tip in the world, metres; of its base where it has no gripper.
+
+        Raises:
+            ValidationError: no such robot.
+        """
+        return self.body(robot_name).tip_position()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise ValidationError("this simulation was cleaned up; make a new one.")
+
+    def _require_idle(self, verb: str) -> None:
+        self._require_open()
+        leaders = [f"{leader} leading {session.robot}" for leader, session in self.teleoperating().items()]
+        moving = [f"policy on {name}" for name in self._running()] + leaders
+        if moving:
+            raise ValidationError(f"{verb} is refused while something moves: {', '.join(moving)}. Stop it first.")
+
+    def _require_undriven(self, name: str) -> None:
+        driver = self.occupied(name) or self.teleoperated_by(name)
+        if driver:
+            raise ValidationError(f"{name} is driven by {driver}; stop that first.")
+
+    def _only(self, robot_name: str | None) -> RobotBody:
+        if not robot_name and len(self._bodies) != 1:
+            raise ValidationError(f"robot_name must be one of {self.list_robots()}, not {shown(robot_name)}.")
+        return self.body(robot_name)
+
+    def _rebuild(self, plan: Plan) -> None:
+        """Compile ``plan`` and go on with it; when it does not compile nothing has changed."""
+        self.physics.replace(compile_stage(plan))
+        self._bodies = {
+            r.name: self._bodies.get(r.name) or RobotBody(r.name, self.physics, self._clock) for r in plan.robots
+        }
+
+    def _running(self) -> dict[str, Rollout]:
+        return {name: rollout for name, rollout in list(self._rollouts.items()) if rollout.running}
+
+    def _start_rollout(
+        self, robot_name: str, instruction: str, provider: str, duration: float, options: dict[str, Any]
+    ) -> Rollout:
+        chosen = rollout_options(instruction, duration, options, settings.number("STRANDS_CONTROL_HZ"))
+        permit = self.gate.permit("start_policy")
+        with self._waiting.until_begun(permit, self.body(robot_name).name):
+            try:
+                policy = create_policy(provider, **options)
+            except MissingExtraError as missing:
+                raise ValidationError(str(missing)) from missing
+            with self.starting:
+                self._require_open()
+                body = self.body(robot_name)
+                self._require_undriven(body.name)
+                if not permit.valid:
+                    raise ValidationError(f"start_policy: {body.name} was halted while its policy was made ready.")
+                rollout = Rollout(body, policy, permit=permit, policy_name=provider, observers=self.observers, **chosen)
+                self._rollouts[body.name] = rollout
+                rollout.start()
+                return rollout
+
+    def _freeze(self, reason: str) -> StopVerdict:
+        deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
+        self.physics.hold()
+        running = self._running()
+        for rollout in running.values():
+            rollout.request_stop()
+        sources: dict[str, Callable[[], object]] = {
+            **{name: partial(rollout.ended_by, deadline) for name, rollout in running.items()},
+            **self.teleop_stops(deadline),
+        }
+        logger.info("Halting %s (%s): %s.", self.tool_name_str, reason or "no reason given", ", ".join(sources) or "-")
+        return halt_each(sources)
+
+
+def _row(rollout: Rollout) -> dict[str, Any]:
+    return {**rollout.row(), "state": rollout.state, "error": rollout.error}
 
 
 def _range(low: float, high: float) -> list[float] | None:

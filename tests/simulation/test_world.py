@@ -45,16 +45,16 @@ class Locked:
         return error(f"{verb} is refused: locked.")
 
 
-def test_a_simulation_fits_the_contract(world: Simulation) -> None:
+def test_simulation_is_a_world_robot(world: Simulation) -> None:
     assert isinstance(world, WorldRobot)
 
 
-def test_the_package_alone_loads_neither_mujoco_nor_numpy() -> None:
+def test_importing_the_package_loads_neither_mujoco_nor_numpy() -> None:
     code = "import strands_robots.simulation, sys; print([m for m in ('mujoco', 'numpy', 'PIL') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-def test_without_mujoco_one_sentence_names_the_extra() -> None:
+def test_missing_mujoco_is_reported_with_the_extra() -> None:
     code = (
         "import sys; sys.modules['mujoco'] = None\n"
         "try:\n    from strands_robots.simulation import Simulation\n"
@@ -64,13 +64,13 @@ def test_without_mujoco_one_sentence_names_the_extra() -> None:
     assert said == "Simulation needs the [sim] extra: in the clone, .venv/bin/pip install -e '.[sim]'.\n"
 
 
-def test_stepping_by_hand_advances_exactly_that_many_steps(world: Simulation) -> None:
+def test_step_advances_exactly_that_many_steps(world: Simulation) -> None:
     answer = world.step(1234)
     assert answer["step_count"] == 1234
     assert answer["sim_time"] == pytest.approx(2.468)
 
 
-def test_the_same_steps_give_the_same_numbers(world: Simulation) -> None:
+def test_same_steps_give_same_numbers(world: Simulation) -> None:
     other = Simulation()
     other.add_robot("arm", "so100")
     other.step(1)
@@ -82,7 +82,7 @@ def test_the_same_steps_give_the_same_numbers(world: Simulation) -> None:
     other.cleanup()
 
 
-def test_an_action_beyond_the_range_is_clamped_and_returned_as_sent(world: Simulation) -> None:
+def test_action_beyond_the_range_is_clamped_and_returned_as_sent(world: Simulation) -> None:
     assert world.send_action({"shoulder_pan": 9.0, "gripper": -5.0})["sent"] == {"shoulder_pan": 2.2, "gripper": -0.2}
 
 
@@ -90,9 +90,7 @@ def test_an_action_beyond_the_range_is_clamped_and_returned_as_sent(world: Simul
     ("action", "named"),
     [({"knee": 1.0}, "'knee'"), ({"gripper": math.nan}, "gripper"), ({"gripper": True}, "True"), ([1], "action")],
 )
-def test_an_action_out_of_domain_is_refused_by_name_and_nothing_moves(
-    world: Simulation, action: Any, named: str
-) -> None:
+def test_bad_action_is_refused_by_name_and_nothing_moves(world: Simulation, action: Any, named: str) -> None:
     before = state_of(world)
     mixed = {"shoulder_pan": 1.0, **action} if isinstance(action, dict) else action
     answer = world.send_action(mixed)
@@ -104,7 +102,7 @@ def test_an_action_out_of_domain_is_refused_by_name_and_nothing_moves(
 
 @RELAXED
 @given(value=BAD_NUMBERS)
-def test_no_unusable_number_gets_past_a_verb(world: Simulation, value: Any) -> None:
+def test_every_verb_refuses_an_unusable_number(world: Simulation, value: Any) -> None:
     before = state_of(world)
     answers = [
         world.step(value),
@@ -125,7 +123,7 @@ def test_no_unusable_number_gets_past_a_verb(world: Simulation, value: Any) -> N
 @given(
     name=st.one_of(st.text(max_size=3).filter(lambda t: not t.isalnum()), st.integers(), st.none(), st.lists(st.text()))
 )
-def test_no_unusable_name_gets_past_a_verb(world: Simulation, name: Any) -> None:
+def test_every_verb_refuses_an_unusable_name(world: Simulation, name: Any) -> None:
     assert world.add_robot(name, "so100")["status"] == "error" or name.strip()
     assert world.remove_robot(name)["status"] == "error"
     assert world.send_action({}, name)["status"] == ("error" if name not in (None, "") else "success")
@@ -136,7 +134,7 @@ def test_no_unusable_name_gets_past_a_verb(world: Simulation, name: Any) -> None
 
 @RELAXED
 @given(timestep=st.floats(1e-4, 2e-2), gravity=st.floats(-20, 0), n=st.integers(1, 50))
-def test_every_number_of_the_domain_is_taken(timestep: float, gravity: float, n: int) -> None:
+def test_every_number_of_the_domain_is_accepted(timestep: float, gravity: float, n: int) -> None:
     simulation = Simulation(timestep=timestep, gravity=gravity)
     assert simulation.step(n)["sim_time"] == pytest.approx(n * timestep)
     simulation.cleanup()
@@ -145,7 +143,7 @@ def test_every_number_of_the_domain_is_taken(timestep: float, gravity: float, n:
 @pytest.mark.parametrize(
     ("argument", "value"), [("timestep", 0.0), ("timestep", 1.0), ("realtime", 1), ("tool_name", "")]
 )
-def test_a_simulation_is_not_made_with_bad_arguments(argument: str, value: Any) -> None:
+def test_constructor_refuses_bad_arguments(argument: str, value: Any) -> None:
     with pytest.raises(ValidationError, match=argument):
         Simulation(**{argument: value})
 
@@ -168,7 +166,7 @@ def test_adding_and_removing_robots_keeps_the_state_of_the_others(world: Simulat
     assert world.get_observation("second")["shoulder_pan"] == pytest.approx(-0.5, abs=0.02)
 
 
-def test_robots_of_one_model_do_not_share_commands(world: Simulation) -> None:
+def test_robots_of_one_model_have_separate_commands(world: Simulation) -> None:
     world.add_robot("twin", "so100")
     world.send_action({"shoulder_pan": 1.0}, "twin")
     world.step(500)
@@ -177,13 +175,13 @@ def test_robots_of_one_model_do_not_share_commands(world: Simulation) -> None:
 
 
 @pytest.mark.parametrize("name", ["arm", "cube", "floor", "world"])
-def test_a_name_is_given_once(world: Simulation, name: str) -> None:
+def test_taken_name_is_refused(world: Simulation, name: str) -> None:
     world.add_object("cube")
     assert "taken" in world.add_robot(name, "so100")["reason"]
     assert "taken" in world.add_object(name)["reason"]
 
 
-def test_an_object_falls_to_the_floor_and_can_be_taken_away(world: Simulation) -> None:
+def test_object_falls_to_the_floor_and_can_be_removed(world: Simulation) -> None:
     world.add_object("ball", "sphere", 0.03, (0.3, 0.2, 0.5))
     world.step(1000)
     assert world.get_features()["objects"] == ["ball"]
@@ -192,11 +190,11 @@ def test_an_object_falls_to_the_floor_and_can_be_taken_away(world: Simulation) -
 
 
 @pytest.mark.parametrize(("shape", "size"), [("cone", 1), ("sphere", (1, 2)), ("box", (0.1, 0.1)), ("cylinder", 0.1)])
-def test_a_shape_needs_its_own_sizes(world: Simulation, shape: str, size: Any) -> None:
+def test_wrong_number_of_sizes_is_refused(world: Simulation, shape: str, size: Any) -> None:
     assert world.add_object("thing", shape, size)["status"] == "error"
 
 
-def test_reset_puts_the_world_back(world: Simulation) -> None:
+def test_reset_restores_the_initial_state(world: Simulation) -> None:
     start = world.get_observation()
     world.send_action({"shoulder_pan": 1.0})
     world.step(300)
@@ -206,7 +204,7 @@ def test_reset_puts_the_world_back(world: Simulation) -> None:
     assert world.get_observation() == pytest.approx(start, abs=0.004)
 
 
-def test_a_locked_world_refuses_motion_and_still_answers_reads(world: Simulation) -> None:
+def test_locked_world_refuses_motion_and_answers_reads(world: Simulation) -> None:
     world.gate.attach(Locked())
     assert world.send_action({"gripper": 1.0})["reason"] == "send_action is refused: locked."
     assert world.reset()["reason"] == "reset is refused: locked."
@@ -220,7 +218,7 @@ def test_features_name_ranges_and_cameras(world: Simulation) -> None:
     assert features["cameras"] == ["arm/wrist"]
 
 
-def test_a_cleaned_up_world_refuses_by_name(world: Simulation) -> None:
+def test_cleaned_up_world_refuses_verbs_by_name(world: Simulation) -> None:
     assert world.cleanup()["status"] == world.cleanup()["status"] == "success"
     for answer in (world.step(1), world.send_action({}), world.reset(), world.add_robot("x", "so100")):
         assert "cleaned up" in answer["reason"]

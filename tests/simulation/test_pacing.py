@@ -1,4 +1,4 @@
-"""Real time, locks and halts: reads never wait, commands never follow a halt, and no thread is left."""
+"""Real time, locks and halts: reads never wait, commands never follow a halt, and no thread remains."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from strands_robots.simulation import Simulation
 from strands_robots.simulation.catalog import find
 from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.physics import Physics
-from strands_robots.simulation.stage import Plan, RobotPlan, compile_stage
+from strands_robots.simulation.plan import Plan, RobotPlan
+from strands_robots.simulation.stage import compile_stage
 
 
 def pacers() -> list[str]:
@@ -38,12 +39,12 @@ def world() -> Iterator[Simulation]:
     simulation.cleanup()
 
 
-def test_an_idle_world_stands_still_and_has_no_thread(world: Simulation) -> None:
+def test_idle_world_has_no_thread(world: Simulation) -> None:
     assert pacers() == []
     assert world.get_state()["step_count"] == 0
 
 
-def test_a_single_command_is_followed_in_real_time_and_then_the_thread_ends(world: Simulation) -> None:
+def test_command_is_followed_in_real_time_and_then_the_thread_ends(world: Simulation) -> None:
     began = time.monotonic()
     world.send_action({"shoulder_pan": 0.5})
     eventually(lambda: abs(world.get_observation()["shoulder_pan"] - 0.5) < 0.02, what="arm follows")
@@ -51,14 +52,14 @@ def test_a_single_command_is_followed_in_real_time_and_then_the_thread_ends(worl
     eventually(lambda: not pacers(), what="pacer ends")
 
 
-def test_whoever_steps_by_hand_owns_the_clock(world: Simulation) -> None:
+def test_command_after_a_step_by_hand_starts_no_clock(world: Simulation) -> None:
     world.step(10)
     world.send_action({"shoulder_pan": 0.5})
     assert pacers() == []
     assert world.get_state()["step_count"] == 10
 
 
-def test_simulated_time_keeps_to_real_time(physics: Physics) -> None:
+def test_simulated_time_follows_real_time(physics: Physics) -> None:
     clock = WorldClock(physics)
     began = time.monotonic()
     with clock.running():
@@ -82,20 +83,33 @@ def test_many_worlds_share_one_thread() -> None:
     assert pacers() == []
 
 
-def test_a_read_does_not_wait_while_physics_holds_its_lock(physics: Physics) -> None:
+def test_reads_and_commands_do_not_wait_for_a_step(physics: Physics, monkeypatch: pytest.MonkeyPatch) -> None:
+    inside, let_go = threading.Event(), threading.Event()
+
+    def slow_step(*_: object, **__: object) -> None:
+        inside.set()
+        let_go.wait(60)
+
     def read() -> None:
         for _ in range(50):
             physics.snapshot.joints(physics.stage.robots["arm"])
             physics.command("arm", {"gripper": 0.1})
 
+    monkeypatch.setattr("mujoco.mj_step", slow_step)
+    stepping = threading.Thread(target=physics.advance, args=(1,), daemon=True)
     reading = threading.Thread(target=read, daemon=True)
-    with physics._step_lock:
+    stepping.start()
+    try:
+        assert inside.wait(20)
         reading.start()
         reading.join(20)
         assert not reading.is_alive()
+    finally:
+        let_go.set()
+        stepping.join(20)
 
 
-def test_a_snapshot_is_never_half_a_step(physics: Physics) -> None:
+def test_snapshot_is_never_half_a_step(physics: Physics) -> None:
     torn: list[object] = []
     stop = threading.Event()
 
@@ -115,7 +129,7 @@ def test_a_snapshot_is_never_half_a_step(physics: Physics) -> None:
     assert torn == []
 
 
-def test_no_command_is_written_with_a_void_permit(physics: Physics) -> None:
+def test_command_with_a_void_permit_is_not_written(physics: Physics) -> None:
     gate = MotionGate()
     permit = gate.permit("send_action")
     gate.revoke()
@@ -125,7 +139,7 @@ def test_no_command_is_written_with_a_void_permit(physics: Physics) -> None:
     assert np.array_equal(before, physics.setpoints)
 
 
-def test_a_halt_in_mid_motion_freezes_the_arm_where_it_is(world: Simulation) -> None:
+def test_halt_freezes_a_moving_arm(world: Simulation) -> None:
     world.send_action({"shoulder_pan": 2.0})
     eventually(lambda: world.get_observation()["shoulder_pan"] > 0.3, what="arm moves")
     verdict = world.halt("test")
@@ -137,7 +151,7 @@ def test_a_halt_in_mid_motion_freezes_the_arm_where_it_is(world: Simulation) -> 
     assert abs(world.get_observation()["shoulder_pan"] - where) < 0.35
 
 
-def test_a_halt_stops_the_rover() -> None:
+def test_halt_stops_the_rover() -> None:
     simulation = Simulation(realtime=False)
     simulation.add_robot("rover")
     simulation.send_action({"linear_velocity": 0.5})
@@ -150,7 +164,7 @@ def test_a_halt_stops_the_rover() -> None:
     simulation.cleanup()
 
 
-def test_a_world_that_was_held_up_catches_up_within_a_second_and_lets_the_rest_go(physics: Physics) -> None:
+def test_late_world_catches_up_one_second_and_drops_the_rest(physics: Physics) -> None:
     clock = WorldClock(physics)
     now = time.monotonic()
     clock.tick(now)

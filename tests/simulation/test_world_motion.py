@@ -1,4 +1,4 @@
-"""Rollouts: one for each robot of a world, honest stops, and nothing written after a halt."""
+"""Motion in a simulated world: one rollout for each robot, stops that report truly, nothing written after a halt."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import pytest
+from fixtures.bodies import ScriptedPolicy
 from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.envelope import Envelope, error
-from strands_robots.safety.stopping import Outcome, grade
-from strands_robots.simulation import Simulation, motion
+from strands_robots.safety.gate import Permit
+from strands_robots.safety.stopping import Outcome, StopVerdict, grade, halt_each
+from strands_robots.simulation import Simulation
+from strands_robots.simulation import world as world_module
+from strands_robots.teleoperators.leader import ScriptedLeader
 
 pytestmark = pytest.mark.usefixtures("patient_halts")
 
@@ -73,12 +77,12 @@ class Failing(Stuck):
 @pytest.fixture
 def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
     policy = Stuck()
-    monkeypatch.setattr(motion, "create_policy", lambda provider, **options: policy)
+    monkeypatch.setattr(world_module, "create_policy", lambda provider, **options: policy)
     yield policy
     policy.let_go.set()
 
 
-def test_two_robots_each_run_their_own_policy(world: Simulation, events: list[RolloutEvent]) -> None:
+def test_each_robot_runs_its_own_policy(world: Simulation, events: list[RolloutEvent]) -> None:
     assert world.start_policy("left", "wave")["status"] == "success"
     assert world.start_policy("right", "nod")["status"] == "success"
     eventually(lambda: {e.robot for e in events if e.step > 5} == {"left", "right"})
@@ -90,7 +94,7 @@ def test_two_robots_each_run_their_own_policy(world: Simulation, events: list[Ro
     eventually(lambda: world.list_policies_running()[0]["step"] > step + 5, what="the other goes on")
 
 
-def test_a_rollout_moves_its_robot_alone(world: Simulation, events: list[RolloutEvent]) -> None:
+def test_a_rollout_moves_only_its_robot(world: Simulation, events: list[RolloutEvent]) -> None:
     still = world.get_observation("right")
     start = world.get_observation("left")
     world.run_policy("left", "wave", duration=60.0, n_steps=30)
@@ -107,7 +111,7 @@ def test_run_policy_waits_and_reports(world: Simulation) -> None:
     assert answer["step"] >= 1
 
 
-def test_a_rollout_is_given_its_rate_and_its_steps_by_the_caller(world: Simulation) -> None:
+def test_the_caller_sets_rate_and_steps_of_a_rollout(world: Simulation) -> None:
     answer = world.run_policy("left", "wave", duration=60.0, control_frequency=25, n_steps=4)
     assert (answer["state"], answer["step"]) == ("completed", 4)
     refused = world.start_policy("left", "wave", control_frequency=1000)
@@ -115,7 +119,7 @@ def test_a_rollout_is_given_its_rate_and_its_steps_by_the_caller(world: Simulati
     assert "control_frequency" in refused["reason"]
 
 
-def test_reads_do_not_wait_for_a_rollout_whose_policy_thinks(world: Simulation, stuck: Stuck) -> None:
+def test_reads_do_not_wait_for_a_slow_policy(world: Simulation, stuck: Stuck) -> None:
     world.start_policy("left", "think")
     assert stuck.inside.wait(20)
     for _ in range(100):
@@ -128,7 +132,7 @@ def test_reads_do_not_wait_for_a_rollout_whose_policy_thinks(world: Simulation, 
     ("change", "arguments"),
     [("remove_robot", ("right",)), ("add_robot", ("x", "so100")), ("add_object", ("cube",)), ("create_world", ())],
 )
-def test_the_world_does_not_change_while_a_rollout_runs(
+def test_changing_the_world_is_refused_while_a_rollout_runs(
     world: Simulation, change: str, arguments: tuple[Any, ...]
 ) -> None:
     world.start_policy("left", "wave")
@@ -139,12 +143,12 @@ def test_the_world_does_not_change_while_a_rollout_runs(
     assert getattr(world, change)(*arguments)["status"] == "success"
 
 
-def test_one_robot_runs_one_policy(world: Simulation) -> None:
+def test_second_policy_on_a_robot_is_refused(world: Simulation) -> None:
     world.start_policy("left", "wave")
     assert "left is driven by the policy mock ('wave')" in world.start_policy("left", "nod")["reason"]
 
 
-def test_a_halt_stops_every_rollout_and_nothing_is_written_afterwards(
+def test_halt_stops_every_rollout_and_nothing_is_written_afterwards(
     world: Simulation, events: list[RolloutEvent]
 ) -> None:
     world.start_policy("left", "wave")
@@ -159,7 +163,7 @@ def test_a_halt_stops_every_rollout_and_nothing_is_written_afterwards(
     assert busy(world) == []
 
 
-def test_a_policy_that_does_not_return_is_named_and_its_action_is_not_written(
+def test_halt_names_a_policy_that_does_not_return_and_its_action_is_not_written(
     world: Simulation, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
@@ -174,10 +178,10 @@ def test_a_policy_that_does_not_return_is_named_and_its_action_is_not_written(
     assert held == world.body("left").targets
 
 
-def test_a_stop_of_one_robot_voids_what_its_stuck_policy_says_later(
+def test_later_action_of_a_stuck_policy_is_not_written_after_stop_policy(
     world: Simulation, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(motion, "STOP_JOIN_S", 0.1)
+    monkeypatch.setattr(world_module, "STOP_JOIN_S", 0.1)
     world.start_policy("left", "think")
     assert stuck.inside.wait(20)
     answer = world.stop_policy("left")
@@ -190,7 +194,7 @@ def test_a_stop_of_one_robot_voids_what_its_stuck_policy_says_later(
     assert world.get_observation("left")["shoulder_pan"] == pytest.approx(where, abs=0.2)
 
 
-def test_a_policy_that_raises_when_interrupted_is_stopped_all_the_same(
+def test_policy_that_raises_when_interrupted_is_stopped(
     world: Simulation, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt() -> None:
@@ -204,10 +208,10 @@ def test_a_policy_that_raises_when_interrupted_is_stopped_all_the_same(
     assert (verdict.stopped, verdict.halted) == (True, ("left",))
 
 
-def test_a_policy_that_fails_ends_in_error_and_on_hold(
+def test_failing_policy_ends_in_error(
     world: Simulation, events: list[RolloutEvent], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(motion, "create_policy", lambda provider, **options: Failing())
+    monkeypatch.setattr(world_module, "create_policy", lambda provider, **options: Failing())
     answer = world.run_policy("left", "wave", duration=5)
     assert answer["status"] == "error"
     assert "ZeroDivisionError: no idea" in answer["reason"]
@@ -215,7 +219,7 @@ def test_a_policy_that_fails_ends_in_error_and_on_hold(
     assert busy(world) == []
 
 
-def test_reset_ends_the_rollouts_first(world: Simulation) -> None:
+def test_reset_stops_rollouts_first(world: Simulation) -> None:
     start = world.get_observation("left")
     world.start_policy("left", "wave")
     eventually(lambda: world.list_policies_running()[0]["step"] > 5)
@@ -237,16 +241,14 @@ def test_reset_ends_the_rollouts_first(world: Simulation) -> None:
         ({"policy_port": -1}, "policy_port"),
     ],
 )
-def test_a_rollout_out_of_domain_is_refused_by_name_and_does_not_start(
-    world: Simulation, change: dict[str, Any], named: str
-) -> None:
+def test_bad_rollout_argument_is_refused_by_name(world: Simulation, change: dict[str, Any], named: str) -> None:
     answer = world.start_policy(**{"robot_name": "left", "instruction": "wave", **change})
     assert answer["status"] == "error"
     assert named in answer["reason"]
     assert busy(world) == []
 
 
-def test_a_locked_world_starts_nothing(world: Simulation) -> None:
+def test_locked_world_refuses_start_policy(world: Simulation) -> None:
     class Locked:
         def refusal(self, verb: str) -> Envelope | None:
             return error(f"{verb} is refused: locked.")
@@ -256,25 +258,25 @@ def test_a_locked_world_starts_nothing(world: Simulation) -> None:
     assert busy(world) == []
 
 
-def test_a_halt_while_a_policy_is_made_ready_keeps_it_from_starting(
+def test_policy_that_was_halted_while_loading_does_not_start(
     world: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def slow(provider: str, **options: Any) -> Stuck:
         assert world.halt("meanwhile").stopped
         return Stuck()
 
-    monkeypatch.setattr(motion, "create_policy", slow)
+    monkeypatch.setattr(world_module, "create_policy", slow)
     assert "halted while its policy was made ready" in world.start_policy("left", "wave")["reason"]
     assert busy(world) == []
 
 
-def test_stopping_what_does_not_run_is_a_stop(world: Simulation) -> None:
+def test_stopping_an_idle_robot_succeeds(world: Simulation) -> None:
     assert world.stop_policy("left")["stopped"] is True
     assert world.halt("test").stopped is True
     assert "robot_name" in world.stop_policy("nobody")["reason"]
 
 
-def test_cleanup_ends_rollouts_and_leaves_no_thread(world: Simulation) -> None:
+def test_cleanup_ends_rollouts_and_threads(world: Simulation) -> None:
     world.start_policy("left", "wave")
     world.start_policy("right", "nod")
     assert [t.name for t in threading.enumerate() if t.name.startswith("rollout")]
@@ -293,7 +295,7 @@ class Script:
         return {"shoulder_pan": 0.5 * min(1.0, time.monotonic() - self.began)}
 
 
-def test_a_leader_drives_one_robot_and_a_halt_ends_it(world: Simulation) -> None:
+def test_halt_ends_a_teleoperation_and_a_rollout(world: Simulation) -> None:
     assert world.attach_teleop(Script(), "script", robot_name="right")["status"] == "success"
     assert world.teleoperate("script")["status"] == "success"
     eventually(lambda: world.get_observation("right")["shoulder_pan"] > 0.1, what="the robot follows")
@@ -308,7 +310,7 @@ def test_a_leader_drives_one_robot_and_a_halt_ends_it(world: Simulation) -> None
     assert world.body("right").targets == held
 
 
-def test_a_leader_does_not_take_a_robot_from_a_policy(world: Simulation) -> None:
+def test_leader_is_refused_while_a_policy_drives_the_robot(world: Simulation) -> None:
     world.attach_teleop(Script(), "script", robot_name="left")
     world.start_policy("left", "wave")
     assert "left is driven by the policy" in world.teleoperate("script")["reason"]
@@ -319,19 +321,19 @@ def test_a_leader_does_not_take_a_robot_from_a_policy(world: Simulation) -> None
     assert not [t.name for t in threading.enumerate() if t.name.startswith(("rollout", "simulation"))]
 
 
-def test_a_single_action_does_not_fight_a_policy(world: Simulation) -> None:
+def test_send_action_is_refused_while_a_policy_drives_the_robot(world: Simulation) -> None:
     world.start_policy("left", "wave")
     assert "left is driven by the policy" in world.send_action({"gripper": 1.0}, "left")["reason"]
     assert world.send_action({"gripper": 1.0}, "right")["status"] == "success"
 
 
-def test_a_cleaned_up_world_follows_no_leader(world: Simulation) -> None:
+def test_cleaned_up_world_refuses_teleoperate(world: Simulation) -> None:
     world.attach_teleop(Script(), "script")
     world.cleanup()
     assert "cleaned up" in world.teleoperate("script")["reason"]
 
 
-def test_everything_at_once_raises_nothing_and_ends(world: Simulation) -> None:
+def test_concurrent_verbs_raise_nothing_and_end(world: Simulation) -> None:
     world.attach_teleop(Script(), "script", robot_name="right")
     jobs: list[Callable[[], object]] = [
         lambda: world.start_policy("left", "wave", duration=0.05),
@@ -364,3 +366,131 @@ def test_everything_at_once_raises_nothing_and_ends(world: Simulation) -> None:
     assert len(calm) == len(jobs)
     assert world.cleanup()["status"] == "success"
     assert not [t.name for t in threading.enumerate() if t.name.startswith(("rollout", "simulation"))]
+
+
+def swinging() -> ScriptedLeader:
+    return ScriptedLeader({"shoulder_pan": (0.0, 0.5, 1.0)})
+
+
+def test_stop_policy_stops_only_the_leader_of_that_robot(world: Simulation) -> None:
+    for name in ("left", "right"):
+        world.attach_teleop(swinging(), f"leader-{name}", robot_name=name)
+        assert world.teleoperate(f"leader-{name}")["status"] == "success"
+    answer = world.stop_policy("left")
+    assert answer["stopped"] is True
+    assert list(world.teleoperating()) == ["leader-right"]
+    held = world.body("left").targets
+    eventually(lambda: world.teleoperating()["leader-right"].step_count > 20)
+    assert world.body("left").targets == held
+
+
+def test_stop_policy_voids_only_the_loading_policy_of_that_robot(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready, loading = threading.Event(), threading.Semaphore(0)
+
+    def slow(provider: str, **options: Any) -> ScriptedPolicy:
+        loading.release()
+        assert ready.wait(60)
+        return ScriptedPolicy([], always={"shoulder_pan": 0.5})
+
+    monkeypatch.setattr(world_module, "create_policy", slow)
+    answers: dict[str, Any] = {}
+    threads = [
+        threading.Thread(target=lambda name=name: answers.update({name: world.start_policy(name, "wave")}))
+        for name in ("left", "right")
+    ]
+    for thread in threads:
+        thread.start()
+    assert all(loading.acquire(timeout=20) for _ in threads)
+    assert world.stop_policy("left")["stopped"] is True
+    ready.set()
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive()
+    assert answers["left"]["status"] == "error"
+    assert answers["right"]["status"] == "success"
+    assert [row["robot"] for row in world.list_policies_running()] == ["right"]
+
+
+def test_reset_that_waited_for_the_lock_is_refused_after_a_halt(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.step(1)  # by hand from here on
+    world.send_action({"shoulder_pan": 0.5}, "left")
+    world.step(500)
+    before = world.get_observation("left")
+    answers: list[Any] = []
+    asked: list[str] = []
+    permit = world.gate.permit
+
+    def noted(verb: str) -> Permit:
+        given = permit(verb)
+        asked.append(verb)
+        return given
+
+    monkeypatch.setattr(world.gate, "permit", noted)
+    with world.starting:
+        thread = threading.Thread(target=lambda: answers.append(world.reset()))
+        thread.start()
+        eventually(lambda: "reset" in asked)
+        thread.join(0.1)
+        assert thread.is_alive(), "it waits for the lock of a world that is being built"
+        assert world.halt("test").stopped is True
+    thread.join(20)
+    assert answers[0]["status"] == "error"
+    assert world.get_observation("left")["shoulder_pan"] == pytest.approx(before["shoulder_pan"], abs=0.05)
+
+
+def test_halt_during_a_reset_leaves_the_world_unchanged(world: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    world.send_action({"shoulder_pan": 0.5}, "left")
+    world.step(500)
+
+    def halted_again(sources: Any) -> StopVerdict:
+        monkeypatch.undo()
+        assert world.halt("another caller").stopped is True
+        return halt_each(sources)
+
+    monkeypatch.setattr(world_module, "halt_each", halted_again)
+    assert world.reset()["status"] == "error"
+    assert world.get_observation("left")["shoulder_pan"] > 0.3
+
+
+def test_locked_world_refuses_create_world(world: Simulation) -> None:
+    class Locked:
+        def refusal(self, verb: str) -> dict[str, Any]:
+            return error(f"{verb} is locked.")
+
+    world.gate.attach(Locked())
+    assert world.create_world()["reason"] == "create_world is locked."
+    assert world.list_robots() == ["left", "right"]
+
+
+def test_stop_policy_freezes_only_the_robot_that_runs_to_a_single_target(world: Simulation) -> None:
+    world.step(1)  # by hand from here on, so that no robot arrives before the stop
+    for name in ("left", "right"):
+        world.send_action({"shoulder_pan": 1.0}, name)
+    world.step(50)
+    answer = world.stop_policy("left")
+    assert (answer["stopped"], answer["was_running"]) == (True, False)
+    where = world.get_observation("left")["shoulder_pan"]
+    assert world.body("left").targets["shoulder_pan"] == pytest.approx(where, abs=0.05)
+    assert world.body("right").targets["shoulder_pan"] == 1.0
+    world.step(1000)
+    assert world.get_observation("right")["shoulder_pan"] > 0.8
+    assert world.get_observation("left")["shoulder_pan"] < 0.8
+
+
+def test_action_overtaken_by_a_stop_of_its_robot_sets_nothing(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped_meanwhile(robot: str) -> str:
+        monkeypatch.undo()
+        assert world.stop_policy("left")["stopped"] is True
+        return ""
+
+    for robot, status in (("left", "error"), ("right", "success")):
+        monkeypatch.setattr(world, "occupied", stopped_meanwhile)
+        answer = world.send_action({"shoulder_pan": 1.0}, robot)
+        assert answer["status"] == status
+        assert (world.body(robot).targets["shoulder_pan"] == 1.0) is (status == "success")

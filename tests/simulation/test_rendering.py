@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 from strands_robots.simulation import Simulation, gl
-from strands_robots.simulation.rendering import RenderingError
-from strands_robots.simulation.scene import Recording, draw_path, save_animation
+from strands_robots.simulation.rendering import RenderingError, draw_path
+from strands_robots.simulation.scene import Recording, save_animation
 from strands_robots.utils import ValidationError
 
 OPENGL = any(gl.loads(backend) for backend in ("egl", "osmesa"))
@@ -37,21 +37,21 @@ def orange(picture: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("camera", ["overview", "front", "side"])
-def test_the_projection_shows_the_arm_on_a_floor_under_a_sky(world: Simulation, camera: str) -> None:
+def test_projection_shows_the_arm(world: Simulation, camera: str) -> None:
     picture = world.project(camera, 160, 120)
     assert picture.shape == (120, 160, 3)
     assert picture.dtype == np.uint8
     assert orange(picture) > 0.01
 
 
-def test_the_projection_follows_the_arm(world: Simulation) -> None:
+def test_projection_follows_the_arm(world: Simulation) -> None:
     before = world.project("top", 160, 120)
     world.send_action({"shoulder_pan": 1.2})
     world.step(500)
     assert np.abs(before.astype(int) - world.project("top", 160, 120)).mean() > 1.0
 
 
-def test_a_path_is_drawn_from_blue_to_red_within_the_picture() -> None:
+def test_path_is_drawn_from_blue_to_red() -> None:
     blank = np.full((60, 80, 3), 255, dtype=np.uint8)
     drawn = draw_path(blank, np.array([[5.0, 30.0], [40.0, 30.0], [75.0, 30.0]]))
     assert drawn[30, 12, 2] > drawn[30, 12, 0]
@@ -59,14 +59,14 @@ def test_a_path_is_drawn_from_blue_to_red_within_the_picture() -> None:
     assert (blank == 255).all()
 
 
-def test_the_tip_is_seen_where_its_path_is_drawn(world: Simulation) -> None:
+def test_gripper_tip_is_within_the_overview(world: Simulation) -> None:
     x, y, depth = world.view("overview").pixels([world.tip_position("arm")], 320, 240)[0]
     assert 0 < x < 320
     assert 0 < y < 240
     assert depth > 0
 
 
-def test_a_recording_becomes_a_picture_and_an_animation(world: Simulation, tmp_path: Path) -> None:
+def test_recording_is_saved_as_picture_and_animation(world: Simulation, tmp_path: Path) -> None:
     recording = Recording(world, width=96, height=72)
     for target in (0.2, 0.5, 0.8):
         world.send_action({"shoulder_pan": target})
@@ -79,7 +79,7 @@ def test_a_recording_becomes_a_picture_and_an_animation(world: Simulation, tmp_p
 
 
 @pytest.mark.parametrize("fps", [0, 51, float("nan")])
-def test_an_animation_needs_frames_and_a_rate_that_gif_has(tmp_path: Path, fps: float) -> None:
+def test_animation_without_frames_or_with_a_bad_rate_is_refused(tmp_path: Path, fps: float) -> None:
     with pytest.raises(ValidationError, match="frames"):
         save_animation([], tmp_path / "a.gif")
     with pytest.raises(ValidationError, match="fps"):
@@ -87,19 +87,19 @@ def test_an_animation_needs_frames_and_a_rate_that_gif_has(tmp_path: Path, fps: 
 
 
 @pytest.mark.parametrize(("width", "height"), [(15, 64), (64, 5000), (True, 64), (64.0, 64)])
-def test_a_picture_of_an_unusable_size_is_refused(world: Simulation, width: int, height: int) -> None:
+def test_bad_picture_size_is_refused(world: Simulation, width: int, height: int) -> None:
     with pytest.raises(ValidationError, match=r"width|height"):
         world.project("overview", width, height)
     with pytest.raises(ValidationError, match=r"width|height"):
         world.render("overview", width, height)
 
 
-def test_an_unknown_camera_lists_those_there_are(world: Simulation) -> None:
+def test_unknown_camera_is_refused_with_the_known_ones(world: Simulation) -> None:
     with pytest.raises(ValidationError, match="overview, front, side, top, arm/wrist"):
         world.project("nose")
 
 
-def test_a_robots_camera_is_found_by_its_own_name_while_only_one_has_it(world: Simulation) -> None:
+def test_short_camera_name_works_while_it_is_unique(world: Simulation) -> None:
     assert world.view("wrist").camera == "arm/wrist"
     world.add_robot("other", "so100")
     with pytest.raises(ValidationError, match="other/wrist"):
@@ -117,14 +117,14 @@ def test_opengl_shows_the_arm_without_a_display(world: Simulation, camera: str) 
 
 @pytest.mark.system
 @needs_opengl
-def test_opengl_and_the_projection_agree_where_the_arm_is(world: Simulation) -> None:
+def test_opengl_and_projection_show_the_arm_at_the_same_place(world: Simulation) -> None:
     drawn, projected = world.render("side", 160, 120), world.project("side", 160, 120)
     assert orange(drawn) == pytest.approx(orange(projected), rel=0.35)
 
 
 @pytest.mark.system
 @needs_opengl
-def test_every_thread_may_ask_for_pictures_and_cleanup_ends_the_rendering_thread(world: Simulation) -> None:
+def test_pictures_can_be_drawn_from_any_thread_and_cleanup_ends_the_rendering_thread(world: Simulation) -> None:
     pictures: list[np.ndarray] = []
     threads = [threading.Thread(target=lambda: pictures.append(world.render("front", 64, 48))) for _ in range(4)]
     for thread in threads:
@@ -138,15 +138,13 @@ def test_every_thread_may_ask_for_pictures_and_cleanup_ends_the_rendering_thread
 
 @pytest.mark.system
 @needs_opengl
-def test_a_picture_is_taken_while_robots_come_and_go(world: Simulation) -> None:
+def test_picture_shows_a_robot_that_was_added_later(world: Simulation) -> None:
     first = world.render("overview", 64, 48)
     world.add_robot("car", "rover", position=(0.3, 0.2, 0))
     assert not np.array_equal(first, world.render("overview", 64, 48))
 
 
-def test_without_opengl_the_error_names_the_packages_and_a_picture_is_still_made(
-    world: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_opengl_is_reported_and_picture_still_works(world: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
     def none(*_: object, **__: object) -> None:
         raise ImportError("libEGL.so.1 is not there")
 
@@ -161,7 +159,7 @@ def test_without_opengl_the_error_names_the_packages_and_a_picture_is_still_made
 @pytest.mark.parametrize(
     ("libraries", "chosen"), [(("egl", "osmesa"), "egl"), (("osmesa",), "osmesa"), ((), "disable")]
 )
-def test_without_a_display_the_library_that_is_there_is_chosen(
+def test_available_backend_is_chosen_without_a_display(
     monkeypatch: pytest.MonkeyPatch, libraries: tuple[str, ...], chosen: str
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "")
@@ -176,9 +174,7 @@ def test_without_a_display_the_library_that_is_there_is_chosen(
 
 
 @pytest.mark.parametrize("asked", ["egl", "osmesa", "glfw"])
-def test_a_backend_that_was_asked_for_and_cannot_load_leaves_physics_alone(
-    monkeypatch: pytest.MonkeyPatch, asked: str
-) -> None:
+def test_configured_backend_that_cannot_load_is_disabled(monkeypatch: pytest.MonkeyPatch, asked: str) -> None:
     monkeypatch.setenv("MUJOCO_GL", asked)
     monkeypatch.setattr(gl, "loads", lambda backend: False)
     gl.prepare.cache_clear()
@@ -188,7 +184,7 @@ def test_a_backend_that_was_asked_for_and_cannot_load_leaves_physics_alone(
         gl.prepare.cache_clear()
 
 
-def test_a_world_without_opengl_is_stepped_and_projected() -> None:
+def test_world_without_opengl_steps_and_projects() -> None:
     code = (
         "from strands_robots.simulation import Simulation\n"
         "s = Simulation(); s.add_robot('so100'); s.step(10); print(s.picture('overview', 64, 48)[1])"

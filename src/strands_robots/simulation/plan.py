@@ -1,0 +1,152 @@
+"""The contents of a world as data: robots and primitive objects, made from checked arguments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from strands_robots.simulation.catalog import ModelSource, find
+from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown
+
+Triple = tuple[float, float, float]
+
+REACH_M = 100.0
+"""Largest coordinate of anything that is placed, in metres."""
+
+SPACING_M = 0.45
+"""Distance between robots that are added without a position, in metres."""
+
+SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}
+"""How many sizes each shape of an object has."""
+
+_RESERVED = ("floor", "world")
+
+
+@dataclass(frozen=True, slots=True)
+class RobotPlan:
+    """One robot: ``position`` in metres, ``yaw`` in radians."""
+
+    name: str
+    source: ModelSource
+    position: Triple = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
+
+    @classmethod
+    def checked(cls, name: object, model: str | Path | None, position: object, yaw: object) -> RobotPlan:
+        """Check a robot, and find its model, which may be fetched; see :meth:`Simulation.add_robot` for the domains.
+
+        Raises:
+            ValidationError: an argument outside its domain, or no such model.
+        """
+        label = identifier("name", name)
+        heading = number("yaw", yaw, low=-6.2831853072, high=6.2831853072)
+        source = find(name if model is None else model)
+        return cls(label, source, (0.0, 0.0, 0.0) if position is None else _triple("position", position), heading)
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectPlan:
+    """One object of primitive shape: sizes in metres, mass in kilograms, colour from 0 to 1."""
+
+    name: str
+    shape: str
+    size: Triple
+    position: Triple
+    color: tuple[float, float, float, float]
+    mass: float
+    fixed: bool
+
+    @classmethod
+    def checked(
+        cls, *, name: object, shape: object, size: object, position: object, color: object, mass: object, fixed: object
+    ) -> ObjectPlan:
+        """Check an object; see :meth:`Simulation.add_object` for the domains.
+
+        Raises:
+            ValidationError: an argument outside its domain.
+        """
+        kind = choice("shape", shape, tuple(SHAPES))
+        return cls(
+            identifier("name", name),
+            kind,
+            _sizes(kind, size),
+            _triple("position", position),
+            _colour(color),
+            number("mass", mass, low=1e-4, high=1000),
+            flag("fixed", fixed),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything in the world; ``timestep`` in seconds, ``gravity`` in m/s² along z."""
+
+    timestep: float = 0.002
+    gravity: float = -9.81
+    robots: tuple[RobotPlan, ...] = ()
+    objects: tuple[ObjectPlan, ...] = ()
+
+    @classmethod
+    def checked(cls, timestep: object, gravity: object) -> Plan:
+        """Return an empty plan. Raises :class:`ValidationError` for a number outside its domain."""
+        return cls(number("timestep", timestep, low=1e-4, high=2e-2), number("gravity", gravity, low=-100, high=100))
+
+    def with_robot(self, robot: RobotPlan, *, beside: bool = False) -> Plan:
+        """Add a robot, ``beside`` those that are there or where its plan says.
+
+        Raises:
+            ValidationError: its name is taken.
+        """
+        self._require_free(robot.name)
+        placed = replace(robot, position=(0.0, -SPACING_M * len(self.robots), 0.0)) if beside else robot
+        return replace(self, robots=(*self.robots, placed))
+
+    def without_robot(self, name: str) -> Plan:
+        """Remove a robot."""
+        return replace(self, robots=tuple(r for r in self.robots if r.name != name))
+
+    def with_object(self, item: ObjectPlan) -> Plan:
+        """Add an object. Raises :class:`ValidationError` where its name is taken."""
+        self._require_free(item.name)
+        return replace(self, objects=(*self.objects, item))
+
+    def without_object(self, name: object) -> Plan:
+        """Remove an object. Raises :class:`ValidationError` where there is none of that name."""
+        names = [o.name for o in self.objects]
+        if name not in names:
+            raise ValidationError(f"name must be one of {names}, not {shown(name)}.")
+        return replace(self, objects=tuple(o for o in self.objects if o.name != name))
+
+    def _require_free(self, name: str) -> None:
+        if name in _RESERVED or name in {r.name for r in self.robots} | {o.name for o in self.objects}:
+            raise ValidationError(f"name {shown(name)} is taken; choose another.")
+
+
+def _triple(name: str, value: object) -> Triple:
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValidationError(f"{name} must be three numbers, not {shown(value)}.")
+    x, y, z = (number(f"{name}[{i}]", v, low=-REACH_M, high=REACH_M) for i, v in enumerate(value))
+    return x, y, z
+
+
+def _colour(value: object) -> tuple[float, float, float, float]:
+    """Check red, green, blue and optionally alpha, each from 0 to 1."""
+    if not isinstance(value, list | tuple) or len(value) not in (3, 4):
+        raise ValidationError(f"color must be three or four numbers from 0 to 1, not {shown(value)}.")
+    r, g, b, a = (number(f"color[{i}]", v, low=0, high=1) for i, v in enumerate([*value, 1.0][:4]))
+    return r, g, b, a
+
+
+def _sizes(shape: str, value: object) -> Triple:
+    """Check the sizes of a shape, and fill MuJoCo's three up with zeros. One number is enough for a cube."""
+    count = SHAPES[shape]
+    values = list(value) if isinstance(value, list | tuple) else [value]
+    if count == 3 and len(values) == 1:
+        values = values * 3
+    if len(values) != count:
+        raise ValidationError(
+            f"size of a {shape} must be {count} number{'s' if count > 1 else ''} in metres, not {shown(value)}."
+        )
+    checked = [number(f"size[{i}]", v, low=0.001, high=10) for i, v in enumerate(values)]
+    x, y, z = [*checked, 0.0, 0.0][:3]
+    return x, y, z
