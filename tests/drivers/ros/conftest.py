@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 from fixtures.ros_bases import OPEN, TOPIC, Made
 
-from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
-from strands_robots.drivers.ros.posed_base import PosedBaseRobot
+from strands_robots.drivers.ros.mobile_base import MobileBaseRobot, PosedBaseRobot
 from strands_robots.ros.memory import MemoryLink
 
 

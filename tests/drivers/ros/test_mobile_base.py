@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,11 +16,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from strands_robots.contract import TaskRobot
-from strands_robots.drivers.ros.burst import Burst
-from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
-from strands_robots.drivers.ros.posed_base import PosedBaseRobot
+from strands_robots.drivers.ros import motion
+from strands_robots.drivers.ros.mobile_base import MobileBaseRobot, PosedBaseRobot, tool_suffix
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
-from strands_robots.drivers.ros.tools import suffix_of
 from strands_robots.envelope import error
 from strands_robots.ros.link import EarlierRefusedError
 from strands_robots.ros.memory import MemoryLink
@@ -262,24 +261,21 @@ def test_a_drive_that_a_ctrl_c_cuts_off_is_told_as_an_error_and_a_single_shot_of
     assert robot.halt("test").halted == left
 
 
-def test_a_drive_that_gets_no_thread_is_told_to_be_over_once_the_base_is_free(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot, free = made(), list[bool]()
-    begin = robot._begin
+def test_drive_without_a_thread_ends_only_once_the_base_is_free(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, busy = made(), list[bool]()
 
-    def noting(*asked: Any) -> Any:
-        burst = begin(*asked)
-        assert isinstance(burst, Burst)
-        told = burst.ended.set
-        monkeypatch.setattr(burst.ended, "set", lambda: (free.append(not robot._slot.locked()), told()))
-        return burst
+    class EndAndDriveAgain(threading.Event):
+        def set(self) -> None:
+            if not busy:
+                busy.append(True)
+                busy[0] = "being driven" in robot.drive(0.1).get("reason", "")
+            super().set()
 
-    monkeypatch.setattr(robot, "_begin", noting)
+    monkeypatch.setattr(motion, "threading", SimpleNamespace(Event=EndAndDriveAgain))
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", none_left)
         assert "could not begin" in robot.start_drive(0.1, 0.0, 0.01)["reason"]
-    assert free == [True]
+    assert busy == [False]
 
 
 def test_a_drive_that_gets_no_thread_leaves_the_base_free(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -328,7 +324,7 @@ def test_only_a_base_with_odometry_has_a_pose_to_ask_for() -> None:
 
 def test_tool_names_are_what_model_apis_take_and_tell_robots_apart() -> None:
     names = ["rover", "rover-2", "a.b", "a_b", "a-b", "x" * 55, "x" * 56, "x" * 128, "x" * 127 + ".", "a." * 60]
-    suffixes = [suffix_of(name) for name in names]
+    suffixes = [tool_suffix(name) for name in names]
     assert suffixes[:2] == ["rover", "rover-2"]
     assert len(set(suffixes)) == len(names)
     for name in names:

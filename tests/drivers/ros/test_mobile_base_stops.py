@@ -20,8 +20,8 @@ from strands_robots.safety.stopping import Outcome, grade
 def holding_by_count(monkeypatch: pytest.MonkeyPatch, held: int, count: Callable[[], int]) -> SimpleNamespace:
     """A hold's clock that goes by ``count`` instead of seconds: blind, it lasts for ``held`` of them."""
     clock = SimpleNamespace(monotonic=lambda: float(count()))
-    monkeypatch.setattr("strands_robots.drivers.ros.wire.time", clock)
-    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", float(held))
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity_publisher.time", clock)
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity_publisher.BLIND_HOLD_S", float(held))
     return clock
 
 
@@ -107,7 +107,7 @@ def test_a_link_that_drops_out_within_the_hold_gets_zeros_for_its_whole_time_aga
 
 
 def test_a_hold_on_a_link_that_never_returns_ends_with_the_base(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("strands_robots.drivers.ros.wire.BLIND_HOLD_S", 0.05)
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity_publisher.BLIND_HOLD_S", 0.05)
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
     robot = made(FaultyLink(tuple(range(1, 10_000))), publish_rate=50.0)
     robot.halt()

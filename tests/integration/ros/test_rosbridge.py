@@ -12,7 +12,7 @@ import pytest
 from fixtures.rosbridge_server import RosbridgeServer
 from fixtures.waiting import eventually, free_port
 
-from strands_robots.drivers.ros import wire
+from strands_robots.drivers.ros import velocity_publisher
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, run_goal
@@ -262,7 +262,7 @@ def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still
 def test_a_server_that_returns_under_the_lockout_brings_zeros_for_their_whole_time_and_nothing_else(
     server: RosbridgeServer, rover: RosbridgeRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(wire, "BLIND_HOLD_S", 1.0)
+    monkeypatch.setattr(velocity_publisher, "BLIND_HOLD_S", 1.0)
     plane = SafetyPlane(deadline_s=1.0)
     entry = plane.register("rover-1", rover)
     try:
@@ -272,14 +272,16 @@ def test_a_server_that_returns_under_the_lockout_brings_zeros_for_their_whole_ti
         report = plane.emergency_stop(StopOrder("e" * 32, "console", "test"))["rover-1"]
         assert report.verdict.stopped is False
         down = time.monotonic()
-        eventually(lambda: time.monotonic() > down + 3 * wire.BLIND_HOLD_S, what="longer than a blind hold")
+        eventually(
+            lambda: time.monotonic() > down + 3 * velocity_publisher.BLIND_HOLD_S, what="longer than a blind hold"
+        )
         assert rover.holding
         server.published.clear()
         taken: list[float] = []
         server.on_publish = lambda topic, message: taken.append(time.monotonic())
         server.start()
         eventually(lambda: not rover.holding, what="the end of the hold on the new connection")
-        assert taken[-1] - taken[0] > 0.5 * wire.BLIND_HOLD_S
+        assert taken[-1] - taken[0] > 0.5 * velocity_publisher.BLIND_HOLD_S
         assert {message["linear"]["x"] for _, message in server.published} == {0.0}
         assert "e" * 32 in rover.drive(0.5)["reason"]
         assert "rover-1" in plane.clear_local("test")

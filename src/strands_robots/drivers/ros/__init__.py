@@ -1,1 +1,1 @@
-"""Robots that already live on a ROS graph: one drive contract, and a class for each road to them."""
+"""Robots that already live on a ROS graph: one drive contract, and a class for each way to reach them."""

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from strands_robots.drivers.ros.mobile_base import UNREACHABLE, MobileBaseRobot
+from strands_robots.drivers.ros.mobile_base import LINK_ERRORS, MobileBaseRobot
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
@@ -165,7 +165,7 @@ class AckermannRosRobot(MobileBaseRobot):
                     return error(f"The handshake was stopped before {service}.")
                 try:
                     answer = self.link.call(service, kind, fields, SERVICE_S)
-                except UNREACHABLE as exc:
+                except LINK_ERRORS as exc:
                     return error(f"The handshake failed at {service}: {exc}", service=service)
                 if not answer.get("success", True) or answer.get("error"):
                     return error(f"The handshake failed at {service}, which answered {shown(answer)}.", service=service)

@@ -1,25 +1,26 @@
-"""The contract of a mobile base on a ROS graph, whatever road leads to it."""
+"""Contract of a mobile base on a ROS graph, whatever link leads to it."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
-from strands_robots.drivers.ros.burst import COUNT_MAX, Burst, Order, messages_for
-from strands_robots.drivers.ros.observers import Observers, Unbegun, state_of
-from strands_robots.drivers.ros.odometry import Odometry
-from strands_robots.drivers.ros.wire import Hold, Holds, VelocityWire
+from strands_robots.drivers.ros.motion import COUNT_MAX, BaseMotion, Drive, DriveOrder, messages_for
+from strands_robots.drivers.ros.odometry import OdometryMonitor
+from strands_robots.drivers.ros.velocity_publisher import CurrentHold, VelocityPublisher, ZeroVelocityHold
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, RosLink
 from strands_robots.ros.names import bare_kind, graph_name, interface
-from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole
 
@@ -29,27 +30,44 @@ TWIST = "geometry_msgs/msg/Twist"
 ANSWER_SHARE = 0.9
 """Part of the halt deadline that a halt waits for stillness; the rest is for its verdict to arrive in time."""
 
-UNREACHABLE = (RosError, MissingExtraError)
+LINK_ERRORS = (RosError, MissingExtraError)
 NO_POLICIES = "{} is a mobile base and runs no policies; use drive."
+
+TOOL_SUFFIX_MAX = 55
+"""Longest robot name in a tool's name, which model APIs limit to 64 characters: the longest verb takes nine."""
+
+_HASHED = 8
+
+AgentVerb = tuple[Callable[..., Envelope], str]
+_Motion = TypeVar("_Motion", bound=BaseMotion)
+
+
+def tool_suffix(node_name: str) -> str:
+    """Return the robot's part of a tool's name: its own name where model APIs take it, else a unique other one."""
+    plain = node_name.replace(".", "_")
+    if plain == node_name and len(plain) <= TOOL_SUFFIX_MAX:
+        return plain
+    digest = hashlib.sha256(node_name.encode()).hexdigest()[:_HASHED]
+    return f"{plain[: TOOL_SUFFIX_MAX - _HASHED - 1]}_{digest}"
 
 
 class MobileBaseRobot:
     """A base that is driven by velocities. Thread-safe; one drive at a time.
 
-    A drive is checked in this order, before anything is done: velocities; ``duration``, else ``count``; the limits;
-    the lockout; the operator's leave for the velocity topic; the handshake that arms the vehicle. Then it is clamped
-    and sent. Every timed or repeated drive that is not zero ends with one zero, and :meth:`stop`, that zero and
-    the zeros of a halt need nobody's leave.
+    A drive is checked in this order, before any side effect: velocities; ``duration``, else ``count``; the limits;
+    the lockout; the operator's approval of the velocity topic; the handshake that arms the vehicle. Then it is
+    clamped and sent. Every timed or repeated drive that is not zero ends with one zero. :meth:`stop`, that zero and
+    the zeros of a halt need no approval.
 
     Args:
-        node_name: what the robot and its tools are called, an identifier.
-        link: the road to the graph.
-        command_topic: the velocity topic; ``command_type`` is what it carries.
-        odom_topic: where the base tells how it moves; with it, a stop waits to see the base still.
-        publish_rate: Hz of a drive that is held, above 0.
+        node_name: name of the robot and of its tools, an identifier.
+        link: the link to the graph.
+        command_topic: the velocity topic, of ``command_type``.
+        odom_topic: odometry or pose; with it, a stop waits to see the base still.
+        publish_rate: Hz of a timed or repeated drive, above 0.
         max_linear: clamp in m/s, above 0; None: this platform declares no limit. ``max_angular`` in rad/s likewise.
         max_duration: longest drive in seconds, above 0; a longer one is refused.
-        command_gate: asks the operator's leave; that of the settings by default.
+        command_gate: asks the operator; that of the settings by default.
 
     Raises:
         ValidationError: an argument outside its domain.
@@ -77,26 +95,27 @@ class MobileBaseRobot:
         self._topic = graph_name("command_topic", command_topic)
         self._kind = interface("command_type", command_type)
         self._scan = (_optional(graph_name, "scan_topic", scan_topic), _optional(interface, "scan_type", scan_type))
-        odom = (_optional(graph_name, "odom_topic", odom_topic), _optional(interface, "odom_type", odom_type))
-        self._odom_kind = odom[1]
+        self._odom = (_optional(graph_name, "odom_topic", odom_topic), _optional(interface, "odom_type", odom_type))
         self.publish_rate = number("publish_rate", publish_rate, above=0)
         self.max_linear = None if max_linear is None else number("max_linear", max_linear, above=0)
         self.max_angular = None if max_angular is None else number("max_angular", max_angular, above=0)
         self.max_duration = None if max_duration is None else number("max_duration", max_duration, above=0)
         self.gate = MotionGate()
         self.command_gate = command_gate or CommandGate()
-        self._odometry = Odometry(link, *odom)
-        self._wire = VelocityWire(link, self._topic, self._kind, self.command_message(0.0, 0.0))
-        self._holds = Holds(lambda: Hold(self._wire, self.publish_rate, self._still_now, self.node_name))
-        self._observers = Observers(self.tool_name_str)
+        self._odometry = OdometryMonitor(link, *self._odom)
+        self._publisher = VelocityPublisher(link, self._topic, self._kind, self.command_message(0.0, 0.0))
+        self._hold = CurrentHold(
+            lambda: ZeroVelocityHold(self._publisher, self.publish_rate, self._still_now, self.node_name)
+        )
+        self._observers = RolloutObservers()
         self._slot = threading.Lock()
-        self._burst: Burst | None = None
+        self._motion: BaseMotion | None = None
         self._latched = False
 
-    # What a subclass says about its platform.
+    # Overridden by a platform.
 
     def command_message(self, linear: float, angular: float) -> dict[str, Any]:
-        """The fields of the message that commands these velocities, in m/s and rad/s, or of the zero."""
+        """Return the fields of the message that commands these velocities, in m/s and rad/s, or of the zero."""
         twist = {
             "linear": {"x": linear, "y": 0.0, "z": 0.0},
             "angular": {"x": 0.0, "y": 0.0, "z": angular},
@@ -107,8 +126,32 @@ class MobileBaseRobot:
         """Raise :class:`ValidationError` where the platform cannot execute this motion."""
 
     def handshake(self, tool_context: Any = None) -> Envelope | None:
-        """Put the vehicle into a state in which it takes commands; the error that stands in the way, or None."""
+        """Make the vehicle ready for commands; return the error where that failed, else None."""
         return None
+
+    def motion_note(self) -> str:
+        """Return one sentence on how this platform moves, for agents."""
+        return "It turns in place."
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Names of the reads that this robot's topics allow, such as ``get_scan``."""
+        return () if self._scan[0] is None else ("get_scan",)
+
+    def agent_verbs(self) -> dict[str, AgentVerb]:
+        """Return the method and the description of each agent tool, by verb."""
+        name = self.node_name
+        verbs: dict[str, AgentVerb] = {
+            "drive": (
+                self.start_drive,
+                f"Drive {name} for some seconds; returns once it has begun. {self.motion_note()}",
+            ),
+            "stop": (self.stop, f"Stop {name} now; says whether it stands."),
+            "status": (self.get_task_status, f"Whether {name} is driving, and how its last drive ended."),
+        }
+        if "get_scan" in self.reads:
+            verbs["get_scan"] = (self.get_scan, f"Read one laser scan of {name}.")
+        return verbs
 
     # Commands.
 
@@ -120,31 +163,33 @@ class MobileBaseRobot:
         count: int = 1,
         tool_context: Any = None,
     ) -> Envelope:
-        """Send velocities (m/s forwards, rad/s to the left) and return when they are sent.
+        """Send velocities (m/s forwards, rad/s to the left) and return once they are sent.
 
-        With ``duration`` in seconds they are held for that long and a zero follows; else ``count`` messages are
-        sent. A bare single message goes on until :meth:`stop`, as a raw command does. Every refusal and failure is
-        an error envelope, and nothing is sent for a refused one.
+        With ``duration`` in seconds they are repeated for that long and a zero follows; else ``count`` messages are
+        sent. A single message latches until :meth:`stop`, as a raw command does. Every refusal and failure is an
+        error envelope, and nothing is sent for a refused drive.
         """
-        burst = self._begin(linear, angular, duration, count, tool_context)
-        if not isinstance(burst, Burst):
-            return burst
-        return self._run(burst)
+        drive = self._begin_drive(linear, angular, duration, count, tool_context)
+        return self._run(drive) if isinstance(drive, Drive) else drive
 
     def start_drive(self, linear: float, angular: float, duration: float, tool_context: Any = None) -> Envelope:
-        """Start a timed drive and return; its end is told to observers and by :meth:`get_task_status`."""
+        """Start a timed drive and return; observers and :meth:`get_task_status` report its end.
+
+        Args:
+            linear: Speed forwards in m/s; negative reverses.
+            angular: Turning rate in rad/s; positive turns left.
+            duration: Seconds until the robot is stopped again, above 0.
+            tool_context: Context of an agent's call, through which the operator is asked.
+        """
         try:
             seconds = number("duration", duration, above=0, high=self.max_duration)
         except ValidationError as refused:
             return error(str(refused))
-        burst = self._begin(linear, angular, seconds, 1, tool_context)
-        if not isinstance(burst, Burst):
-            return burst
-        refusal = self._run_behind(lambda: self._run(burst), burst, "drive")
-        if refusal is not None:
-            return refusal
-        order = burst.order
-        return success(
+        drive = self._begin_drive(linear, angular, seconds, 1, tool_context)
+        if not isinstance(drive, Drive):
+            return drive
+        order = drive.order
+        return self._run_in_background(drive) or success(
             f"Driving at {order.linear:g} m/s and {order.angular:g} rad/s for {seconds:g} s.",
             linear=order.linear,
             angular=order.angular,
@@ -152,30 +197,30 @@ class MobileBaseRobot:
         )
 
     def stop(self, tool_context: Any = None) -> Envelope:
-        """Stop the base: a zero at once and more until it is still. Needs nobody's leave; the answer is the verdict.
+        """Stop the base: a zero at once and more until it is still; return the verdict. Needs no approval.
 
-        It is the one that every network gives: where odometry is silent, an error with ``stopped`` None.
+        Where odometry is silent this is an error with ``stopped`` None.
         """
         del tool_context
         return self.halt("stop").envelope()
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Void every permit, send zeros until the base is still, and say within the deadline what is known.
+        """Void every permit, send zeros until the base is still, and return the verdict within the deadline.
 
-        With odometry, stopped means that two samples after the first zero say so; one that still moves did not
-        stop, and one whose odometry is silent is unknown. Without odometry, stopped means that the link took the
-        zero: nobody measures the rest. A zero that the link does not take is a base that did not stop.
+        With odometry, stopped means that two samples after the first zero are still; a base that moves on did not
+        stop, and one whose odometry is silent is unknown. Without odometry, stopped means that the link accepted the
+        zero: nothing measures the rest. A zero that the link does not accept is a base that did not stop.
         """
         began = time.monotonic()
         deadline = began + ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
         self.gate.revoke()
         self._odometry.expect_stillness()
-        burst = self._burst
-        driven = self._latched or (burst is not None and not burst.ended.is_set())
-        if burst is not None:
-            burst.interrupt()
-        hold = self._holds.begin()
-        verdict = self._verdict(hold, burst, driven, deadline)
+        drive = self._motion if isinstance(self._motion, Drive) else None
+        driven = self._latched or (drive is not None and not drive.ended.is_set())
+        if drive is not None:
+            drive.interrupt()
+        hold = self._hold.begin()
+        verdict = self._verdict(hold, drive, driven, deadline)
         self._latched = self._latched and not verdict.stopped
         logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
         return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
@@ -183,59 +228,53 @@ class MobileBaseRobot:
     # Reads.
 
     def get_scan(self, timeout: float = 5.0) -> Envelope:
-        """The next laser scan, within ``timeout`` seconds, above 0."""
+        """Return the next laser scan.
+
+        Args:
+            timeout: Seconds to wait for a sample, above 0.
+        """
         return self._read("get_scan", "scan_topic", self._scan, timeout)
 
     @property
     def tools(self) -> list[Any]:
-        """What this robot can do, as Strands agent tools named by it. Needs the [agent] extra."""
-        from strands_robots.drivers.ros.tools import tools_of  # noqa: PLC0415 - strands is loaded when it is used
+        """The robot's verbs as Strands agent tools with its name in theirs. Needs the [agent] extra.
 
-        return tools_of(self)
+        The ``drive`` tool needs a duration and returns at once, so that an agent can stop the drive that it began.
+        """
+        from strands_robots.agent_tool import tool  # noqa: PLC0415 - strands is loaded when it is used
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """The reads that this robot's topics allow, such as ``get_scan``."""
-        return () if self._scan[0] is None else ("get_scan",)
+        suffix = tool_suffix(self.node_name)
+        return [
+            tool(name=f"{verb}_{suffix}", description=description, context=True)(method)
+            for verb, (method, description) in self.agent_verbs().items()
+        ]
 
     @property
     def holding(self) -> bool:
-        """Zeros still go out after a halt."""
-        return self._holds.running
-
-    def motion_note(self) -> str:
-        """What an agent has to know about how this platform moves, one sentence."""
-        return "It turns in place."
+        """Whether zeros still go out after a halt."""
+        return self._hold.running
 
     # The robot contract, so that every network takes a base.
 
     def start_task(
         self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
     ) -> Envelope:
-        """Refused: a base is driven, it follows no policy."""
+        """Refuse: a base is driven, it follows no policy."""
         del instruction, policy_provider, duration, policy_port
         return error(NO_POLICIES.format(self.tool_name_str))
 
     def stop_task(self) -> Envelope:
-        """The same as :meth:`stop`."""
+        """Do the same as :meth:`stop`."""
         return self.stop()
 
     def get_task_status(self) -> Envelope:
-        """``task_status`` (idle, running, completed, stopped, error) and what the current or last drive sent."""
-        burst = self._burst
-        if burst is None:
+        """Return ``task_status`` (idle, running, completed, stopped, error) and the progress of the last motion."""
+        if self._motion is None:
             return success("Idle.", task_status="idle", instruction="", step_count=0, duration=0.0)
-        state = state_of(burst)
-        return success(
-            f"The last drive is {state}.",
-            task_status=state,
-            instruction=f"drive {burst.order.linear:g} m/s, {burst.order.angular:g} rad/s",
-            step_count=burst.sent,
-            duration=round(burst.elapsed_s, 3),
-        )
+        return self._motion.status()
 
     def get_features(self) -> Envelope:
-        """``observation_features`` and ``action_features`` as data, with the declared limits."""
+        """Return ``observation_features`` and ``action_features`` as data, with the declared limits."""
         limits = {"linear": self.max_linear, "angular": self.max_angular, "duration": self.max_duration}
         return success(
             "A mobile base: linear in m/s, angular in rad/s.",
@@ -245,60 +284,102 @@ class MobileBaseRobot:
         )
 
     def get_state(self) -> Envelope:
-        """``joints`` (none), the drive as ``task``, and ``still`` as far as odometry tells."""
+        """Return ``joints`` (none), the status of the drive as ``task``, and ``still``: True, False or None."""
         task = self.get_task_status()["task_status"]
         return success(f"{task}.", joints={}, task=task, still=self._odometry.still)
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Tell ``observer`` when a drive begins and ends."""
-        return self._observers.add(observer)
+        """Call ``observer`` when a motion begins and when it ends, the zero of a drive included."""
+        return self._observers.subscribe(observer)
 
     def cleanup(self) -> Envelope:
-        """Stop and let go of the graph. A base that is not known to stand stays connected, to be stopped again."""
+        """Stop and leave the graph. A base that is not known to be still stays connected, to be stopped again."""
         verdict = self.halt("cleanup")
         if verdict.stopped:
             self.disconnect()
         return verdict.envelope()
 
     def disconnect(self) -> None:
-        """End what is sent, the zeros too, and let go of the graph. :meth:`cleanup` stops the base first."""
+        """Send nothing more, not even zeros, and leave the graph. :meth:`cleanup` stops the base first."""
         self.gate.revoke()
-        self._holds.close()
+        self._hold.close()
         try:
             self._odometry.close()
-        except UNREACHABLE as gone:
-            logger.info("%s: %s", self.tool_name_str, gone)
+        except LINK_ERRORS as exc:
+            logger.info("%s: %s", self.tool_name_str, exc)
         self.link.close()
 
-    def _begin(self, linear: Any, angular: Any, duration: Any, count: Any, tool_context: Any) -> Burst | Envelope:
+    # One motion at a time, for this class and its subclasses.
+
+    def _begin(
+        self, verb: str, target: tuple[str, str], tool_context: Any, make: Callable[[Permit], _Motion]
+    ) -> _Motion | Envelope:
+        """Take the base's one slot for a motion that may begin; return it, or the refusal.
+
+        Args:
+            verb: name of the motion in refusals.
+            target: name and type of the topic or action that the operator has to approve.
+            tool_context: context of an agent's call, through which the operator is asked.
+            make: makes the motion of its permit.
+        """
+        if not self._slot.acquire(blocking=False):
+            return error("The base is being driven; stop it first, or wait for its end.")
+        motion = None
         try:
-            order = self._checked(linear, angular, duration, count)
-            if not self._slot.acquire(blocking=False):
-                return error("The base is being driven; stop it first, or wait for the drive's end.")
-        except ValidationError as refused:
-            return error(str(refused))
-        held = False
-        try:
-            permit = self.gate.permit("drive")
-            refusal = self.command_gate.refusal(self._topic, self._kind, "drive", tool_context)
-            # Asking may take minutes: a stop meanwhile ends the handshake too, which would arm the vehicle.
+            permit = self.gate.permit(verb)
+            refusal = self.command_gate.refusal(*target, verb, tool_context)
+            # The operator may take minutes to answer: a stop meanwhile also ends the handshake, which would arm.
             with permit.inside():
                 refusal = refusal or self.handshake(tool_context)
             if refusal is not None:
                 return refusal
             self._odometry.start()
-            self._holds.end_for(permit)
-            burst = self._burst = Burst(order, self._wire, permit)
-            held = True
+            self._hold.end_for(permit)
+            motion = self._motion = make(permit)
         except MotionRefused as locked:
             return locked.envelope
         finally:
-            if not held:
+            if motion is None:
                 self._slot.release()
-        return burst
+        return motion
 
-    def _checked(self, linear: Any, angular: Any, duration: Any, count: Any) -> Order:
-        asked = number("linear", linear), number("angular", angular)
+    def _run_in_background(self, motion: BaseMotion) -> Envelope | None:
+        """Run on a thread; without one, return the error and leave the base as free and as still as before."""
+        name = f"{motion.policy}-{self.node_name}"
+        try:
+            threading.Thread(target=self._run, args=(motion,), name=name, daemon=True).start()
+        except RuntimeError as exc:
+            answer = motion.fail_to_begin(str(exc))
+            self._slot.release()
+            motion.ended.set()
+            self._hold.resume()
+            return answer
+        return None
+
+    def _run(self, motion: BaseMotion) -> Envelope:
+        self._observers.notify(motion.event("started", self.tool_name_str))
+        try:
+            return motion.run()
+        finally:
+            if isinstance(motion, Drive):
+                self._latched = motion.latched
+            # The slot is released first: a caller that waits for the end may start the next motion at once.
+            self._slot.release()
+            motion.ended.set()
+            self._observers.notify(motion.event("finished", self.tool_name_str))
+
+    def _begin_drive(
+        self, linear: object, angular: object, duration: object, count: object, tool_context: Any
+    ) -> Drive | Envelope:
+        try:
+            order = self._checked(linear, angular, duration, count)
+        except ValidationError as refused:
+            return error(str(refused))
+        target = (self._topic, self._kind)
+        return self._begin("drive", target, tool_context, lambda permit: Drive(order, self._publisher, permit))
+
+    def _checked(self, linear: object, angular: object, duration: object, count: object) -> DriveOrder:
+        requested = number("linear", linear), number("angular", angular)
         if duration is not None:
             seconds = number("duration", duration, above=0, high=self.max_duration)
             messages = messages_for("duration", seconds, self.publish_rate)
@@ -310,53 +391,27 @@ class MobileBaseRobot:
                     f"count must be at most {max(1, round(most))}, what {self.max_duration:g} s hold at "
                     f"{self.publish_rate:g} Hz, not {messages}."
                 )
-        self.check_motion(*asked)
-        sent = _clamped(asked[0], self.max_linear), _clamped(asked[1], self.max_angular)
-        return Order(
+        self.check_motion(*requested)
+        sent = _clamped(requested[0], self.max_linear), _clamped(requested[1], self.max_angular)
+        return DriveOrder(
             *sent,
             fields=self.command_message(*sent),
             messages=messages,
             rate_hz=self.publish_rate,
             latches=duration is None and messages == 1,
-            zero=not any(sent),
         )
 
-    def _run_behind(self, run: Callable[[], object], motion: Unbegun, what: str) -> Envelope | None:
-        """Run on a thread; where none is to be had, why, with the base as free and as held as before."""
-        try:
-            threading.Thread(target=run, name=f"{what}-{self.node_name}", daemon=True).start()
-        except RuntimeError as exc:
-            answer = motion.never_began(str(exc))
-            self._slot.release()
-            motion.ended.set()
-            self._holds.resume()
-            return answer
-        return None
-
-    def _run(self, burst: Burst) -> Envelope:
-        self._observers.started(burst)
-        try:
-            answer = burst.run()
-        finally:
-            # A shot that failed, or that a Ctrl-C cut off, may have reached the base all the same.
-            self._latched = burst.order.latches and not burst.order.zero and burst.state != "stopped"
-            # The slot first: whoever stopped the drive and waits for its end may drive anew at once.
-            self._slot.release()
-            burst.ended.set()
-            self._observers.finished(burst)
-        return answer
-
     def _still_now(self) -> bool | None:
-        self._odometry.start_behind()
+        self._odometry.start_in_background()
         return self._odometry.still
 
-    def _verdict(self, hold: Hold, burst: Burst | None, driven: bool, deadline: float) -> StopVerdict:
+    def _verdict(self, hold: ZeroVelocityHold, drive: Drive | None, driven: bool, deadline: float) -> StopVerdict:
         source = "drive" if driven else "velocity"
         hold.sent.wait(max(0.0, deadline - time.monotonic()))
         if not hold.sent.is_set():
             why = hold.problem or "the link did not take the zero in time"
             return StopVerdict(not_stopped={source: why})
-        if burst is not None and not burst.ended.wait(max(0.0, deadline - time.monotonic())):
+        if drive is not None and not drive.ended.wait(max(0.0, deadline - time.monotonic())):
             return StopVerdict(not_stopped={source: "the drive has not ended in time"})
         if self._odometry.topic is not None:
             while not self._odometry.still and time.monotonic() < deadline:
@@ -375,9 +430,32 @@ class MobileBaseRobot:
             if source[0] is None:
                 return error(f"{verb} needs {argument}, and {self.tool_name_str} was made without one.")
             message = self.link.read(source[0], source[1], seconds)
-        except (ValidationError, *UNREACHABLE) as exc:
+        except (ValidationError, *LINK_ERRORS) as exc:
             return error(str(exc))
         return success(f"One message of {source[0]}.", topic=source[0], message=message)
+
+
+class PosedBaseRobot(MobileBaseRobot):
+    """A :class:`MobileBaseRobot` of a platform with odometry, whose topic can be read too."""
+
+    def get_pose(self, timeout: float = 5.0) -> Envelope:
+        """Return the next sample of the odometry topic.
+
+        Args:
+            timeout: Seconds to wait for a sample, above 0.
+        """
+        return self._read("get_pose", "odom_topic", self._odom, timeout)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Names of the reads that this robot's topics allow: ``get_pose``, ``get_scan``."""
+        return super().reads if self._odom[0] is None else ("get_pose", *super().reads)
+
+    def agent_verbs(self) -> dict[str, AgentVerb]:
+        verbs = super().agent_verbs()
+        if "get_pose" in self.reads:
+            verbs["get_pose"] = (self.get_pose, f"Read where {self.node_name} is and how it moves.")
+        return verbs
 
 
 def _optional(check: Callable[[str, object], str], name: str, value: str | None) -> str | None:

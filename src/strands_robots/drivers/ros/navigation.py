@@ -1,29 +1,29 @@
-"""One goal given to a robot's own navigation stack, from its sending to what is known of its end."""
+"""Goal of a robot's own navigation stack, from its sending to what is known of its end."""
 
 from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from strands_robots.drivers.ros.motion import BaseMotion
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.ros.link import GoalReport, Message, RosError, RosLink, run_goal
+from strands_robots.ros.link import Goal, GoalReport, Message, RosError, RosLink, run_goal
 from strands_robots.safety.gate import Permit
 from strands_robots.utils import MissingExtraError
 
 logger = logging.getLogger(__name__)
 
 FEEDBACK_KEPT = 5
-"""How many samples of feedback an answer carries: the last ones."""
+"""Number of the last samples of feedback that an answer carries."""
 
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """A checked goal: metres and radians in a frame, and how long the way may take."""
+    """A checked goal: metres and radians in a frame, and the seconds that it may take."""
 
     x: float
     y: float
@@ -32,7 +32,7 @@ class Destination:
     timeout_s: float
 
     def fields(self) -> dict[str, Any]:
-        """The goal of ``nav2_msgs/NavigateToPose``; a heading is a rotation about the vertical axis."""
+        """Return the goal of ``nav2_msgs/NavigateToPose``; a heading is a rotation about the vertical axis."""
         return {
             "pose": {
                 "header": {"frame_id": self.frame_id},
@@ -44,86 +44,70 @@ class Destination:
         }
 
 
-class Navigation:
-    """Sends one goal under a permit and waits; a void permit cancels it. :meth:`run` once."""
+class Navigation(BaseMotion):
+    """A goal sent under a permit and waited for; a void permit cancels it."""
 
+    noun = "goal"
     policy = "navigate"
 
     def __init__(self, link: RosLink, action: str, kind: str, to: Destination, permit: Permit) -> None:
+        super().__init__(permit)
         self.to = to
-        self.state = "running"
-        self.ended = threading.Event()
-        """Set by whoever runs it, once the base is free for the next motion."""
         self.report: GoalReport | None = None
         self.feedback: list[Mapping[str, Any]] = []
-        self.sent = 0
-        self.answer: Envelope | None = None
         self._link = link
         self._target = (action, kind)
-        self._permit = permit
-        self._began = time.monotonic()
-        self._took_s: float | None = None
 
     @property
     def instruction(self) -> str:
-        """The goal in a few words."""
         return f"navigate to x {self.to.x:g} m, y {self.to.y:g} m in {self.to.frame_id}"
 
-    @property
-    def velocities(self) -> Mapping[str, float]:
-        """None: the stack chooses them."""
-        return {}
+    def status_fields(self) -> dict[str, Any]:
+        """``feedback``: the latest sample."""
+        return {"feedback": self.feedback[-1] if self.feedback else {}}
 
-    @property
-    def elapsed_s(self) -> float:
-        """Seconds since the goal was ordered; once it has ended, how long it took."""
-        return time.monotonic() - self._began if self._took_s is None else self._took_s
+    def fail_to_begin(self, why: str, **fields: Any) -> Envelope:
+        return super().fail_to_begin(why, goal_state="not sent", **fields)
 
-    @property
     def doubt(self) -> str | None:
-        """Why the robot may still be on its way, or None: it is known not to be."""
+        """Return why the robot may still be on its way, or None: it is known not to be."""
         if not self.ended.is_set():
             return "the goal is being cancelled, and its server has not told its end"
-        report = self.report
+        report, lost = self.report, self._lost_goal
         if report is None and self.answer is None:
             return "the goal was interrupted, and nobody knows whether it still goes on"
-        if report is None or report.over or (report.lost_goal is not None and report.lost_goal.status is not None):
+        if report is None or report.over or (lost is not None and lost.status is not None):
             return None
         return report.sentence()
 
+    @property
+    def _lost_goal(self) -> Goal | None:
+        return None if self.report is None else self.report.lost_goal
+
     def wait_until_over(self, within_s: float) -> None:
-        """Wait for the end of the goal, a late one of a lost goal too."""
+        """Wait for the end of the goal, including the late end of a lost one."""
         deadline = time.monotonic() + within_s
         self.ended.wait(within_s)
-        lost = None if self.report is None else self.report.lost_goal
-        if lost is not None:
-            lost.done.wait(max(0.0, deadline - time.monotonic()))
+        if self._lost_goal is not None:
+            self._lost_goal.done.wait(max(0.0, deadline - time.monotonic()))
 
     def cancel_again(self) -> None:
-        """Ask once more for the end of a goal that nobody knows to be over."""
-        lost = None if self.report is None else self.report.lost_goal
+        """Cancel a lost goal once more."""
+        lost = self._lost_goal
         if lost is not None and not lost.done.is_set():
             try:
                 lost.cancel()
             except RosError as exc:
                 logger.warning("The %s could not be cancelled: %s", self.instruction, exc)
 
-    def never_began(self, why: str) -> Envelope:
-        """In place of :meth:`run`: nothing was sent, for this reason."""
-        self.state = "error"
-        self.answer = error(f"The goal could not begin: {why}.", goal_state="not sent")
-        self._took_s = 0.0
-        return self.answer
-
     def run(self) -> Envelope:
-        """Send, wait, and answer how it went; the answer is kept in ``answer``."""
         try:
             self.report = run_goal(
                 self._link,
                 *self._target,
                 self.to.fields(),
                 self.to.timeout_s,
-                feedback=self._hear,
+                feedback=self._on_feedback,
                 cancelled=lambda: not self._permit.valid,
             )
             self.answer = self._answered(self.report)
@@ -131,12 +115,12 @@ class Navigation:
             self.state = "error"
             self.answer = error(f"The goal was not begun: {exc}", goal_state="not sent")
         finally:
-            # A Ctrl-C has left neither a report nor an answer.
+            # A Ctrl-C leaves neither a report nor an answer.
             self.state = "error" if self.state == "running" else self.state
             self._took_s = time.monotonic() - self._began
         return self.answer
 
-    def _hear(self, message: Message) -> None:
+    def _on_feedback(self, message: Message) -> None:
         self.sent += 1
         self.feedback = [*self.feedback[1 - FEEDBACK_KEPT :], dict(message)]
 

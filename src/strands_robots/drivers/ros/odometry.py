@@ -1,4 +1,4 @@
-"""What a base's odometry says of its motion, from the moment somebody asks."""
+"""Monitor of a base's odometry: whether the base is still."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ STILL_ANGULAR = 0.02
 """rad/s below which a base counts as still."""
 
 STILL_SAMPLES = 2
-"""Samples in a row that must say so, because one may be a turn of direction."""
+"""Samples in a row that must be below both, because a single one may be a reversal of direction."""
 
 FRESH_S = 1.0
-"""Seconds after which a sample says nothing about now."""
+"""Seconds after which a sample is too old to count."""
 
-AGAIN_S = 0.5
-"""Seconds between two tries to watch a graph that could not be watched."""
+RETRY_S = 0.5
+"""Seconds between two attempts to watch a topic that could not be watched."""
 
 
 def speeds(message: Message) -> tuple[float, float] | None:
-    """Linear (m/s) and angular (rad/s) speed of a ``nav_msgs/Odometry``, a ``TwistStamped`` or a ``turtlesim/Pose``.
+    """Return the linear (m/s) and angular (rad/s) speed in a message, or None where it carries no usable velocity.
 
-    None where the message carries no velocity or one that is no number.
+    The message is a ``nav_msgs/Odometry``, a ``TwistStamped`` or a ``turtlesim/Pose``.
     """
     if "linear_velocity" in message and "theta" in message:
         linear, angular = _norm(message["linear_velocity"]), _norm(message.get("angular_velocity"))
@@ -47,8 +47,8 @@ def speeds(message: Message) -> tuple[float, float] | None:
     return None if linear is None or angular is None else (linear, angular)
 
 
-class Odometry:
-    """Watches an odometry topic once :meth:`start` was called; without a topic it knows nothing."""
+class OdometryMonitor:
+    """Watches an odometry topic once :meth:`start` was called; without a topic its answers are None."""
 
     def __init__(self, link: RosLink, topic: str | None, kind: str | None) -> None:
         self._link = link
@@ -57,7 +57,7 @@ class Odometry:
         self._lock = threading.Lock()
         self._unwatch: Unwatch | None = None
         self._starting = threading.Lock()
-        self._telling = threading.Lock()
+        self._sample_lock = threading.Lock()
         self._closings = 0
         self._tried_at = -math.inf
         self._problem = ""
@@ -67,16 +67,16 @@ class Odometry:
 
     @property
     def watched(self) -> bool:
-        """Samples are asked for, or there is no topic to ask for."""
+        """Whether the topic is watched, or there is none to watch."""
         return self.topic is None or self._unwatch is not None
 
     def start(self) -> None:
-        """Watch from now on; a second call does nothing. A graph that cannot be watched is told to the log."""
+        """Watch from now on; a second call does nothing. A topic that cannot be watched is logged."""
         self._start(self._closings)
 
-    def start_behind(self) -> None:
-        """The same on a thread of its own, because a graph may be asked for the topic's type for seconds."""
-        if self.watched or time.monotonic() - self._tried_at < AGAIN_S or not self._starting.acquire(blocking=False):
+    def start_in_background(self) -> None:
+        """Do the same on a thread of its own, because finding out the topic's type may take seconds."""
+        if self.watched or time.monotonic() - self._tried_at < RETRY_S or not self._starting.acquire(blocking=False):
             return
         closings = self._closings
 
@@ -93,7 +93,7 @@ class Odometry:
             logger.warning("%s is not watched: %s", self.topic, exc)
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         with self._lock:
             self._closings += 1
             unwatch, self._unwatch = self._unwatch, None
@@ -102,12 +102,12 @@ class Odometry:
 
     def _start(self, closings: int) -> None:
         with self._lock:
-            # One that was asked for before a close must not open the graph again after it.
+            # A start from before a close must not open the link again after it.
             if self.topic is None or self._unwatch is not None or closings != self._closings:
                 return
             problem = ""
             try:
-                self._unwatch = self._link.watch(self.topic, self._kind, self._heard)
+                self._unwatch = self._link.watch(self.topic, self._kind, self._on_message)
             except (RosError, MissingExtraError) as exc:
                 problem = str(exc)
             if problem and problem != self._problem:
@@ -115,15 +115,15 @@ class Odometry:
             self._problem, self._tried_at = problem, time.monotonic()
 
     def expect_stillness(self) -> None:
-        """Forget the samples so far: only what arrives from now on says that the base stands."""
-        with self._telling:
+        """Forget the samples so far: only later ones can show that the base is still."""
+        with self._sample_lock:
             self._still_in_a_row = 0
             self._at = -math.inf
 
     @property
     def still(self) -> bool | None:
-        """True: it stands. False: it moves. None: nothing fresh is known."""
-        with self._telling:
+        """True: the base is still. False: it moves. None: there is no fresh sample."""
+        with self._sample_lock:
             if time.monotonic() - self._at > FRESH_S or self._speeds is None:
                 return None
             return self._still_in_a_row >= STILL_SAMPLES
@@ -133,15 +133,15 @@ class Odometry:
         """Linear (m/s) and angular (rad/s) speed of the last usable sample."""
         return self._speeds
 
-    def _heard(self, message: Message) -> None:
-        found = speeds(message)
-        if found is None:
+    def _on_message(self, message: Message) -> None:
+        measured = speeds(message)
+        if measured is None:
             return
-        still = found[0] <= STILL_LINEAR and found[1] <= STILL_ANGULAR
-        # A stop forgets the samples so far: one that is being counted must not bring their number back.
-        with self._telling:
+        still = measured[0] <= STILL_LINEAR and measured[1] <= STILL_ANGULAR
+        # Under the lock, because a stop may forget the samples at the same time.
+        with self._sample_lock:
             self._still_in_a_row = self._still_in_a_row + 1 if still else 0
-            self._speeds = found
+            self._speeds = measured
             self._at = time.monotonic()
 
 

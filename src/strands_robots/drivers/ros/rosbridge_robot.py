@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from strands_robots.drivers.ros.posed_base import PosedBaseRobot
+from strands_robots.drivers.ros.mobile_base import PosedBaseRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from strands_robots.drivers.ros.mobile_base import TWIST, UNREACHABLE
-from strands_robots.drivers.ros.posed_base import PosedBaseRobot
+from strands_robots.drivers.ros.mobile_base import LINK_ERRORS, TWIST, PosedBaseRobot
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.gate import CommandGate
@@ -78,7 +77,7 @@ class RtpsRobot(PosedBaseRobot):
         """Join the domain and appear as a publisher of the velocity topic, without sending anything."""
         try:
             self.link.advertise(*self._advertised)
-        except UNREACHABLE as exc:
+        except LINK_ERRORS as exc:
             return error(str(exc))
         topic, kind = self._advertised
         return success(f"Publishing {topic}.", topic=topic, type=kind, domain_id=self.link.domain_id)
