@@ -18,11 +18,11 @@ from fixtures.reachy_daemon.process import Daemon, Kind
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.reachy import ReachyDriver
-from strands_robots.drivers.reachy.connection import Joints
+from strands_robots.drivers.reachy.connection import JointSample
 from strands_robots.drivers.reachy.target import HeadPose, Target
 
 SIZE = (400, 480)
-Sample = tuple[Joints, float]
+Sample = tuple[JointSample, float]
 """Joints, and the head's pitch in radians."""
 
 
