@@ -1,4 +1,4 @@
-"""No test meets what the user of this machine has set or kept, nor does what a whole file shares."""
+"""Tests see neither the settings nor the state directory of the user, shared fixtures included."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from strands_robots import settings
 from strands_robots.safety.approval import state_dir
 
-KEPT = Path("~/.strands_robots").expanduser()
+USERS = Path("~/.strands_robots").expanduser()
 
 
 @pytest.fixture(scope="module")
@@ -17,12 +17,12 @@ def shared() -> Path:
     return state_dir()
 
 
-def test_a_robot_of_a_whole_file_keeps_its_state_away_from_the_users(shared: Path) -> None:
-    assert shared != KEPT
+def test_module_fixture_has_a_state_directory_of_its_own(shared: Path) -> None:
+    assert shared != USERS
     assert shared != state_dir()
-    assert state_dir() != KEPT
+    assert state_dir() != USERS
 
 
-def test_no_setting_of_the_shell_is_left() -> None:
+def test_settings_of_the_shell_are_removed() -> None:
     left = {setting.name for setting in settings.declared() if settings.is_set(setting.name)}
     assert left <= {"STRANDS_STATE_DIR", "DISPLAY", "MUJOCO_GL"}

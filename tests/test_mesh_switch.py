@@ -1,4 +1,4 @@
-"""What STRANDS_MESH asks for."""
+"""The switch STRANDS_MESH and the old module name of the mesh's session."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from strands_robots.mesh import mesh_disabled_by_env
 
 
 @pytest.mark.parametrize(
-    ("word", "asks"),
+    ("value", "expected"),
     [
         ("false", False),
         ("0", False),
@@ -23,13 +23,13 @@ from strands_robots.mesh import mesh_disabled_by_env
         (" ", None),
     ],
 )
-def test_the_words_of_the_switch(monkeypatch: pytest.MonkeyPatch, word: str, asks: bool | None) -> None:
-    monkeypatch.setenv("STRANDS_MESH", word)
-    assert _mesh_switch.mesh_env_request() is asks
-    assert mesh_disabled_by_env() is (asks is False)
+def test_switch_is_read_in_each_spelling(monkeypatch: pytest.MonkeyPatch, value: str, expected: bool | None) -> None:
+    monkeypatch.setenv("STRANDS_MESH", value)
+    assert _mesh_switch.mesh_env_request() is expected
+    assert mesh_disabled_by_env() is (expected is False)
 
 
-def test_any_other_word_is_ignored_with_one_warning(
+def test_any_other_value_is_ignored_with_one_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("STRANDS_MESH", "flase")
@@ -39,7 +39,7 @@ def test_any_other_word_is_ignored_with_one_warning(
     assert len([record for record in caplog.records if "flase" in record.getMessage()]) == 1
 
 
-def test_the_old_name_of_the_session_is_the_session() -> None:
+def test_mesh_session_is_the_old_name_of_mesh_dot_session() -> None:
     import strands_robots.mesh.session  # noqa: PLC0415 - both names are what is tested
     import strands_robots.mesh_session  # noqa: PLC0415 - likewise
 

@@ -1,4 +1,4 @@
-"""The one reader of the environment: defaults, domains, and the safe side."""
+"""Settings: defaults, domains, and the safe value of a misspelt switch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from strands_robots import settings
 NAME = "DEVICE_CONNECT_ALLOW_INSECURE"
 RATE = "STRANDS_CONTROL_HZ"
 
-WORDS = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=20)
+TEXTS = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=20)
 
 
 def test_every_setting_is_declared_once_with_a_usable_default() -> None:
@@ -31,29 +31,29 @@ def test_every_setting_is_declared_once_with_a_usable_default() -> None:
 
 
 @hypothesis_settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(word=WORDS, safe=st.booleans())
-def test_an_unknown_spelling_of_a_boolean_is_the_safe_side(
-    monkeypatch: pytest.MonkeyPatch, word: str, safe: bool
+@given(spelling=TEXTS, safe=st.booleans())
+def test_unknown_spelling_of_a_boolean_gives_the_safe_value(
+    monkeypatch: pytest.MonkeyPatch, spelling: str, safe: bool
 ) -> None:
-    monkeypatch.setenv(NAME, word)
+    monkeypatch.setenv(NAME, spelling)
     value = settings.boolean(NAME, safe=safe)
-    spelled = word.strip().lower()
-    if not spelled or spelled in settings.FALSE_WORDS:
+    spelled = spelling.strip().lower()
+    if not spelled or spelled in settings.FALSE_SPELLINGS:
         assert value is False
-    elif spelled in settings.TRUE_WORDS:
+    elif spelled in settings.TRUE_SPELLINGS:
         assert value is True
     else:
         assert value is safe
 
 
 @hypothesis_settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(word=st.one_of(WORDS, st.floats().map(str), st.integers().map(str)))
-def test_a_number_is_always_in_its_domain(monkeypatch: pytest.MonkeyPatch, word: str) -> None:
-    monkeypatch.setenv(RATE, word)
+@given(spelling=st.one_of(TEXTS, st.floats().map(str), st.integers().map(str)))
+def test_number_is_always_in_its_domain(monkeypatch: pytest.MonkeyPatch, spelling: str) -> None:
+    monkeypatch.setenv(RATE, spelling)
     assert 1 <= settings.number(RATE) <= 2000
 
 
-def test_a_number_out_of_its_domain_is_the_default_and_one_warning(
+def test_number_out_of_its_domain_gives_the_default_and_one_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv(RATE, "1e99")
@@ -61,7 +61,7 @@ def test_a_number_out_of_its_domain_is_the_default_and_one_warning(
     assert len([record for record in caplog.records if "1e99" in record.getMessage()]) == 1
 
 
-def test_an_integer_that_is_not_whole_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_integer_that_is_not_whole_gives_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_DC_PORT", "7000.5")
     assert settings.integer("STRANDS_DC_PORT") == 7447
     monkeypatch.setenv("STRANDS_DC_PORT", "7000")
@@ -69,7 +69,7 @@ def test_an_integer_that_is_not_whole_is_the_default(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("blank", ["", " ", "\t"])
-def test_blank_means_unset(monkeypatch: pytest.MonkeyPatch, blank: str) -> None:
+def test_blank_value_means_unset(monkeypatch: pytest.MonkeyPatch, blank: str) -> None:
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", blank)
     assert not settings.is_set("DEVICE_CONNECT_RPC_ALLOW")
     assert settings.items("DEVICE_CONNECT_RPC_ALLOW") == ()
@@ -77,12 +77,12 @@ def test_blank_means_unset(monkeypatch: pytest.MonkeyPatch, blank: str) -> None:
     assert settings.number(RATE) == 50.0
 
 
-def test_a_list_is_its_items_without_blanks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_list_has_its_items_without_blanks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", " a , ,b*,")
     assert settings.items("DEVICE_CONNECT_RPC_ALLOW") == ("a", "b*")
 
 
-def test_what_is_not_declared_cannot_be_read() -> None:
+def test_undeclared_setting_cannot_be_read() -> None:
     for read in (settings.raw, settings.is_set, settings.boolean, settings.number, settings.items):
         with pytest.raises(KeyError):
             read("STRANDS_NO_SUCH_THING")

@@ -1,4 +1,4 @@
-"""Value domains: what is a number, a name, a host; every refusal names the argument, the value and the domain."""
+"""Value domains, identifiers and quaternions; every refusal names the argument, the value and the domain."""
 
 from __future__ import annotations
 
@@ -189,3 +189,22 @@ def test_a_leader_needs_a_callable_get_action() -> None:
 
     assert utils.teleoperator_contract_error(Leader()) is None
     assert "get_action" in str(utils.teleoperator_contract_error(object()))
+
+
+@pytest.mark.parametrize("yaw", [-3.0, -0.5, 0.0, 1.0, 3.1])
+@pytest.mark.parametrize("scale", [1.0, -1.0, 2.5])
+def test_yaw_of_a_rotation_about_z_does_not_depend_on_sign_and_length(yaw: float, scale: float) -> None:
+    quat = [scale * math.cos(yaw / 2), 0.0, 0.0, scale * math.sin(yaw / 2)]
+    assert utils.yaw_of(quat) == pytest.approx(yaw)
+
+
+def test_yaw_is_the_heading_of_the_x_axis_when_the_body_pitches_as_well() -> None:
+    yaw, pitch = 0.7, 0.4
+    a, b = yaw / 2, pitch / 2
+    quat = [math.cos(a) * math.cos(b), -math.sin(a) * math.sin(b), math.cos(a) * math.sin(b), math.sin(a) * math.cos(b)]
+    assert utils.yaw_of(quat) == pytest.approx(yaw)
+
+
+def test_w_positive_picks_the_quaternion_with_a_positive_w() -> None:
+    assert utils.w_positive((-0.5, 0.5, -0.5, 0.5)) == [0.5, -0.5, 0.5, -0.5]
+    assert utils.w_positive((0.0, 1.0, 0.0, 0.0)) == [0.0, 1.0, 0.0, 0.0]

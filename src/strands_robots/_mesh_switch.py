@@ -1,4 +1,4 @@
-"""What ``STRANDS_MESH`` asks for: off, on, or nothing."""
+"""The kill switch ``STRANDS_MESH``, read before the mesh is loaded."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _warned: set[str] = set()
 
 
 def mesh_env_request() -> bool | None:
-    """False for ``false``, ``0`` and ``no`` (the kill switch), True for ``true``, ``1`` and ``yes``, else None.
+    """Return False for ``false``, ``0`` and ``no``, True for ``true``, ``1`` and ``yes``, else None.
 
-    Any other word is ignored, with one warning.
+    Any other value is ignored, with one warning.
     """
-    word = settings.raw("STRANDS_MESH").lower()
-    if word and word not in _REQUESTS and word not in _warned:
-        _warned.add(word)
-        logger.warning("STRANDS_MESH=%r is neither true nor false; it is ignored.", word)
-    return _REQUESTS.get(word)
+    value = settings.raw("STRANDS_MESH").lower()
+    if value and value not in _REQUESTS and value not in _warned:
+        _warned.add(value)
+        logger.warning("STRANDS_MESH=%r is neither true nor false; it is ignored.", value)
+    return _REQUESTS.get(value)

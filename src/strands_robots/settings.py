@@ -1,8 +1,8 @@
-"""What each environment variable means, in one table.
+"""Environment variables: one table of names, kinds, defaults, domains and meanings.
 
-Nothing else in the package reads the environment. A value is read when it is asked for, not at import, so a
-test or a flag of ``serve`` may set it first. An unknown spelling of a boolean is the safe side and one
-warning; a number out of its domain is the default and one warning.
+Nothing else in the package reads the environment. A value is read at each call, not at import, so a test or a flag of
+``serve`` may set it first. An unknown spelling of a boolean gives the safe value and one warning; a number out of its
+domain gives the default and one warning.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 logger = logging.getLogger(__name__)
 
-TRUE_WORDS = frozenset({"1", "true", "yes", "on"})
-FALSE_WORDS = frozenset({"0", "false", "no", "off"})
+TRUE_SPELLINGS = frozenset({"1", "true", "yes", "on"})
+FALSE_SPELLINGS = frozenset({"0", "false", "no", "off"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ def _declare(*settings: Setting) -> None:
 _declare(
     # The framework's own names, honoured as it documents them.
     Setting("DEVICE_CONNECT_ALLOW_INSECURE", "boolean", "false", "Opt in to a transport without authentication."),
-    Setting("DEVICE_CONNECT_DISCOVERY_MODE", "text", "d2d", "How devices are found: d2d (presence) or registry."),
+    Setting("DEVICE_CONNECT_DISCOVERY_MODE", "text", "d2d", "Discovery of devices: d2d (presence) or registry."),
     Setting("MESSAGING_BACKEND", "text", "zenoh", "Transport of Device Connect: zenoh or nats."),
     Setting("MESSAGING_URLS", "list", "", "Broker or peer URLs of Device Connect."),
     Setting("MESSAGING_CREDENTIALS_FILE", "path", "", "Device Connect credentials file (JSON)."),
@@ -55,20 +55,20 @@ _declare(
     Setting("ZENOH_CONNECT", "list", "", "Zenoh endpoints to connect to, such as tcp/127.0.0.1:7447."),
     Setting("ZENOH_LISTEN", "list", "", "Zenoh endpoints to listen on."),
     Setting("TENANT", "text", "default", "Device Connect tenant."),
-    Setting("OTEL_EXPORTER_OTLP_ENDPOINT", "text", "", "Where traces of calls go. Unset: none are recorded."),
+    Setting("OTEL_EXPORTER_OTLP_ENDPOINT", "text", "", "Endpoint for traces of calls. Unset: none are recorded."),
     # Ours, on Device Connect.
     Setting(
         "DEVICE_CONNECT_RPC_ALLOW",
         "list",
         "",
         "Callers that may move a robot: globs; '*' any named caller; 'anonymous' the unnamed. "
-        "Unset: simulations move for anybody, real hardware for nobody.",
+        "Unset: anyone may move a simulation, nobody may move real hardware.",
     ),
     Setting(
         "DEVICE_CONNECT_ESTOP_ALLOW",
         "list",
         "",
-        "Sources whose emergencyStop is honoured: globs. Unset: every named source.",
+        "Sources whose emergencyStop counts: globs. Unset: every named source.",
     ),
     Setting(
         "STRANDS_MESH_POLICY_TYPE_ALLOW",
@@ -96,10 +96,10 @@ _declare(
     ),
     Setting("ROS_DOMAIN_ID", "integer", "0", "DDS domain of ROS 2 robots.", 0, 232),
     Setting("ROS_LOCALHOST_ONLY", "boolean", "false", "Keep DDS on this machine, unless CYCLONEDDS_URI is set."),
-    Setting("ROS_SECURITY_ENABLE", "text", "", "ROS 2's own switch of its security: exactly true."),
-    Setting("ROS_SECURITY_STRATEGY", "text", "", "ROS 2's own word for what it does without keys: Enforce refuses."),
+    Setting("ROS_SECURITY_ENABLE", "text", "", "ROS 2's own security switch: on only for exactly true."),
+    Setting("ROS_SECURITY_STRATEGY", "text", "", "ROS 2's own rule for a node without keys: Enforce refuses it."),
     Setting("ROS_SECURITY_KEYSTORE", "path", "", "ROS 2's own folder of keys and permissions."),
-    Setting("CYCLONEDDS_URI", "text", "", "Configuration of Cyclone DDS, which the library reads itself."),
+    Setting("CYCLONEDDS_URI", "text", "", "Configuration of Cyclone DDS; the library reads it."),
     Setting("BYPASS_TOOL_CONSENT", "boolean", "false", "Approve every motion verb on real hardware."),
     Setting("STRANDS_DC_PORT", "integer", "7447", "Loopback port where local robots meet.", 1, 65535),
     Setting("STRANDS_DC_STATE_HZ", "number", "1", "stateUpdate events a second while idle.", 0.01, 100),
@@ -120,7 +120,14 @@ _declare(
     Setting("STRANDS_MESH_NAMESPACE", "text", "strands", "Zenoh namespace on top of the mesh's keys."),
     Setting("STRANDS_MESH_MULTICAST", "boolean", "false", "Find peers by multicast on the local network."),
     Setting("STRANDS_MESH_MAX_SESSIONS", "integer", "256", "Zenoh sessions a hub accepts.", 1, 65535),
-    Setting("STRANDS_MESH_MAX_PEERS", "integer", "1024", "Peers remembered; the oldest leaves first.", 1, 1_000_000),
+    Setting(
+        "STRANDS_MESH_MAX_PEERS",
+        "integer",
+        "1024",
+        "Peers kept in the table; the oldest is dropped first.",
+        1,
+        1_000_000,
+    ),
     Setting("STRANDS_MESH_PEER_RETENTION_S", "number", "0", "Seconds a silent peer stays listed.", 0, 10_000_000),
     Setting("STRANDS_MESH_AUTH_MODE", "text", "mtls", "mtls, or none with STRANDS_MESH_I_KNOW_THIS_IS_INSECURE."),
     Setting("STRANDS_MESH_I_KNOW_THIS_IS_INSECURE", "boolean", "false", "Opt in to a mesh without certificates."),
@@ -157,8 +164,8 @@ _declare(
     Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Network of the robot_mesh tool: off means the native mesh."),
     Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants and lockouts. Unset: ~/.strands_robots."),
     # Rendering, by names that are not ours.
-    Setting("MUJOCO_GL", "text", "", "OpenGL of MuJoCo: egl, osmesa, glfw. Unset: what works without a display."),
-    Setting("DISPLAY", "text", "", "X display; where there is one, MuJoCo's own choice of OpenGL is kept."),
+    Setting("MUJOCO_GL", "text", "", "OpenGL of MuJoCo: egl, osmesa or glfw. Unset: one that works without a display."),
+    Setting("DISPLAY", "text", "", "X display; with one, MuJoCo's own choice of OpenGL is kept."),
     # Safety.
     Setting(
         "STRANDS_HALT_DEADLINE_S",
@@ -168,7 +175,7 @@ _declare(
         0.05,
         60,
     ),
-    Setting("STRANDS_ESTOP_TORQUE", "text", "hold", "What a stop does to torque: hold (stiff) or limp (off)."),
+    Setting("STRANDS_ESTOP_TORQUE", "text", "hold", "Torque after a stop: hold (stiff) or limp (off)."),
     Setting(
         "STRANDS_CHECKIN_TIMEOUT_S",
         "number",
@@ -187,7 +194,7 @@ _declare(
         "STRANDS_MESH_RESUME_PUBLIC_KEY",
         "list",
         "",
-        "Ed25519 keys (base64url) of the operators whose resume counts. Unset: no signed resume is admitted.",
+        "Ed25519 keys (base64url) of the operators who may resume a robot. Unset: no signed resume is admitted.",
     ),
     Setting("STRANDS_MESH_AUDIT_DIR", "path", "", "Directory of the safety audit. Unset: ~/.strands_robots."),
     Setting("STRANDS_MESH_AUDIT_PSK", "text", "", "Secret that signs each audit record (HMAC-SHA256)."),
@@ -195,58 +202,58 @@ _declare(
 
 
 def declared() -> tuple[Setting, ...]:
-    """Every setting, in the order in which the table declares them."""
+    """Return every setting, in the order of the table."""
     return tuple(_TABLE.values())
 
 
 def raw(name: str) -> str:
-    """The variable's text, stripped; the declared default when unset or blank."""
+    """Return the variable's text, stripped; the declared default when unset or blank."""
     return os.environ.get(name, "").strip() or _TABLE[name].default
 
 
 def verbatim(name: str) -> str:
-    """The variable letter by letter, "" when unset: for a word that another program compares so."""
+    """Return the variable unchanged, "" when unset, for a value that another program compares letter by letter."""
     return os.environ.get(_TABLE[name].name, "")
 
 
 def put(name: str, value: str) -> None:
-    """Set a declared variable for this process and its children: how a flag of a command takes effect."""
+    """Set a declared variable for this process and its children, as a flag of a command does."""
     os.environ[_TABLE[name].name] = value
 
 
 def is_set(name: str) -> bool:
-    """True when the variable holds anything but blanks."""
+    """Return True when the variable has anything but blanks."""
     return bool(os.environ.get(_TABLE[name].name, "").strip())
 
 
 def boolean(name: str, *, safe: bool = False) -> bool:
-    """A switch. An unknown spelling is ``safe``, with one warning."""
-    word = raw(name).lower()
-    if word in TRUE_WORDS:
+    """Return a switch; an unknown spelling gives ``safe`` and one warning."""
+    spelling = raw(name).lower()
+    if spelling in TRUE_SPELLINGS:
         return True
-    if word in FALSE_WORDS:
+    if spelling in FALSE_SPELLINGS:
         return False
-    _warn_once(name, word, f"is no boolean; taken as {str(safe).lower()}, the safe side")
+    _warn_once(name, spelling, f"is no boolean; taken as {str(safe).lower()}, the safe side")
     return safe
 
 
 def number(name: str) -> float:
-    """A finite number in the setting's domain, else its default with one warning."""
-    setting, word = _TABLE[name], raw(name)
+    """Return a finite number in the setting's domain, else its default with one warning."""
+    setting, spelling = _TABLE[name], raw(name)
     try:
-        value = float(word)
+        value = float(spelling)
     except ValueError:
         value = math.nan
     low = -math.inf if setting.low is None else setting.low
     high = math.inf if setting.high is None else setting.high
     if math.isfinite(value) and low <= value <= high:
         return value
-    _warn_once(name, word, f"is no number from {low:g} to {high:g}; {setting.default} is used")
+    _warn_once(name, spelling, f"is no number from {low:g} to {high:g}; {setting.default} is used")
     return float(setting.default)
 
 
 def integer(name: str) -> int:
-    """A whole number in the setting's domain, else its default with one warning."""
+    """Return a whole number in the setting's domain, else its default with one warning."""
     value = number(name)
     if value != int(value):
         _warn_once(name, raw(name), f"is not whole; {_TABLE[name].default} is used")
@@ -255,11 +262,11 @@ def integer(name: str) -> int:
 
 
 def items(name: str) -> tuple[str, ...]:
-    """A comma list without its blanks; empty when unset."""
+    """Return the parts of a comma list without blanks; empty when unset."""
     return tuple(part.strip() for part in raw(name).split(",") if part.strip())
 
 
-def _warn_once(name: str, value: str, what: str) -> None:
+def _warn_once(name: str, value: str, complaint: str) -> None:
     if (name, value) not in _warned:
         _warned.add((name, value))
-        logger.warning("%s=%r %s.", name, value, what)
+        logger.warning("%s=%r %s.", name, value, complaint)

@@ -1,8 +1,8 @@
-"""Value domains and identifiers: is this number usable, is this name allowed?
+"""Value domains, identifiers and quaternions.
 
-Every check returns the value, typed, or raises :class:`ValidationError` whose sentence names the argument,
-the value and the domain. The doors (RPC handlers, constructors, wire decoders) call these once; what is
-inside trusts its types. Booleans are not numbers, and NaN is not a number.
+Every check returns the value, typed, or raises :class:`ValidationError` with the argument, the value and the domain
+in its message. The edges (RPC handlers, constructors, wire decoders) call a check once; the code inside trusts its
+types. Booleans are not numbers, and NaN is not a number.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import ipaddress
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ class ValidationError(StrandsRobotsError, ValueError):
 
 
 class MissingExtraError(StrandsRobotsError, ImportError):
-    """An optional dependency is not installed; the message says which extra brings it."""
+    """An optional dependency is not installed; the message names the extra that brings it."""
 
 
 def install_line(extra: str) -> str:
@@ -47,12 +48,12 @@ def install_line(extra: str) -> str:
 
 
 def missing_extra(what: str, extra: str) -> MissingExtraError:
-    """The one sentence for an absent optional package."""
+    """Return the error for an absent optional package, with the command that installs its extra."""
     return MissingExtraError(f"{what} needs the [{extra}] extra: {install_line(extra)}.")
 
 
 def shown(value: object) -> str:
-    """``repr`` of a refused value, shortened so that a hostile one cannot flood a log or a reply."""
+    """Return ``repr(value)``, shortened so that a hostile value cannot flood a log or a reply."""
     if isinstance(value, str | bytes) and len(value) > _SHOWN_MAX:
         return f"{value[:_SHOWN_MAX]!r}... ({len(value)} long)"
     if isinstance(value, list | tuple | dict | set) and len(value) > 8:
@@ -74,7 +75,7 @@ def number(
     high: float | None = None,
     above: float | None = None,
 ) -> float:
-    """A finite number, ``low`` and ``high`` included, ``above`` excluded."""
+    """Return ``value`` as a finite float; ``low`` and ``high`` are included, ``above`` is excluded."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             result = float(value)
@@ -88,12 +89,12 @@ def number(
         )
         if inside:
             return result
-    # The domain is put into words for a refusal only: every command of every robot comes through here.
+    # The text of the domain is made for a refusal only, because every command of every robot passes this check.
     raise ValidationError(f"{name} must be {_domain('a finite number', low, high, above)}, not {shown(value)}.")
 
 
 def whole(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:
-    """An integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
+    """Return ``value`` as an integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
     if isinstance(value, int) and not isinstance(value, bool):
         inside = (low is None or value >= low) and (high is None or value <= high)
         if inside:
@@ -102,14 +103,14 @@ def whole(name: str, value: object, *, low: int | None = None, high: int | None 
 
 
 def flag(name: str, value: object) -> bool:
-    """A boolean; no spelling of one and no 0 or 1 stands for it."""
+    """Return ``value`` as a boolean; a spelling of one, 0 and 1 are refused."""
     if not isinstance(value, bool):
         raise ValidationError(f"{name} must be true or false, not {shown(value)}.")
     return value
 
 
 def text(name: str, value: object, *, longest: int = 2000, empty: bool = False) -> str:
-    """A string of at most ``longest`` characters without control characters; blank only where ``empty``."""
+    """Return a string of at most ``longest`` characters without control characters; blank only with ``empty``."""
     domain = f"text of {0 if empty else 1} to {longest} characters without control characters"
     if not isinstance(value, str):
         raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
@@ -120,21 +121,21 @@ def text(name: str, value: object, *, longest: int = 2000, empty: bool = False) 
 
 
 def choice(name: str, value: object, allowed: tuple[str, ...]) -> str:
-    """One of a few words."""
+    """Return ``value`` when it is one of the allowed strings."""
     if not isinstance(value, str) or value not in allowed:
         raise ValidationError(f"{name} must be one of {', '.join(allowed)}, not {shown(value)}.")
     return value
 
 
 def mapping(name: str, value: object) -> dict[str, Any]:
-    """A JSON object."""
+    """Return ``value`` as a JSON object."""
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise ValidationError(f"{name} must be an object with string keys, not {shown(value)}.")
     return value
 
 
 def identifier(name: str, value: object) -> str:
-    """A peer id or an identifier inside a message: letters, digits, ``.``, ``_``, ``-``, the first alphanumeric."""
+    """Return a peer id or message identifier: letters, digits, ``.``, ``_``, ``-``, the first one alphanumeric."""
     domain = f"1 to {IDENTIFIER_MAX} letters, digits, '.', '_' or '-', the first one alphanumeric"
     if not isinstance(value, str) or len(value) > IDENTIFIER_MAX or not _IDENTIFIER.match(value):
         raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
@@ -142,7 +143,7 @@ def identifier(name: str, value: object) -> str:
 
 
 def device_id(name: str, value: object) -> str:
-    """An id on Device Connect: an identifier without dots, because discovery cannot see a dotted one."""
+    """Return an id on Device Connect: an identifier without dots, because discovery cannot see a dotted one."""
     domain = f"1 to {IDENTIFIER_MAX} letters, digits, '_' or '-', the first one alphanumeric, without dots"
     if not isinstance(value, str) or len(value) > IDENTIFIER_MAX or not _DEVICE_ID.match(value):
         raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
@@ -150,12 +151,12 @@ def device_id(name: str, value: object) -> str:
 
 
 def port(name: str, value: object) -> int:
-    """A TCP port, 1 to 65535."""
+    """Return a TCP port, 1 to 65535."""
     return whole(name, value, low=1, high=65535)
 
 
 def dial_host_error(value: object) -> str | None:
-    """Why ``value`` cannot be the host half of a URL, or None: a bare hostname or an IP literal can."""
+    """Return the reason why ``value`` is no bare hostname or IP literal, or None when it is one."""
     domain = "a bare hostname or IP address"
     if not isinstance(value, str) or not 0 < len(value) <= 253:
         return f"host must be {domain}, not {shown(value)}."
@@ -167,10 +168,24 @@ def dial_host_error(value: object) -> str | None:
 
 
 def teleoperator_contract_error(teleoperator: object) -> str | None:
-    """Why ``teleoperator`` cannot lead a robot, or None: it must have a callable ``get_action``."""
+    """Return the reason why ``teleoperator`` cannot lead a robot, or None; it needs a callable ``get_action``."""
     if callable(getattr(teleoperator, "get_action", None)):
         return None
     return f"teleoperator must have a callable get_action(), and {shown(teleoperator)} has none."
+
+
+def w_positive(quat: Sequence[float]) -> list[float]:
+    """Return the one of the two quaternions (w, x, y, z) of a rotation whose w is not negative."""
+    return [-value for value in quat] if quat[0] < 0 else list(quat)
+
+
+def yaw_of(quat: Sequence[float]) -> float:
+    """Return the rotation about z, radians, of a quaternion (w, x, y, z) that need not be normalised.
+
+    The z-y-x Euler yaw, ``atan2(2(wz + xy), w² + x² - y² - z²)``.
+    """
+    w, x, y, z = quat
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 def _domain(kind: str, low: float | None, high: float | None, above: float | None) -> str:

@@ -30,9 +30,8 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.throttle import TroubleLog
-from strands_robots.quaternions import w_positive, yaw_of
 from strands_robots.recording.cameras import Frames, jpeg
-from strands_robots.utils import ValidationError, identifier, shown
+from strands_robots.utils import ValidationError, identifier, shown, w_positive, yaw_of
 
 logger = logging.getLogger(__name__)
 

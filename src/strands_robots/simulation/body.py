@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from strands_robots.quaternions import w_positive, yaw_of
 from strands_robots.safety.gate import Permit
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.physics import Physics, Snapshot
 from strands_robots.simulation.stage import Actuator, RobotParts
-from strands_robots.utils import ValidationError, mapping, number
+from strands_robots.utils import ValidationError, mapping, number, w_positive, yaw_of
 
 PLANAR = 2
 """Sliding joints of one body that make it a mobile base; one alone is a rail, or an arm's first joint."""

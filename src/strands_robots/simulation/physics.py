@@ -23,11 +23,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from strands_robots.quaternions import yaw_of
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.stage import Floats, RobotParts, Stage
-from strands_robots.utils import ValidationError, shown
+from strands_robots.utils import ValidationError, shown, yaw_of
 
 CHUNK = 128
 """Steps between two snapshots when stepping by hand: about a millisecond for an arm, 1 % of it for the snapshot."""

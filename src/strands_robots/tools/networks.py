@@ -53,7 +53,7 @@ class RobotNetwork(Protocol):
 def network() -> RobotNetwork:
     """The network that is in use: Device Connect, unless it is absent or ``STRANDS_ROBOT_MESH_DC`` says off."""
     absent = importlib.util.find_spec("device_connect_edge") is None
-    if absent or settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_WORDS:
+    if absent or settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_SPELLINGS:
         return NativeMesh()
     return DeviceConnect()
 
