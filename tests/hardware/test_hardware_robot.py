@@ -184,7 +184,7 @@ def test_a_wedged_bus_is_reported_within_the_deadline_and_frozen_when_it_answers
         assert verdict.stopped is False
         assert "no answer in 0.3 s" in verdict.not_stopped["task"]
     assert verdicts[0].elapsed_ms < 20_000, "and the bus hangs for longer"
-    freezing = [thread for thread in threading.enumerate() if thread.name == "freeze-wedging"]
+    freezing = [thread for thread in threading.enumerate() if thread.name == "halt-wedging"]
     assert len(freezing) == 1, "a second halt waits for the first attempt"
     written = len(device.writes)
     device.release()

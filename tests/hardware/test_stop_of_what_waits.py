@@ -12,7 +12,8 @@ from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
 from strands_robots.envelope import error
-from strands_robots.hardware import HardwareRobot, tasks
+from strands_robots.hardware import HardwareRobot
+from strands_robots.hardware import robot as hardware_robot
 from strands_robots.safety.gate import Permit
 from strands_robots.teleoperators.leader import ScriptedLeader
 
@@ -44,7 +45,7 @@ def loading(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
         return ScriptedPolicy([], always={"pan.pos": 90.0})
 
     ready.asked = asked  # type: ignore[attr-defined]
-    monkeypatch.setattr(tasks, "create_policy", slow)
+    monkeypatch.setattr(hardware_robot, "create_policy", slow)
     yield ready
     ready.set()
 

@@ -31,20 +31,20 @@ class SilentDevice(RecordingDevice):
         return dict(self.positions)
 
 
-def freezers(name: str) -> list[str]:
-    return [thread.name for thread in threading.enumerate() if thread.name == f"freeze-{name}"]
+def stop_threads(name: str) -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name == f"halt-{name}"]
 
 
 def test_the_thread_of_the_stop_stands_ready_once_connected_and_goes_with_the_robot() -> None:
     robot = HardwareRobot(RecordingDevice(), "steady")
-    assert freezers("steady") == []
+    assert stop_threads("steady") == []
     robot.connect()
-    assert len(freezers("steady")) == 1
+    assert len(stop_threads("steady")) == 1
     for _ in range(3):
         assert robot.halt("test").stopped is True
-    assert len(freezers("steady")) == 1
+    assert len(stop_threads("steady")) == 1
     robot.cleanup()
-    eventually(lambda: not freezers("steady"))
+    eventually(lambda: not stop_threads("steady"))
     assert robot.halt("again").stopped is True, "a halt after the cleanup makes its thread anew"
 
 
@@ -54,7 +54,7 @@ def test_a_robot_that_nobody_cleans_up_takes_the_thread_along() -> None:
     robot.halt("test")
     del robot
     gc.collect()
-    eventually(lambda: not freezers("dropped"))
+    eventually(lambda: not stop_threads("dropped"))
 
 
 def test_a_read_that_lost_an_answer_gives_the_bus_to_a_stop_instead_of_asking_again() -> None:

@@ -18,6 +18,7 @@ from strands_robots.envelope import is_error
 from strands_robots.safety.orders import RobotReport, StopOrder, derived_epoch, epoch_of, new_epoch
 from strands_robots.safety.persistence import LockoutStore, hardware_key
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.stop_executor import StopExecutor
 from strands_robots.safety.stopping import stop_level
 from strands_robots.utils import ValidationError
 
@@ -91,20 +92,24 @@ def test_a_robot_wedged_in_one_stop_is_asked_again_by_the_next(
 
 
 def test_a_wedged_robot_is_reported_where_no_thread_can_start(
-    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    full = threading.Event()
+
+    def start(thread: threading.Thread) -> None:
+        if full.is_set():
+            raise RuntimeError("can't start new thread")
+        thread.start()
+
     release = threading.Event()
-    add("wedged", before_halt=lambda: release.wait(60))
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.3")
-
-    def no_thread() -> None:
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(plane.robots["wedged"].worker, "renew", no_thread)
-    for _ in range(2):
-        assert plane.emergency_stop(order())["wedged"].stopped is False
-    assert "can't start new thread" in caplog.text
-    release.set()
+    with own_plane(0.3, executor=StopExecutor(start)) as plane:
+        plane.register("wedged", RecordingRobot(before_halt=lambda: release.wait(60)))
+        full.set()
+        for _ in range(2):
+            assert plane.emergency_stop(order())["wedged"].stopped is False
+        eventually(lambda: "wedged is stuck in its halt and no other thread can halt it" in caplog.text)
+        assert "can't start new thread" in caplog.text
+        release.set()
 
 
 @pytest.mark.parametrize(

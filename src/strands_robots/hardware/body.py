@@ -70,7 +70,7 @@ class DeviceBody:
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         self._latest: tuple[float, dict[str, float]] | None = None
         self._lost = False
-        self._stops = 0
+        self._stops: list[object] = []
         self.driven = False
         """True from an action until it was frozen or let go."""
 
@@ -87,8 +87,8 @@ class DeviceBody:
 
     @property
     def stop_waits(self) -> bool:
-        """Whether somebody stops the body, or waits for the bus to do it."""
-        return self._stops > 0
+        """True while the body is being stopped, or a stop waits for the bus."""
+        return bool(self._stops)
 
     @property
     def latest_joints(self) -> tuple[float, dict[str, float]] | None:
@@ -155,27 +155,26 @@ class DeviceBody:
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
-        """The bus for whoever stops the body: others give it up after the exchange that is under way.
+        """Hold the bus for a stop of the body: readers give it up after the exchange that is under way.
 
-        It is waited for without end; who may not wait so long does this on a thread.
+        The bus is waited for without end, so a caller with a deadline does this on the stop executor's thread.
         """
-        # Halts take turns on the freezer's thread, so that nobody else counts here.
-        self._stops += 1
-        counted = 1
+        stop = object()
+        self._stops.append(stop)
         try:
             with self.lock:
                 try:
                     yield
                 finally:
-                    # Before the bus is free: whoever reads next waits for no stop that is over.
-                    self._stops -= counted
-                    counted = 0
+                    # Before the bus is free: the next reader then waits for no stop that is over.
+                    self._stops.remove(stop)
         finally:
-            # Nothing is left to take off but for a wait for the bus that was cut off.
-            self._stops -= counted
+            # A Ctrl-C may have cut off the wait for the bus.
+            if stop in self._stops:
+                self._stops.remove(stop)
 
     def stop(self) -> None:
-        """Freeze, or let go, as the stop level says.
+        """Freeze, or let go, as the stop level says; nothing where it is disconnected and was not moved since.
 
         Raises:
             ConnectionError: the port is gone, or some motors did not confirm that they let go.
@@ -185,6 +184,8 @@ class DeviceBody:
             if self.lost:
                 raise ConnectionError("its port is gone; a servo goes on to its last goal")
             if not self.is_connected:
+                if not self.driven:
+                    return
                 raise ConnectionError("it is not connected; what it was told last goes on")
             if self.stop_level == "release":
                 self._release()
@@ -228,17 +229,17 @@ class DeviceBody:
             present = self._joints(1)
         except ConnectionError:
             # One silent motor must not leave the others running to their goals while it is asked again.
-            if age <= HOLD_FRESH_S:
-                self._send_still(dict(still), known)
+            if age <= HOLD_FRESH_S and (targets := still | self._targets(known)):
+                self.device.send_action(targets)
             present = self._joints(READ_TRIES, urgent=urgent)
-        self._send_still(still, present)
+        targets = still | self._targets(present)
+        if targets:
+            self.device.send_action(targets)
         # A bus does not confirm targets; what it answers after them shows that it took them.
         self._joints(READ_TRIES, urgent=urgent)
 
-    def _send_still(self, still: dict[str, float], present: Mapping[str, float]) -> None:
-        still |= {key: present[key] for key in self.bounds if key in present and key not in still}
-        if still:
-            self.device.send_action(still)
+    def _targets(self, present: Mapping[str, float]) -> dict[str, float]:
+        return {key: present[key] for key in self.bounds if key in present and not _is_velocity(key)}
 
     def _release(self) -> None:
         """Torque off, motor by motor where they have names, so that a silent one keeps none of the others on."""

@@ -4,35 +4,42 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
 
 from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
+from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
 from strands_robots.hardware.motors import joint_units, tells_temperature, temperatures
-from strands_robots.hardware.tasks import ANSWER_SHARE, Tasks
 from strands_robots.policies.base import checked_action
+from strands_robots.policies.registry import create_policy, resolve_provider
+from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
 from strands_robots.recording.cameras import Shots
-from strands_robots.safety.gate import MotionRefused, Permit, PermitVoidError
+from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, PermitVoidError, Waiting
 from strands_robots.safety.persistence import hardware_key
+from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.safety.stopping import stop_level as configured_level
-from strands_robots.utils import ValidationError, choice, number, text
+from strands_robots.teleop_mixin import TeleopMixin
+from strands_robots.utils import MissingExtraError, ValidationError, choice, number, text
 
 logger = logging.getLogger(__name__)
 
+WIND_DOWN_S = 5.0
+"""How much longer than its duration :meth:`HardwareRobot.run_task` waits for a task to end."""
 
 IDLE_WAIT_S = 1.0
 """How long a read of the state waits for the bus while nothing drives the robot."""
 
 
-class HardwareRobot(Tasks):
+class HardwareRobot(TeleopMixin):
     """Any device with LeRobot's robot interface, driven by tasks, leaders and single actions.
 
     Args:
@@ -62,10 +69,21 @@ class HardwareRobot(Tasks):
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
         asked = ("release" if configured_level() == "limp" else "hold") if stop_level is None else stop_level
         level = cast(StopLevel, choice("stop_level", asked, STOP_LEVELS))
-        super().__init__(DeviceBody(name, device, joint_ranges, level), number("control_hz", rate, low=1, high=2000))
+        self.tool_name_str = name
+        self.control_hz = number("control_hz", rate, low=1, high=2000)
         self.device = device
+        self.gate = MotionGate()
+        self.starting = threading.RLock()
+        self.observers = RolloutObservers()
+        self._body = DeviceBody(name, device, joint_ranges, level)
+        self._task: Rollout | None = None
+        self._waiting = Waiting()
         self._sends: set[Permit] = set()
         self._unread = ""
+        self._ready, self._readying = False, threading.Lock()
+        self._moved: dict[str, None] = {}
+        self._halting: dict[str, None] = {}
+        self._frozen_at = -1
 
     @property
     def safety_key(self) -> str:
@@ -82,10 +100,12 @@ class HardwareRobot(Tasks):
         Raises what the device raises.
         """
         self._body.connect()
-        self._freezer.ready()
+        self._stand_by()
         if self.gate.refusal("connect") is not None:
             # The halt found no port: a servo that is back goes on to its last goal.
-            self._freezer.freeze(ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S"))
+            verdict = self.halt("it is locked and connected again")
+            if not verdict.stopped:
+                raise ConnectionError(f"{self.tool_name_str} is locked: {verdict.envelope()['reason']}")
 
     def get_features(self) -> Envelope:
         """``observation_features`` and ``action_features`` as data (``float``, or an image's shape), with ranges."""
@@ -161,7 +181,7 @@ class HardwareRobot(Tasks):
         try:
             permit = self.gate.permit("send_action")
             with self.starting:
-                self._freezer.ready()
+                self._stand_by()
                 self._free()
                 targets = checked_action(dict(action) if isinstance(action, Mapping) else action, self._body.bounds)
             self._sends.add(permit)
@@ -179,35 +199,137 @@ class HardwareRobot(Tasks):
             return error(str(exc) if isinstance(exc, ValidationError) else f"{type(exc).__name__}: {exc}")
         return success(f"Sent {len(targets)} targets.", sent=dict(sent))
 
+    def body(self, robot_name: str | None = None) -> DeviceBody:
+        """The one body of this robot, by its name or without one."""
+        if robot_name not in (None, "", self.tool_name_str):
+            raise ValidationError(f"robot_name must be {self.tool_name_str}, not {robot_name!r}.")
+        return self._body
+
+    def subscribe(self, observer: Observer) -> Unsubscribe:
+        """Tell ``observer`` of every task event until the returned callable is called."""
+        return self.observers.subscribe(observer)
+
+    def start_task(
+        self,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        policy_port: int = 0,
+        **policy: Any,
+    ) -> Envelope:
+        """Start a task and return at once; refused while something drives the robot.
+
+        Args:
+            instruction: what it shall do, 1 to 2000 characters.
+            policy_provider: a registered policy, such as mock, remote or lerobot_local.
+            duration: seconds, above 0 up to a day.
+            policy_port: port of the policy's server; 0 for the provider's own.
+            policy: what that policy's constructor takes besides, ``control_frequency`` (Hz, at most the robot's rate)
+                and ``n_steps`` (actions after which it ends).
+        """
+        task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+        if isinstance(task, dict):
+            return task
+        return success(
+            f"{self.tool_name_str} started: {task.instruction}",
+            task_status="running",
+            instruction=task.instruction,
+            policy=task.policy_name,
+            duration=task.duration,
+        )
+
+    def run_task(
+        self,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        policy_port: int = 0,
+        **policy: Any,
+    ) -> Envelope:
+        """The same, but wait for the end; an error when the policy failed or did not end in its time."""
+        task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+        if isinstance(task, dict):
+            return task
+        if not task.join((task.duration or 0.0) + WIND_DOWN_S):
+            task.request_stop()
+            return error(f"The task was still running {WIND_DOWN_S:g} s after its time.", **self._task_fields())
+        if task.state == "error":
+            return error(f"The task failed: {task.error}", **self._task_fields())
+        return success(f"The task {task.state} after {task.step_count} steps.", **self._task_fields())
+
+    def stop_task(self) -> Envelope:
+        """Stop the task and freeze the robot; ``stopped`` is false when the loop outlived the halt deadline."""
+        self._waiting.void()
+        task = self._task
+        if task is None or not task.running:
+            return success("No task runs.", stopped=True, was_running=False, **self._task_fields())
+        task.request_stop()
+        verdict = stop_executor().halt(_TaskStop(self._body, task), self.tool_name_str, "stop_task")
+        fields = {"stopped": bool(verdict.stopped), "was_running": True, **self._task_fields()}
+        if verdict.stopped:
+            return success(f"Stopped after {task.step_count} steps.", **fields)
+        return error(next(iter([*verdict.not_stopped.values(), *verdict.unknown.values()])), **fields)
+
+    def get_task_status(self) -> Envelope:
+        """``task_status`` (idle, running, completed, stopped, error), ``instruction``, ``policy``, ``step_count``,
+        ``duration`` (seconds it has taken) and ``error`` of the current or last task."""
+        fields = self._task_fields()
+        return success(f"Task {fields['task_status']} after {fields['step_count']} steps.", **fields)
+
+    def occupied(self, robot: str) -> str:
+        """The running task, for a refusal; empty when none runs."""
+        task = self._task
+        return f"the task {task.instruction!r}" if task is not None and task.running else ""
+
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop tasks, leaders and single actions, and freeze the robot; answers within ``STRANDS_HALT_DEADLINE_S``.
 
-        Every permit is void first. A verdict of stopped means: no write is in flight, none will follow until
-        somebody starts anew, and the robot was frozen. A bus that does not answer is ``not_stopped``.
+        Every permit is void first. A verdict of stopped means: no write is in flight, none will follow until a motion
+        is started anew, and the robot was frozen. A bus that does not answer is ``not_stopped``, and the robot is
+        frozen as soon as it does.
         """
-        began = time.monotonic()
-        deadline = began + ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
-        sending = bool(self._sends)
+        # Before the permits are void: a loop that finds its permit void ends by itself, and was halted all the same.
+        self._moved.update(dict.fromkeys(self._moving()))
+        return stop_executor().halt(self, self.tool_name_str, reason)
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
+        """Halt on the calling thread, the stop executor's; returns by ``deadline`` unless the bus blocks."""
+        ordered = self.gate.generation
+        moved = self._halting = dict.fromkeys([*self._moved, *self._moving()])
+        self._moved = {}
         self.gate.revoke()
-        sources: dict[str, Callable[[], object]] = {}
-        task = self._task
-        if task is not None and task.running:
-            task.request_stop()
-            sources["task"] = partial(task.ended_by, deadline)
-        sources.update(self.teleop_stops(deadline))
-        if sending:
-            sources["send_action"] = lambda: success("Sent.", stopped=True)
-        problem = self._freeze(deadline)
-        verdict = halt_each(sources) if problem is None else _unfrozen(problem, tuple(sources))
+        ends = self._ends(deadline)
+        try:
+            with self._body.stopping():
+                seen = self.gate.generation
+                # A halt that waited for the bus when this one was ordered has frozen the robot for both.
+                if ordered != self._frozen_at or self._body.driven:
+                    self._body.stop()
+                    self._frozen_at = seen
+        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
+            verdict = _unfrozen(_failure(self.tool_name_str, exc), moved)
+        else:
+            verdict = halt_each({**dict.fromkeys(moved, _stopped), **ends})
+        finally:
+            self._halting = {}
         logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
-        return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
+        return verdict
+
+    def unanswered(self, why: str) -> StopVerdict:
+        """Return what is known while the bus does not answer: what moved may move on; a robot at rest is unknown."""
+        if self._frozen_at == self.gate.generation:
+            return halt_each(self._ends(time.monotonic()))
+        return _unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
 
     def cleanup(self) -> Envelope:
         """Halt and disconnect. A robot that did not stop stays connected, so that it can still be stopped."""
         verdict = self.halt("cleanup")
         if not verdict.stopped:
             return verdict.envelope()
-        self._freezer.close()
+        with self._readying:
+            if self._ready:
+                stop_executor().detach(self)
+                self._ready = False
         if self._body.is_connected:
             try:
                 with self._body.lock:
@@ -216,6 +338,89 @@ class HardwareRobot(Tasks):
                 logger.exception("%s did not disconnect.", self.tool_name_str)
                 return error(f"Halted, but the device did not disconnect: {type(exc).__name__}: {exc}")
         return success("Halted and disconnected.", stopped=True)
+
+    def _stand_by(self) -> None:
+        """Have a thread ready for this robot's stops from before its first motion; cheap when there is one."""
+        with self._readying:
+            if not self._ready:
+                stop_executor().attach(self, self.tool_name_str)
+                self._ready = True
+
+    def _moving(self) -> list[str]:
+        task = ["task"] if self.occupied(self.tool_name_str) else []
+        return task + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
+
+    def _ends(self, deadline: float) -> dict[str, Callable[[], object]]:
+        """Ask every loop to end; how to wait for each."""
+        ends: dict[str, Callable[[], object]] = {}
+        task = self._task
+        if task is not None and task.running:
+            task.request_stop()
+            ends["task"] = partial(task.ended_by, deadline)
+        return ends | self.teleop_stops(deadline)
+
+    def _start(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout | Envelope:
+        try:
+            return self._begin(instruction, provider, duration, options)
+        except MotionRefused as refused:
+            return refused.envelope
+        except (ValidationError, MissingExtraError) as exc:
+            return error(str(exc))
+
+    def _begin(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
+        chosen = rollout_options(instruction, duration, options, self.control_hz)
+        name = resolve_provider(provider)
+        # Before the line for the robot: a stop that comes while this waits, connects or loads is newer.
+        permit = self.gate.permit("start_task")
+        with self._waiting.until_begun(permit), self.starting:
+            permit.check()
+            self._stand_by()
+            self._free()
+            self._reconnect()
+            if not self._body.is_connected:
+                raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
+            policy = create_policy(name, **options)
+            permit.check()
+            rollout = Rollout(
+                self._body,
+                policy,
+                permit=permit,
+                policy_name=name,
+                observers=self.observers,
+                **chosen,
+            )
+            self._task = rollout
+            rollout.start()
+            return rollout
+
+    def _reconnect(self) -> None:
+        """Whoever asks for a motion after the cable was out gets the robot back, if the port is."""
+        if not self._body.lost:
+            return
+        try:
+            self._body.connect()
+        except Exception as exc:
+            raise ValidationError(
+                f"{self.tool_name_str} lost its port and could not be connected again: {type(exc).__name__}: {exc}."
+            ) from exc
+        logger.warning("%s lost its port and is connected again.", self.tool_name_str)
+
+    def _free(self) -> None:
+        leader = self.teleoperated_by(self.tool_name_str)
+        busy = self.occupied(self.tool_name_str) or (f"the leader {leader}" if leader else "")
+        if busy:
+            raise ValidationError(f"{self.tool_name_str} is driven by {busy}; stop that first.")
+
+    def _task_fields(self) -> dict[str, Any]:
+        task = self._task
+        return {
+            "task_status": "idle" if task is None else task.state,
+            "instruction": "" if task is None else task.instruction,
+            "policy": "" if task is None else task.policy_name,
+            "step_count": 0 if task is None else task.step_count,
+            "duration": 0.0 if task is None else round(task.elapsed_s, 3),
+            "error": "" if task is None else task.error,
+        }
 
     def _refresh(self) -> str:
         if joint_read_source(self) is None or not self._body.is_connected:
@@ -248,8 +453,36 @@ class HardwareRobot(Tasks):
         return ""
 
 
-def _unfrozen(problem: str, moving: tuple[str, ...]) -> StopVerdict:
-    """What moved may move on; of a robot that stood still nobody knows."""
+@dataclass(frozen=True)
+class _TaskStop:
+    """Stops a task that was asked to end, and leaves what waits to start."""
+
+    body: DeviceBody
+    task: Rollout
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
+        try:
+            self.body.stop()
+        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
+            return self.unanswered(_failure(self.body.name, exc))
+        return halt_each({"task": partial(self.task.ended_by, deadline)})
+
+    def unanswered(self, why: str) -> StopVerdict:
+        return StopVerdict(not_stopped={"task": why})
+
+
+def _failure(name: str, exc: Exception) -> str:
+    problem = f"it could not be frozen: {type(exc).__name__}: {exc}"
+    logger.critical("%s did not stop: %s", name, problem)
+    return problem
+
+
+def _stopped() -> Envelope:
+    return success("Stopped.", stopped=True)
+
+
+def _unfrozen(problem: str, moving: Mapping[str, None]) -> StopVerdict:
+    """Return the verdict on a robot that may not be frozen: what moved may move on; at rest it is unknown."""
     return StopVerdict(not_stopped=dict.fromkeys(moving, problem), unknown={} if moving else {"bus": problem})
 
 

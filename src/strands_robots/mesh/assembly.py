@@ -33,10 +33,9 @@ from strands_robots.mesh.transport import Transport
 from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
 from strands_robots.mesh.wire_identity import Identity, signature_policy
 from strands_robots.recording.cameras import frames_of
-from strands_robots.safety.halting import halt_of
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.stopping import StopVerdict, verdict_of
 
 if TYPE_CHECKING:
     from strands_robots.mesh.core import Mesh
@@ -189,7 +188,7 @@ def assemble(mesh: Mesh, parts: Parts, before: Assembled | None = None) -> Assem
     inputs: dict[str, dict[str, Any]] = {}
 
     def halt(reason: str) -> StopVerdict:
-        return halt_of(robot, peer, reason) if robot is not None else StopVerdict()
+        return verdict_of(lambda: robot.halt(reason), peer) if robot is not None else StopVerdict()
 
     dispatcher = Dispatcher(robot, halt, closing=lambda: not context.running())
     desk = {

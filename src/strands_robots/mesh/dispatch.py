@@ -12,8 +12,7 @@ from strands_robots.bus_access import read_joints
 from strands_robots.contract import RUNNING, RolloutEvent, TaskRobot, WorldRobot, adapt
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mesh.security import policy_host_refusal
-from strands_robots.safety.halting import verdict_of
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.stopping import StopVerdict, verdict_of
 
 logger = logging.getLogger(__name__)
 

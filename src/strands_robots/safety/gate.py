@@ -9,7 +9,7 @@ action reaches the device. Revoking is one assignment: it takes no lock and cann
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from itertools import count
 from typing import Protocol
@@ -121,6 +121,8 @@ class MotionGate:
         self._numbers = count(1)
         self._generation = 0
         self._here = threading.local()
+        self._watchers: tuple[Callable[[], None], ...] = ()
+        self._given = False
 
     @property
     def generation(self) -> int:
@@ -142,6 +144,19 @@ class MotionGate:
         """Ask ``latch`` no more."""
         with self._attaching:
             self._latches = tuple(each for each in self._latches if each is not latch)
+
+    def watch(self, begins: Callable[[], None]) -> Callable[[], None]:
+        """Call ``begins`` before each permit is given, and now where one was given before; return what ends that."""
+        with self._attaching:
+            self._watchers = (*self._watchers, begins)
+        if self._given:
+            begins()
+
+        def unwatch() -> None:
+            with self._attaching:
+                self._watchers = tuple(each for each in self._watchers if each is not begins)
+
+        return unwatch
 
     def asked(self) -> Asked:
         """A call that asks for motion now; for :meth:`asked_at` when its turn comes."""
@@ -173,6 +188,9 @@ class MotionGate:
         refusal = self._refusal(verb, asked)
         if refusal is not None:
             raise MotionRefused(refusal)
+        self._given = True
+        for begins in self._watchers:
+            begins()
         return permit
 
     def revoke(self) -> None:

@@ -7,23 +7,24 @@ import logging
 import threading
 import time
 from collections.abc import Iterable
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.audit import log_safety_event
-from strands_robots.contract import Haltable, body_of
+from strands_robots.contract import Haltable, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceDesk
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.halting import HaltWorker
 from strands_robots.safety.latch import LockoutLatch
 from strands_robots.safety.lockout import Cleared, Hold, LockoutState
 from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
 from strands_robots.safety.persistence import Kept, LockoutStore
 from strands_robots.safety.reporting import OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.stop_executor import StopExecutor, stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, identifier, shown
 
@@ -53,11 +54,16 @@ class Registered:
         self.users = 1
         self.gates: tuple[MotionGate, ...] = (robot.gate,)
         self.latch = LockoutLatch(wire_id, kept.state, kept.seen)
-        self.worker = HaltWorker(robot, robot_id)
         self.on_disk = kept.state
         self.verifier = ResumeVerifier([wire_id])
         self.reports: dict[str, RobotReport] = {}
         self._plane = plane
+        self._ready, self._readying = False, threading.Lock()
+        # A world that has not moved yet shares the threads of the reserve: a hundred of them need no hundred threads.
+        plane.executor.prepare()
+        if not isinstance(robot, WorldRobot):
+            self._stand_by()
+        self._unwatch = robot.gate.watch(self._stand_by)
 
     @property
     def locked(self) -> bool:
@@ -92,9 +98,25 @@ class Registered:
         for gate in self.gates:
             gate.revoke()
         logger.warning("%s comes up locked: epochs %s.", self.robot_id, ", ".join(self.epochs))
-        self.worker.halt("it comes up locked", self._came_up)
+        halted = self._plane.executor.submit(self.robot, self.robot_id, "it comes up locked")
+        halted.add_done_callback(self._came_up)
 
-    def _came_up(self, verdict: StopVerdict) -> None:
+    def leave_executor(self) -> None:
+        """Give up the ready thread; a halt under way is waited for, for a second."""
+        self._unwatch()
+        with self._readying:
+            ready, self._ready = self._ready, True
+        if ready:
+            self._plane.executor.detach(self.robot, wait=1.0)
+
+    def _stand_by(self) -> None:
+        with self._readying:
+            if not self._ready:
+                self._plane.executor.attach(self.robot, self.robot_id)
+                self._ready = True
+
+    def _came_up(self, halted: Future[StopVerdict]) -> None:
+        verdict = halted.result()
         if verdict.stopped is not True:
             logger.critical("%s comes up locked and DID NOT STOP: %s", self.robot_id, verdict.envelope().get("reason"))
 
@@ -111,11 +133,18 @@ class SafetyPlane:
     Args:
         store: where lockouts are kept.
         deadline_s: seconds a robot has to halt; ``STRANDS_HALT_DEADLINE_S`` by default, read at each stop.
+        executor: halts the robots; the process's by default.
     """
 
-    def __init__(self, store: LockoutStore | None = None, deadline_s: float | None = None) -> None:
+    def __init__(
+        self,
+        store: LockoutStore | None = None,
+        deadline_s: float | None = None,
+        executor: StopExecutor | None = None,
+    ) -> None:
         self.store = store or LockoutStore()
         self._deadline_s = deadline_s
+        self._executor = executor
         self._registering = threading.Lock()
         self._keeping = threading.Lock()
         self._robots: dict[str, Registered] = {}
@@ -123,6 +152,11 @@ class SafetyPlane:
         self._issued: dict[str, int] = {}
         self._desk = ClearanceDesk(self.robot_ids, self._clear_one)
         self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
+
+    @property
+    def executor(self) -> StopExecutor:
+        """The executor that halts the robots."""
+        return self._executor or stop_executor()
 
     @property
     def robots(self) -> dict[str, Registered]:
@@ -190,7 +224,7 @@ class SafetyPlane:
                 last, self._reporter = self._reporter, None
         if last is not None:
             last.close()
-        entry.worker.close()
+        entry.leave_executor()
 
     def _inherit(self, entry: Registered) -> None:
         """What a robot was locked by when it left the plane holds it here, though it is on no disk."""
@@ -229,7 +263,7 @@ class SafetyPlane:
         if reporter is None:
             # The last robot is leaving; nobody reports it any more, and it is halted all the same.
             for entry in fresh:
-                entry.worker.halt(order.reason, lambda verdict: None)
+                self.executor.submit(entry.robot, entry.robot_id, order.reason)
         if not fresh or reporter is None:
             self._repeat(order, robots, on_report)
             return None
@@ -248,10 +282,17 @@ class SafetyPlane:
             reported,
             self._record,
             lambda: self._keep(fresh),
-            {name: entry.worker for name, entry in by_id.items()},
         )
+        executor = self.executor
         for entry in fresh:
-            entry.worker.halt(order.reason, functools.partial(reporter.answer, run, entry.robot_id))
+            executor.submit(
+                entry.robot,
+                entry.robot_id,
+                order.reason,
+                within=run.deadline_s,
+                since=order.received,
+                answered=functools.partial(reporter.answer, run, entry.robot_id),
+            )
         reporter.begin(run)
         self._repeat(order, [each for each in robots if each.robot_id not in by_id], on_report)
         return run

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from strands_robots.safety.halting import HaltWorker
 from strands_robots.safety.orders import RobotReport, StopOrder
 from strands_robots.safety.stopping import StopVerdict
 
@@ -42,7 +41,6 @@ class StopRun:
     on_report: OnReport
     on_done: OnDone
     keep: Callable[[], None]
-    workers: dict[str, HaltWorker]
     reports: dict[str, RobotReport] = field(default_factory=dict)
     done: threading.Event = field(default_factory=threading.Event)
     started: float = field(default_factory=time.monotonic)
@@ -163,26 +161,16 @@ class Reporter:
             for robot_id in run.robot_ids:
                 if robot_id in run.answers and robot_id not in run.reports:
                     self._report(run, robot_id)
-        if waiting and now - run.order.received >= run.deadline_s:
-            self._time_out(run)
         if len(run.reports) == len(run.robot_ids):
             self._finish(run)
 
     def _time_out(self, run: StopRun) -> None:
+        """Report the rest as unanswered: nobody will be there to report it when the executor answers."""
         for robot_id in run.robot_ids:
-            if robot_id in run.reports:
-                continue
-            if robot_id not in run.answers:
+            if robot_id not in run.reports:
                 why = {robot_id: f"no answer in {run.deadline_s:g} s"}
-                run.answers[robot_id] = (StopVerdict(not_stopped=why), time.monotonic())
-                self._renew(run, robot_id)
-            self._report(run, robot_id)
-
-    def _renew(self, run: StopRun, robot_id: str) -> None:
-        try:
-            run.workers[robot_id].renew()
-        except RuntimeError as exc:
-            logger.critical("%s is stuck in its halt and no other thread can halt it: %s.", robot_id, exc)
+                run.answers.setdefault(robot_id, (StopVerdict(not_stopped=why), time.monotonic()))
+                self._report(run, robot_id)
 
     def _report(self, run: StopRun, robot_id: str, *, late: bool = False) -> None:
         verdict, at = run.answers[robot_id]

@@ -124,6 +124,25 @@ def explain(answer: object) -> str:
     return f"{outcome.value}: {shown(answer)}"
 
 
+def graded(answer: object, name: str) -> StopVerdict:
+    """Return whatever a stop of ``name`` answered or raised as a verdict."""
+    if isinstance(answer, StopVerdict):
+        return answer
+    outcome = grade(answer)
+    if outcome.stopped:
+        return StopVerdict((name,))
+    why = {name: explain(answer)}
+    return StopVerdict(unknown=why) if outcome.stopped is None else StopVerdict(not_stopped=why)
+
+
+def verdict_of(stop: Callable[[], object], name: str) -> StopVerdict:
+    """Return what ``stop`` answers or raises as a verdict on ``name``."""
+    try:
+        return graded(stop(), name)
+    except Exception as exc:  # noqa: BLE001 - a stop that raises is a robot that may be moving
+        return graded(exc, name)
+
+
 def halt_each(sources: Mapping[str, Callable[[], object]]) -> StopVerdict:
     """Ask every source to stop, in order, whatever the ones before it did, and grade each answer.
 

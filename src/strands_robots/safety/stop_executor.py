@@ -1,0 +1,453 @@
+"""The stop executor: every halt of this process runs here, on a thread that stands ready, within a deadline.
+
+The safety plane, an RPC ``stop``, the mesh's ``stop``, ``HardwareRobot.halt`` and a departing process submit to it.
+:meth:`StopExecutor.submit` takes no lock that is held during a halt, so a robot that blocks delays no other robot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import itertools
+import logging
+import os
+import queue
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future, InvalidStateError
+from dataclasses import dataclass, field, replace
+from typing import Protocol, cast, runtime_checkable
+
+from strands_robots import settings
+from strands_robots.contract import Haltable, body_of
+from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.stopping import StopVerdict, graded
+
+logger = logging.getLogger(__name__)
+
+RESERVE = 3
+"""Threads that stand ready for all targets without a thread of their own."""
+
+WAITING_MAX = 4096
+"""Stops of one target that wait for its next halt. Beyond it the oldest is answered by its deadline alone."""
+
+STUCK_MAX = 8
+"""Threads that one target may keep blocked in its halts before no further thread is given to it."""
+
+DIRECT_SHARE, RETURN_SHARE = 0.9, 0.85
+"""Parts of the deadline after which a direct target is answered for, and by which its halt should return.
+
+The rest is for the verdict to reach the caller in time."""
+
+
+@runtime_checkable
+class DirectTarget(Protocol):
+    """A target whose public ``halt`` goes through the executor, which then calls :meth:`halt_here`.
+
+    It says itself what is known while its halt blocks, and no second thread is started for it meanwhile: whatever
+    blocks the first, such as its bus, would block the second.
+    """
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
+        """Halt on the calling thread and return by ``deadline`` (monotonic seconds), unless the device blocks."""
+
+    def unanswered(self, why: str) -> StopVerdict:
+        """Return the verdict while :meth:`halt_here` has not returned. Must not block."""
+
+
+Target = Haltable | DirectTarget
+Answered = Callable[[StopVerdict], None]
+
+
+@dataclass(eq=False, slots=True)
+class _Stop:
+    """One submitted stop. Times are monotonic seconds."""
+
+    slot: _Slot | None
+    target: Target | None
+    name: str
+    reason: str
+    within: float
+    since: float
+    answered: Answered | None
+    direct: bool = False
+    submitted: float = field(default_factory=time.monotonic)
+    future: Future[StopVerdict] = field(default_factory=Future)
+    answering: threading.Lock = field(default_factory=threading.Lock)
+
+    def moment(self, part: float) -> float:
+        """Return the moment at which ``part`` of the time to halt has passed."""
+        return self.since + part * self.within
+
+    def resolve(self, answer: object) -> None:
+        """Hand out the graded answer of the halt, as a late one where the deadline has passed."""
+        verdict, late = graded(answer, self.name), self.answered
+        # Watched until the deadline, an answered stop must not keep its robot alive.
+        self.slot = self.target = self.answered = None
+        if not self._set(verdict) and late is not None:
+            late(verdict)
+
+    def expire(self) -> bool:
+        """Answer for the target that did not; False where it has answered."""
+        target = self.target
+        if target is None or self.future.done():
+            return False
+        why = f"no answer in {self.within:g} s"
+        verdict = StopVerdict(not_stopped={self.name: why})
+        if isinstance(target, DirectTarget):
+            try:
+                verdict = target.unanswered(why)
+            except Exception:
+                logger.exception("%s could not say what it does while its halt blocks.", self.name)
+        return self._set(verdict)
+
+    def _set(self, verdict: StopVerdict) -> bool:
+        elapsed_ms = (time.monotonic() - self.submitted) * 1000
+        # The callbacks of the first answer have returned before a late one is handed out.
+        with self.answering:
+            try:
+                self.future.set_result(replace(verdict, elapsed_ms=elapsed_ms))
+            except InvalidStateError:
+                return False
+            return True
+
+
+class _Slot:
+    """The halts of one target: those that wait, those that one running halt is for, and the thread that is woken.
+
+    It does not refer to the target; only its stops do.
+    """
+
+    def __init__(self, name: str, wake: queue.SimpleQueue[_Slot | None]) -> None:
+        self.name = name
+        self.wake = wake
+        self.waiting: deque[_Stop] = deque(maxlen=WAITING_MAX)
+        self.running: list[_Stop] | None = None
+        self.changing = threading.Lock()
+        self.owners = 0
+        self.stuck = 0
+        self.thread: threading.Thread | None = None
+
+    def next(self, done: list[_Stop] | None = None) -> list[_Stop] | None:
+        """Take everything that waits, for one halt; None where nothing does or another thread serves the target.
+
+        Args:
+            done: what the calling thread took before.
+        """
+        with self.changing:
+            if self.running is not done:
+                self.stuck -= done is not None
+                return None
+            taken = []
+            while self.waiting:
+                taken.append(self.waiting.popleft())
+            self.running = taken or None
+            return self.running
+
+    def give_up(self, stuck: list[_Stop]) -> bool:
+        """Leave the thread that carries out ``stuck`` to itself; False where it has just returned."""
+        with self.changing:
+            if self.running is not stuck:
+                return False
+            self.running = None
+            self.stuck += 1
+            return True
+
+
+_Wake = queue.SimpleQueue[_Slot | None]
+
+
+class StopExecutor:
+    """Halts robots on threads that stand ready. One per process; every method may be called from any thread.
+
+    A target that was attached owns a thread. All others share :data:`RESERVE` threads, and each that is taken is
+    replaced at once, so that blocked halts never use them up. Stops of one target that arrive while a halt of it runs
+    share the next halt, which begins after them. When a halt misses its deadline, a fresh thread takes over what waits.
+
+    Args:
+        start: starts a thread; a test fails it.
+    """
+
+    def __init__(self, start: Callable[[threading.Thread], None] = threading.Thread.start) -> None:
+        self._start_thread = start
+        self._slots: weakref.WeakValueDictionary[Hashable, _Slot] = weakref.WeakValueDictionary()
+        self._attached: dict[Hashable, tuple[_Slot, object]] = {}
+        self._creating, self._attaching, self._counting = threading.Lock(), threading.Lock(), threading.Lock()
+        self._reserve: _Wake = queue.SimpleQueue()
+        self._idle = 0
+        self._watched: queue.SimpleQueue[_Stop | None] = queue.SimpleQueue()
+        self._watcher: threading.Thread | None = None
+        self._here = threading.local()
+        self._numbers = itertools.count()
+
+    def attach(self, target: Target, name: str) -> None:
+        """Give ``target`` a ready thread, until it was detached as often or is garbage.
+
+        Raises:
+            RuntimeError: no thread can be started.
+        """
+        with self._attaching:
+            self._prepare()
+            slot, key = self._slot(target, name), _key(target)
+            if slot.owners == 0:
+                slot.wake, slot.thread = self._ready_thread(name)
+                # What was submitted to the reserve in between waits at the slot.
+                slot.wake.put(slot)
+                self._attached[key] = (slot, self._end_with(target, key, slot))
+            slot.owners += 1
+
+    def detach(self, target: Target, wait: float = 0.0) -> None:
+        """End the ready thread with the last detach, after what waits; wait for that for ``wait`` seconds.
+
+        A thread that is blocked in a halt is left behind as a daemon.
+        """
+        with self._attaching:
+            slot, end = self._attached.get(_key(target), (None, None))
+            if slot is None:
+                return
+            slot.owners -= 1
+            if slot.owners:
+                return
+            del self._attached[_key(target)]
+            if isinstance(end, weakref.finalize):
+                end.detach()
+            inbox, thread = slot.wake, slot.thread
+            slot.wake, slot.thread = self._reserve, None
+            self._reserve.put(slot)
+            inbox.put(None)
+        if wait and thread is not None and thread is not threading.current_thread():
+            thread.join(wait)
+
+    def prepare(self) -> None:
+        """Have the reserve stand ready for targets that are not attached. Raises RuntimeError like attach."""
+        with self._attaching:
+            self._prepare()
+
+    def submit(
+        self,
+        target: Target,
+        name: str,
+        reason: str,
+        *,
+        within: float | None = None,
+        since: float | None = None,
+        answered: Answered | None = None,
+    ) -> Future[StopVerdict]:
+        """Void the target's permits, order its halt and return at once.
+
+        Args:
+            target: the robot. Wrappers of one robot, and equal frozen dataclasses, are the same target.
+            name: what a verdict calls it where its halt names nothing itself.
+            within: seconds to halt; ``STRANDS_HALT_DEADLINE_S`` by default.
+            since: the moment from which they count, in monotonic seconds; now by default.
+            answered: called with the verdict of the future, and again with that of a halt that returns too late for it.
+
+        Returns:
+            A future of the graded verdict. It is set at the latest when the time is over, and never to an exception.
+        """
+        gate = getattr(target, "gate", None)
+        if isinstance(gate, MotionGate):
+            gate.revoke()
+        limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
+        slot = self._slot(target, name)
+        stop = _Stop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
+        stop.direct = isinstance(target, DirectTarget)
+        stop.future.set_running_or_notify_cancel()
+        if answered is not None:
+            stop.future.add_done_callback(lambda future: answered(future.result()))
+        if slot in getattr(self._here, "serving", ()):
+            # A halt that asks for itself again: this thread is the one that carries it out.
+            self._serve(slot, [stop])
+            return stop.future
+        slot.waiting.append(stop)
+        if self._watcher is None and not self._prepared(name):
+            self._serve(slot)
+            return stop.future
+        slot.wake.put(slot)
+        self._watched.put(stop)
+        return stop.future
+
+    def halt(self, target: Target, name: str, reason: str, *, within: float | None = None) -> StopVerdict:
+        """Halt ``target`` and return its verdict, at the latest when ``within`` is over."""
+        return self.submit(target, name, reason, within=within).result()
+
+    def _slot(self, target: Target, name: str) -> _Slot:
+        key = _key(target)
+        slot = self._slots.get(key)
+        if slot is None:
+            with self._creating:
+                slot = self._slots.get(key)
+                if slot is None:
+                    slot = self._slots[key] = _Slot(name, self._reserve)
+        return slot
+
+    def _ready_thread(self, name: str) -> tuple[_Wake, threading.Thread]:
+        inbox: _Wake = queue.SimpleQueue()
+        thread = threading.Thread(target=self._work, args=(inbox,), name=f"halt-{name}", daemon=True)
+        self._start_thread(thread)
+        return inbox, thread
+
+    def _end_with(self, target: Target, key: Hashable, slot: _Slot) -> object:
+        """Let the thread end with the target, or keep the target alive where it cannot be watched."""
+        body = body_of(target)
+        if key is body:
+            return body
+        try:
+            end = weakref.finalize(body, _end, self._attached, key, slot, self._reserve)
+        except TypeError:
+            return body
+        end.atexit = False
+        return end
+
+    def _work(self, inbox: _Wake) -> None:
+        while (slot := inbox.get()) is not None:
+            self._serve(slot)
+            if slot.wake is not inbox:
+                return
+            del slot
+
+    def _work_in_reserve(self) -> None:
+        while True:
+            slot = self._reserve.get()
+            with self._counting:
+                self._idle -= 1
+            self._watched.put(None)
+            if slot is not None:
+                self._serve(slot)
+            del slot
+            with self._counting:
+                if self._idle >= RESERVE:
+                    return
+                self._idle += 1
+
+    def _serve(self, slot: _Slot, nested: list[_Stop] | None = None) -> None:
+        """Carry out what waits at ``slot`` until nothing does, or until another thread has taken over."""
+        stops = nested or slot.next()
+        while stops is not None:
+            outer = getattr(self._here, "serving", ())
+            self._here.serving = (*outer, slot)
+            answer: object = None
+            try:
+                reason, target = stops[0].reason, stops[0].target
+                if isinstance(target, DirectTarget):
+                    answer = target.halt_here(reason, max(each.moment(RETURN_SHARE) for each in stops))
+                elif target is not None:
+                    answer = target.halt(reason)
+            except BaseException as exc:  # noqa: BLE001 - a stop that raises is a robot that may be moving
+                answer = exc
+            finally:
+                self._here.serving = outer
+            del target
+            for stop in stops:
+                stop.resolve(answer)
+            stops = None if nested else slot.next(stops)
+
+    def _prepared(self, name: str) -> bool:
+        try:
+            self.prepare()
+        except RuntimeError as exc:
+            logger.critical("No thread can be started to halt %s; its halt runs on the caller's: %s.", name, exc)
+            return False
+        return True
+
+    def _prepare(self) -> None:
+        if self._watcher is None:
+            self._refill()
+            watcher = threading.Thread(target=self._watch, name="halt-deadlines", daemon=True)
+            self._start_thread(watcher)
+            self._watcher = watcher
+
+    def _refill(self) -> None:
+        while self._idle < RESERVE:
+            name = f"halt-reserve-{next(self._numbers)}"
+            thread = threading.Thread(target=self._work_in_reserve, name=name, daemon=True)
+            self._start_thread(thread)
+            with self._counting:
+                self._idle += 1
+
+    def _watch(self) -> None:
+        """Answer for every halt that misses its deadline, and keep the reserve full. Never on a stop's way."""
+        due: list[tuple[float, int, _Stop]] = []
+        while True:
+            try:
+                self._take_new(due)
+                self._refill()
+            except RuntimeError as exc:
+                logger.critical("No thread can be started for stops of robots that block their halts: %s.", exc)
+            late = []
+            while due and due[0][0] <= time.monotonic():
+                stop = heapq.heappop(due)[2]
+                if stop.expire():
+                    late.append(stop)
+            for stop in late:
+                self._renew(stop)
+
+    def _take_new(self, due: list[tuple[float, int, _Stop]]) -> None:
+        """Wait for a stop, a taken thread of the reserve or the next deadline."""
+        timeout = max(0.0, due[0][0] - time.monotonic()) if due else None
+        with contextlib.suppress(queue.Empty):
+            stop = self._watched.get(timeout=timeout)
+            for _ in range(self._watched.qsize() + 1):
+                if stop is not None:
+                    at = stop.moment(DIRECT_SHARE if stop.direct else 1.0)
+                    heapq.heappush(due, (at, next(self._numbers), stop))
+                stop = self._watched.get_nowait()
+
+    def _renew(self, stop: _Stop) -> None:
+        """Let a fresh thread take over what waits behind a halt that missed its deadline."""
+        slot = stop.slot
+        if slot is None or stop.direct:
+            return
+        stuck = slot.running
+        if stuck is None or not any(each.future.done() for each in stuck):
+            return
+        if slot.stuck >= STUCK_MAX:
+            logger.critical("%s is stuck in its halt, and so are %d threads of it.", stop.name, slot.stuck)
+            return
+        try:
+            with self._attaching:
+                fresh = self._ready_thread(stop.name) if slot.owners else None
+                if not slot.give_up(stuck):
+                    if fresh is not None:
+                        fresh[0].put(None)
+                    return
+                if fresh is not None:
+                    slot.wake, slot.thread = fresh
+            slot.wake.put(slot)
+        except RuntimeError as exc:
+            logger.critical("%s is stuck in its halt and no other thread can halt it: %s.", stop.name, exc)
+
+
+def _key(target: Target) -> Hashable:
+    """Return what is equal for the same target: a frozen dataclass itself, else the identity of its body."""
+    body = body_of(target)
+    params = getattr(type(body), "__dataclass_params__", None)
+    by_value = params is not None and params.frozen and params.eq
+    return cast(Hashable, body) if by_value else id(body)
+
+
+def _end(attached: dict[Hashable, tuple[_Slot, object]], key: Hashable, slot: _Slot, reserve: _Wake) -> None:
+    # Called by the garbage collector, on any thread: it may take no lock.
+    attached.pop(key, None)
+    inbox, slot.wake, slot.owners = slot.wake, reserve, 0
+    inbox.put(None)
+
+
+class _OfProcess:
+    executor = StopExecutor()
+
+    @classmethod
+    def renew(cls) -> None:
+        """Start anew in a forked child, which has none of its parent's threads."""
+        cls.executor = StopExecutor()
+
+
+os.register_at_fork(after_in_child=_OfProcess.renew)
+
+
+def stop_executor() -> StopExecutor:
+    """Return the executor of this process."""
+    return _OfProcess.executor
