@@ -1,4 +1,4 @@
-"""The factory: a running robot by its name, or one sentence that says why not."""
+"""The factory: a running robot by its name, or a refusal that gives the reason."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Registry:
 
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[_Config]]:
-    """A package with the three names of ``lerobot.robots`` that the factory uses."""
+    """A stand-in for ``lerobot.robots`` with the three names that the factory uses."""
     configs: list[_Config] = []
 
     def make(config: _Config) -> RecordingDevice:
@@ -49,7 +49,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[_Config]]:
     return configs
 
 
-def test_a_name_is_a_running_simulation_with_that_robot_in_it() -> None:
+def test_name_makes_a_running_simulation_with_that_robot() -> None:
     robot = Robot("so100", peer_id="bench-1")
     try:
         assert isinstance(robot, Simulation)
@@ -77,17 +77,17 @@ def test_a_name_is_a_running_simulation_with_that_robot_in_it() -> None:
     ],
     ids=str,
 )
-def test_what_cannot_be_made_is_refused_by_name(arguments: dict[str, Any], words: str) -> None:
+def test_bad_argument_is_refused_by_name(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         Robot(**arguments)
 
 
-def test_a_real_robot_without_lerobot_is_one_sentence() -> None:
+def test_missing_lerobot_is_reported_with_the_extra() -> None:
     with pytest.raises(MissingExtraError, match=r"\[lerobot\] extra"):
         Robot("so100", mode="real")
 
 
-def test_a_real_robot_is_built_configured_and_connected_without_calibration(stand_in: list[_Config]) -> None:
+def test_real_robot_is_configured_and_connected_without_calibration(stand_in: list[_Config]) -> None:
     robot = Robot("so100", mode="real", port="/dev/ttyACM0", control_hz=100)
     assert isinstance(robot, HardwareRobot)
     assert isinstance(robot, TaskRobot)
@@ -97,14 +97,14 @@ def test_a_real_robot_is_built_configured_and_connected_without_calibration(stan
     robot.cleanup()
 
 
-def test_an_unknown_real_robot_lists_the_near_ones(stand_in: list[_Config]) -> None:
+def test_unknown_real_robot_is_refused_with_similar_names(stand_in: list[_Config]) -> None:
     with pytest.raises(ValidationError, match="near it: so100_follower"):
         Robot("so100_folower", mode="real")
     with pytest.raises(ValidationError, match="do not configure"):
         Robot("lekiwi", mode="real", speed=3)
 
 
-def test_the_package_imports_without_what_is_heavy() -> None:
+def test_package_import_loads_no_heavy_module() -> None:
     code = (
         "import sys, strands_robots; assert strands_robots.__version__;"
         "heavy = {'numpy', 'mujoco', 'zenoh', 'nats', 'pydantic', 'websockets', 'device_connect_edge'};"
@@ -114,7 +114,7 @@ def test_the_package_imports_without_what_is_heavy() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
 
 
-def test_every_public_name_is_there_and_no_other() -> None:
+def test_every_public_name_exists_and_no_other() -> None:
     for name in strands_robots.__all__:
         assert getattr(strands_robots, name) is not None
     assert dir(strands_robots) == sorted(strands_robots.__all__)

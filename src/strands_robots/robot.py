@@ -1,4 +1,4 @@
-"""``Robot(name)``: a running robot by its name, simulated or real, and ``run``, which serves it until a signal."""
+"""The factory ``Robot(name)`` for simulated and real robots, and ``run``, which serves a robot until a signal."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,16 @@ from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import ValidationError, choice, device_id, identifier, missing_extra, shown
+from strands_robots.utils import ValidationError, choice, device_id, identifier, shown
 
 logger = logging.getLogger(__name__)
 
-_SIM_PACKAGES = ("mujoco", "numpy", "PIL")
-
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
-"""The code of the refusal of a simulated robot whose model is not known, or cannot be had."""
+"""Error code for a simulated robot whose model is unknown or cannot be loaded."""
 
 
 class Networked:
-    """What :func:`Robot` adds to a robot: its place on the networks."""
+    """Network identity and mesh peer that :func:`Robot` adds to a robot's class."""
 
     peer_id: str | None = None
     mesh: Any = None
@@ -37,11 +36,11 @@ class Networked:
         return run(self, **{"peer_id": self.peer_id, **options})
 
     def cleanup(self) -> Any:
-        """Leave the mesh, then halt and let go of everything."""
+        """Leave the mesh, then halt the robot and free everything."""
         peer, self.mesh = self.mesh, None
         if peer is not None:
             peer.stop()
-        return super().cleanup()  # type: ignore[misc]  # the robot class stands behind this one
+        return super().cleanup()  # type: ignore[misc]  # the robot class is the next base
 
 
 def Robot(  # the factory reads as the class it stands for
@@ -53,25 +52,25 @@ def Robot(  # the factory reads as the class it stands for
     mesh: bool | None = None,
     **options: Any,
 ) -> Any:
-    """A running robot.
+    """Make a running robot.
 
     Args:
         name: in simulation a model: ``so100``, ``so101``, ``rover``, the path of an MJCF or URDF file, or a
             ``robot_descriptions`` name. Real: a LeRobot robot type, such as ``so100_follower`` or ``so100``, or
             ``reachy_mini``.
         mode: ``sim`` (MuJoCo, moving in real time) or ``real`` (a LeRobot device, connected without calibration).
-        tool_name: what it is called on a network; the robot's name by default.
+        tool_name: its name on a network; the robot's name by default.
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
-        options: ``sim``: what ``Simulation`` takes (``timestep``, ``gravity``, ``realtime``). ``real``:
+        options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``). ``real``:
             ``control_hz``, ``joint_ranges``, ``stop_level``, and every other one goes to the LeRobot
             configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
             dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
-            ``reachy_mini``: ``host`` (looked for on the local network when there is none) and what
-            ``ReachyDriver`` takes.
+            ``reachy_mini``: ``host`` (by default searched on the local network) and the arguments of
+            ``ReachyDriver``.
 
     Raises:
-        ValidationError: an unknown name (the sentence lists the near ones) or an option outside its domain.
+        ValidationError: an unknown name (the message lists similar ones) or an option outside its domain.
         MissingExtraError: the [sim] or [lerobot] extra, or that of the mesh, is not installed.
         ConnectionError: a real robot could not be connected.
     """
@@ -98,19 +97,19 @@ def run(
     until: threading.Event | None = None,
     **network: Any,
 ) -> StopVerdict:
-    """Serve ``robot`` on Device Connect until SIGINT, SIGTERM or ``until``; then halt it first, and say so.
+    """Serve ``robot`` on Device Connect until SIGINT, SIGTERM or ``until``, then halt it and leave the network.
 
-    Without a network in the arguments or the environment it is served on this machine alone. Called outside the
-    main thread there are no signals, and ``until`` is needed.
+    Without a network in the arguments or the environment it is served on this machine alone. Outside the main
+    thread there are no signals, so ``until`` is needed.
 
     Args:
-        robot: any robot that ``init_device_connect`` takes.
+        robot: any robot that ``init_device_connect`` accepts.
         peer_id: its id, without dots; made from its name by default.
         until: ends the serving as a signal does.
-        network: what else ``init_device_connect`` takes, such as ``messaging_url`` and ``allow_insecure``.
+        network: other arguments of ``init_device_connect``, such as ``messaging_url`` and ``allow_insecure``.
 
     Returns:
-        What the halt did.
+        The verdict of the halt.
     """
     from strands_robots import device_connect  # noqa: PLC0415 - the network is loaded when it is used
     from strands_robots.device_connect.links import usual_link  # noqa: PLC0415
@@ -121,60 +120,35 @@ def run(
         network["link"] = usual_link(network.get("tenant"))
     body = robot if callable(getattr(robot, "halt", None)) else adapt(robot)
     verdict = StopVerdict()
-    # Who waits for Ctrl-C sits at a terminal and is told there, whatever the program does about logging.
-    tell: Callable[[str], None] = _say if until is None else logger.info
-    with _signals(until) as asked:
+    # A user who waits for Ctrl-C reads the terminal, whatever the program does about logging.
+    report: Callable[[str], None] = _print_to_terminal if until is None else logger.info
+    with device_connect.StopSignal() if until is None else nullcontext(until) as stop:
         runtime = device_connect.init_device_connect_sync(robot, peer_id=peer_id, **network)
-        tell(f"Serving {runtime.device_id}; Ctrl-C stops the robot first.")
+        report(f"Serving {runtime.device_id}; Ctrl-C stops the robot first.")
         try:
-            asked.wait()
+            stop.wait()
         finally:
             free = put_away(getattr(body, "robot", body))
             verdict = body.halt("run ended")
-            told = text_of(verdict.envelope())
+            summary = text_of(verdict.envelope())
             if verdict.stopped is True:
-                tell(told)
+                report(summary)
             else:
-                logger.critical("%s", told)
+                logger.critical("%s", summary)
             device_connect.stop_device_connect(runtime)
             free()
     return verdict
 
 
-def _say(text: str) -> None:
+def _print_to_terminal(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-class _Until:
-    """An event of the caller's in the place of the signals."""
-
-    def __init__(self, event: threading.Event) -> None:
-        self._event = event
-
-    def __enter__(self) -> threading.Event:
-        return self._event
-
-    def __exit__(self, *exc: object) -> None:
-        """Nothing to put back."""
-
-
-def _signals(until: threading.Event | None) -> Any:
-    if until is not None:
-        return _Until(until)
-    from strands_robots.device_connect import StopSignal  # noqa: PLC0415 - as above
-
-    return StopSignal()
-
-
 def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
-    try:
-        made = _simulation_class()
-    except ModuleNotFoundError as exc:
-        if (exc.name or "").partition(".")[0] in _SIM_PACKAGES:
-            raise missing_extra("A simulated robot", "sim") from exc
-        raise
+    from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
+
     label = _label(name)
-    simulation = _made(made, tool_name=tool_name or label, **options)
+    simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)
     answer = simulation.add_robot(label, model=name)
     if is_error(answer):
         simulation.cleanup()
@@ -185,10 +159,12 @@ def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any
 def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
     if name == "reachy_mini":
         return _reachy(tool_name, options)
-    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - real hardware only
+    from strands_robots.hardware import HardwareRobot  # noqa: PLC0415 - real hardware only
+    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - as above
 
-    ours = {key: options.pop(key) for key in ("control_hz", "joint_ranges", "stop_level") if key in options}
-    robot = _made(_hardware_class(), make_device(name, options), tool_name=tool_name or _label(name), **ours)
+    own = {key: options.pop(key) for key in ("control_hz", "joint_ranges", "stop_level") if key in options}
+    device = make_device(name, options)
+    robot = _construct(_networked(HardwareRobot), device, tool_name=tool_name or _label(name), **own)
     try:
         robot.connect()
     except Exception as exc:
@@ -197,37 +173,22 @@ def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
 
 
 def _reachy(tool_name: str | None, options: dict[str, Any]) -> Any:
+    from strands_robots.drivers.reachy import ReachyDriver  # noqa: PLC0415 - as above
     from strands_robots.drivers.reachy.discovery import make_reachy  # noqa: PLC0415 - as above
 
-    robot = _made(make_reachy, driver=_reachy_class(), **options)
+    robot = _construct(make_reachy, driver=_networked(ReachyDriver), **options)
     robot.tool_name_str = tool_name or robot.tool_name_str
-    # A daemon that is away is connected to when it appears.
+    # The connection is made when the daemon appears.
     robot.connection.start()
     return robot
 
 
 @cache
-def _simulation_class() -> type[Any]:
-    from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
-
-    return type("Robot", (Networked, Simulation), {"__doc__": Simulation.__doc__})
+def _networked(robot_class: type[Any]) -> type[Any]:
+    return type("Robot", (Networked, robot_class), {"__doc__": robot_class.__doc__})
 
 
-@cache
-def _hardware_class() -> type[Any]:
-    from strands_robots.hardware import HardwareRobot  # noqa: PLC0415 - real hardware only
-
-    return type("Robot", (Networked, HardwareRobot), {"__doc__": HardwareRobot.__doc__})
-
-
-@cache
-def _reachy_class() -> type[Any]:
-    from strands_robots.drivers.reachy import ReachyDriver  # noqa: PLC0415 - real hardware only
-
-    return type("Robot", (Networked, ReachyDriver), {"__doc__": ReachyDriver.__doc__})
-
-
-def _made(factory: Callable[..., Any], *args: Any, **options: Any) -> Any:
+def _construct(factory: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
         return factory(*args, **options)
     except TypeError as exc:

@@ -13,11 +13,11 @@ from fixtures.bodies import ScriptedPolicy
 from fixtures.devices import BlindDevice, FailingDevice, RecordingDevice, WedgingDevice
 from fixtures.waiting import eventually
 
+from strands_robots import policies
 from strands_robots.contract import RolloutEvent, TaskRobot
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware import robot as robots
-from strands_robots.policies import registry
 from strands_robots.teleoperators.leader import ScriptedLeader
 from strands_robots.utils import ValidationError
 
@@ -133,7 +133,8 @@ def test_a_stop_of_a_loop_that_outlives_it_says_stopped_false(
 
     # The policy has not returned by then; the bus has frozen the robot long before.
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "2")
-    monkeypatch.setattr(registry, "_factory", lambda name: lambda: ScriptedPolicy([{"pan.pos": 5.0}], always=think))
+    thinking = ScriptedPolicy([{"pan.pos": 5.0}], always=think)
+    monkeypatch.setattr(policies, "policy_factory", lambda name: lambda: thinking)
     robot.start_task("think")
     assert thinks.wait(20)
     answer = robot.stop_task()

@@ -29,7 +29,7 @@ ARM = {"pan": (-1.0, 1.0), "free": (-math.inf, math.inf)}
 
 
 class Server:
-    """The reference server as a process of its own."""
+    """The reference server in its own process."""
 
     def __init__(self, port: int) -> None:
         self.port = port
@@ -58,14 +58,14 @@ def server() -> Iterator[Server]:
 
 @contextmanager
 def answering(answer: Callable[[dict[str, Any]], Any]) -> Iterator[int]:
-    """A server in this process: ``answer`` gives the reply to each act, or a frame as it is."""
+    """A server in this process: ``answer`` returns the reply to each act, or a raw frame."""
 
     def attend(connection: ServerConnection) -> None:
         for frame in connection:
             message = json.loads(frame)
-            said = {"type": "ready"} if message["type"] == "reset" else answer(message)
-            if said is not None:
-                connection.send(said if isinstance(said, str | bytes) else json.dumps({"id": message["id"], **said}))
+            reply = {"type": "ready"} if message["type"] == "reset" else answer(message)
+            if reply is not None:
+                connection.send(reply if isinstance(reply, str | bytes) else json.dumps({"id": message["id"], **reply}))
 
     with serve(attend, "127.0.0.1", 0) as running:
         thread = threading.Thread(target=running.serve_forever)
@@ -88,7 +88,7 @@ def policy(port: int, **options: Any) -> Iterator[RemotePolicy]:
 
 
 @pytest.mark.parametrize("frames", ["json", "msgpack"])
-def test_the_reference_server_answers_in_both_kinds_of_frames(server: Server, frames: str) -> None:
+def test_reference_server_answers_in_both_kinds_of_frames(server: Server, frames: str) -> None:
     with policy(server.port, frames=frames) as remote:
         chunk = remote.act({"pan": 0.2, "free": 0.0})
         assert chunk is not None
@@ -96,7 +96,7 @@ def test_the_reference_server_answers_in_both_kinds_of_frames(server: Server, fr
         assert chunk[0] == {"pan": pytest.approx(0.2)}
 
 
-def test_a_robot_runs_a_task_of_a_policy_server(server: Server) -> None:
+def test_robot_runs_a_task_of_a_policy_server(server: Server) -> None:
     robot = HardwareRobot(RecordingDevice(), "arm", control_hz=100)
     robot.connect()
     answer = robot.run_task("wave", policy_provider="remote", policy_port=server.port, duration=3.0, deadline_s=20.0)
@@ -106,7 +106,7 @@ def test_a_robot_runs_a_task_of_a_policy_server(server: Server) -> None:
     robot.cleanup()
 
 
-def test_a_server_that_was_restarted_is_found_again_within_the_step() -> None:
+def test_restarted_server_is_reconnected_within_the_step() -> None:
     port = free_port()
     first = Server(port)
     with policy(port) as remote:
@@ -119,7 +119,7 @@ def test_a_server_that_was_restarted_is_found_again_within_the_step() -> None:
             second.kill()
 
 
-def test_a_server_that_is_lost_ends_the_task_in_error_and_a_hold(server: Server) -> None:
+def test_lost_server_ends_the_task_in_error_and_the_robot_holds(server: Server) -> None:
     robot = HardwareRobot(RecordingDevice(), "arm", control_hz=100)
     robot.connect()
     robot.start_task("wave", policy_provider="remote", policy_port=server.port, duration=300.0)
@@ -131,13 +131,13 @@ def test_a_server_that_is_lost_ends_the_task_in_error_and_a_hold(server: Server)
     robot.cleanup()
 
 
-def test_nobody_at_the_port_is_an_error_that_names_it() -> None:
+def test_closed_port_is_an_error_that_names_it() -> None:
     port = free_port()
     with pytest.raises(PolicyServerError, match=str(port)):
         RemotePolicy(policy_port=port).reset("wave", ARM)
 
 
-def test_a_server_that_does_not_answer_in_time_is_an_error() -> None:
+def test_late_server_is_an_error() -> None:
     with answering(lambda message: None) as port, policy(port, deadline_s=0.2) as remote:
         began = time.monotonic()
         with pytest.raises(PolicyServerError, match="in time"):
@@ -145,7 +145,7 @@ def test_a_server_that_does_not_answer_in_time_is_an_error() -> None:
         assert time.monotonic() - began < 20
 
 
-def test_a_stop_does_not_wait_for_a_server_that_thinks() -> None:
+def test_stop_does_not_wait_for_a_slow_server() -> None:
     asked = threading.Event()
     with answering(lambda message: asked.set()) as port:
         robot = HardwareRobot(RecordingDevice(), "arm")
@@ -158,7 +158,7 @@ def test_a_stop_does_not_wait_for_a_server_that_thinks() -> None:
 
 
 @pytest.mark.parametrize(
-    "said",
+    "reply",
     [
         {"type": "actions", "actions": [{"elbow": 0.1}]},
         {"type": "actions", "actions": [{"pan": None}]},
@@ -174,16 +174,16 @@ def test_a_stop_does_not_wait_for_a_server_that_thinks() -> None:
         "[" * 100_000,
         b"\xc1",
     ],
-    ids=lambda said: str(said)[:40],
+    ids=lambda reply: str(reply)[:40],
 )
-def test_an_answer_that_cannot_be_used_is_refused(said: Any) -> None:
-    with answering(lambda message: said) as port, policy(port) as remote:
+def test_unusable_answer_is_refused(reply: Any) -> None:
+    with answering(lambda message: reply) as port, policy(port) as remote:
         with pytest.raises(PolicyServerError) as refused:
             remote.act({"pan": 0.0})
         assert len(str(refused.value)) < 500
 
 
-def test_a_target_that_is_not_finite_is_refused() -> None:
+def test_target_that_is_not_finite_is_refused() -> None:
     frame = '{"id": 2, "type": "actions", "actions": [{"pan": NaN}]}'
     with answering(lambda message: frame) as port, policy(port) as remote:
         with pytest.raises(PolicyServerError, match="finite"):
@@ -191,8 +191,8 @@ def test_a_target_that_is_not_finite_is_refused() -> None:
 
 
 def test_done_ends_the_task_after_its_last_actions() -> None:
-    said = {"type": "actions", "actions": [{"pan": 0.5}], "done": True}
-    with answering(lambda message: said) as port, policy(port) as remote:
+    reply = {"type": "actions", "actions": [{"pan": 0.5}], "done": True}
+    with answering(lambda message: reply) as port, policy(port) as remote:
         assert remote.act({"pan": 0.0}) == [{"pan": 0.5}]
         assert remote.act({"pan": 0.0}) is None
 
@@ -204,8 +204,8 @@ def test_images_travel_in_msgpack_frames() -> None:
         for frame in connection:
             message = msgpack.unpackb(frame)
             seen.append(message)
-            said = {"type": "ready"} if message["type"] == "reset" else {"type": "actions", "actions": []}
-            connection.send(msgpack.packb({"id": message["id"], **said}))
+            reply = {"type": "ready"} if message["type"] == "reset" else {"type": "actions", "actions": []}
+            connection.send(msgpack.packb({"id": message["id"], **reply}))
 
     with serve(attend, "127.0.0.1", 0) as running:
         thread = threading.Thread(target=running.serve_forever)
@@ -236,6 +236,6 @@ def test_images_travel_in_msgpack_frames() -> None:
     ],
     ids=str,
 )
-def test_an_option_out_of_its_domain_is_refused(options: dict[str, Any]) -> None:
+def test_option_outside_its_domain_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         RemotePolicy(**options)

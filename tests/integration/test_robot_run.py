@@ -1,4 +1,4 @@
-"""``run`` serves a robot on the real network until a signal, and halts it before it departs."""
+"""``run`` serves a robot on a real network until a signal, and halts it before it leaves."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ print("threads", [t.name for t in threading.enumerate() if t.name.startswith("ro
 
 
 def status_of(port: int, device: str) -> dict[str, object] | None:
-    """The answer of a device to getStatus, or None when nobody answers."""
+    """Return the answer of a device to getStatus, or None when it does not answer."""
 
     async def ask() -> dict[str, object] | None:
         client = await open_client(loopback_config(port))
@@ -52,7 +52,7 @@ def status_of(port: int, device: str) -> dict[str, object] | None:
     return asyncio.run(ask())
 
 
-def test_a_robot_is_served_until_its_event_and_is_halted_first(patient_halts: None) -> None:
+def test_run_serves_until_the_event_and_halts_the_robot(patient_halts: None) -> None:
     robot = HardwareRobot(RecordingDevice(), "arm", control_hz=100)
     robot.connect()
     port, until = free_port(), threading.Event()
@@ -75,7 +75,7 @@ def test_a_robot_is_served_until_its_event_and_is_halted_first(patient_halts: No
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_halts_the_robot_and_then_departs(
+def test_signal_halts_the_robot_and_ends_the_process(
     number: signal.Signals, monkeypatch: pytest.MonkeyPatch, patient_halts: None
 ) -> None:
     monkeypatch.setenv("STRANDS_DC_PORT", str(free_port()))

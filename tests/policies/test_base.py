@@ -1,4 +1,4 @@
-"""Is this action usable, and how fast may it change?"""
+"""Checks of actions and the bound of their speed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RANGES = {"a": (-1.0, 1.0), "b": (-math.inf, math.inf)}
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
-def test_a_finite_target_is_inside_its_range_afterwards(value: float) -> None:
+def test_finite_target_is_clamped_to_its_range(value: float) -> None:
     action = checked_action({"a": value, "b": value}, RANGES)
     assert -1 <= action["a"] <= 1
     assert action["b"] == value
@@ -25,28 +25,28 @@ def test_a_finite_target_is_inside_its_range_afterwards(value: float) -> None:
 @pytest.mark.parametrize(
     "bad", [math.nan, math.inf, -math.inf, True, None, "1", [1.0], np.array([1.0]), np.nan, 10**400]
 )
-def test_what_is_no_finite_number_is_refused_by_its_key(bad: object) -> None:
+def test_value_that_is_no_finite_number_is_refused_by_its_key(bad: object) -> None:
     with pytest.raises(ValidationError, match="'a'"):
         checked_action({"a": bad}, RANGES)
 
 
-def test_the_scalars_of_an_array_package_are_numbers() -> None:
+def test_numpy_scalars_are_accepted() -> None:
     assert checked_action({"a": np.float32(0.5), "b": np.array(2)}, RANGES) == {"a": 0.5, "b": 2.0}
 
 
 @pytest.mark.parametrize("bad", [None, 5, [("a", 1.0)], {"c": 1.0}, {3: 1.0}])
-def test_an_action_that_is_no_object_of_known_keys_is_refused(bad: object) -> None:
+def test_action_without_known_keys_is_refused(bad: object) -> None:
     with pytest.raises(ValidationError):
         checked_action(bad, RANGES)
 
 
-def test_an_observations_numbers_are_without_images_flags_and_words() -> None:
+def test_numbers_leaves_out_images_flags_and_text() -> None:
     observation = {"a": np.float64(1), "b": 2, "c": True, "d": "x", "e": np.zeros((2, 2)), "f": math.nan, "g": None}
     assert numbers(observation) == {"a": 1.0, "b": 2.0}
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.001, 0.1))
-def test_a_step_is_never_longer_than_the_speed_allows(before: float, wanted: float, dt: float) -> None:
+def test_speed_limit_bounds_every_step(before: float, wanted: float, dt: float) -> None:
     limit = SpeedLimit(RANGES, full_ranges_per_s=2.0, unbounded_per_s=10.0)
     after = limit.limit({"a": wanted, "b": wanted}, {"a": before, "b": before}, dt)
     assert abs(after["a"] - before) <= 4 * dt + 1e-9

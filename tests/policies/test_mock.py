@@ -31,20 +31,20 @@ def motion(
     amplitude=st.floats(0.01, 1.0),
     pan=st.floats(-1.5, 2.0),
 )
-def test_it_stays_inside_every_range(seed: int, instruction: str, amplitude: float, pan: float) -> None:
+def test_motion_stays_inside_every_range(seed: int, instruction: str, amplitude: float, pan: float) -> None:
     for action in motion(400, instruction, {"pan": pan, "lift": 0.0, "grip": 1.7}, seed=seed, amplitude=amplitude):
         for key, (low, high) in ARM.items():
             assert low - 1e-9 <= action[key] <= high + 1e-9
 
 
-def test_it_begins_where_the_robot_is_and_without_velocity() -> None:
+def test_motion_starts_at_the_present_position_without_velocity() -> None:
     first = motion(3)
     assert first[0] == pytest.approx({"pan": 0.3, "lift": 1.0, "grip": 0.0})
     for key in ARM:
         assert abs(first[1][key] - first[0][key]) < 1e-4
 
 
-def test_it_is_smooth() -> None:
+def test_motion_is_smooth() -> None:
     actions = motion(1000)
     for key, (low, high) in ARM.items():
         speeds = [(b[key] - a[key]) * 50 for a, b in itertools.pairwise(actions)]
@@ -53,19 +53,19 @@ def test_it_is_smooth() -> None:
         assert max(jumps) < 0.25 * (high - low)
 
 
-def test_it_really_moves() -> None:
+def test_every_joint_moves() -> None:
     actions = motion(500)
     for key, (low, high) in ARM.items():
         assert max(a[key] for a in actions) - min(a[key] for a in actions) > 0.2 * (high - low)
 
 
-def test_the_same_seed_and_instruction_are_the_same_motion_and_others_are_not() -> None:
+def test_motion_depends_only_on_seed_and_instruction() -> None:
     assert motion(200) == motion(200)
     assert motion(200) != motion(200, seed=1)
     assert motion(200) != motion(200, "pick up the cube")
 
 
-def test_a_joint_without_a_range_stays_where_it_is_and_a_body_without_any_is_refused() -> None:
+def test_joint_without_range_does_not_move_and_a_body_without_ranges_is_refused() -> None:
     policy = MockPolicy()
     policy.reset("wave", {"pan": (-1.0, 1.0), "lift": (-math.inf, math.inf)})
     assert set(policy.act({"pan": 0.0, "lift": 0.0})) == {"pan"}

@@ -1,4 +1,4 @@
-"""The control loop: its rate, its ends, its events, and that nothing is written after a stop."""
+"""The control loop: its rate, its ends, its events, and that it writes nothing after a stop."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(policy: Any, **more: Any) -> tuple[Rollout, RecordingBody]:
     return one, body
 
 
-def test_a_policy_that_is_done_completes_the_rollout_and_leaves_a_hold() -> None:
+def test_policy_that_is_done_completes_the_rollout_and_the_body_holds() -> None:
     policy = ScriptedPolicy([{"a": 0.1}, {"a": 0.2}])
     one, body = run(policy)
     assert (one.state, one.step_count, one.error) == ("completed", 2, "")
@@ -37,19 +37,19 @@ def test_a_policy_that_is_done_completes_the_rollout_and_leaves_a_hold() -> None
     assert (body.holds, policy.closed, policy.told) == (1, 1, ["wave"])
 
 
-def test_a_rollout_ends_when_its_duration_is_over() -> None:
+def test_rollout_ends_after_its_duration() -> None:
     one, body = run(ScriptedPolicy([], always={"a": 0.5}), duration=1.0, hz=10.0)
     assert (one.state, one.step_count) == ("completed", 10)
     assert one.elapsed_s == pytest.approx(1.0)
     assert body.holds == 1
 
 
-def test_a_rollout_ends_after_the_steps_it_was_asked_for() -> None:
+def test_rollout_ends_after_its_steps() -> None:
     one, body = run(ScriptedPolicy([], always={"a": 0.5}), duration=9.0, steps=3)
     assert (one.state, one.step_count, len(body.writes), body.holds) == ("completed", 3, 3, 1)
 
 
-def test_the_rate_and_the_steps_are_taken_from_the_options_of_a_policy() -> None:
+def test_rollout_options_takes_rate_and_steps_out_of_the_policy_options() -> None:
     options = {"control_frequency": 20, "n_steps": 7, "policy_port": 5000}
     task = {"instruction": "wave", "duration": 3.0}
     assert rollout_options("wave", 3, options, 50.0) == {**task, "hz": 20.0, "steps": 7}
@@ -60,12 +60,12 @@ def test_the_rate_and_the_steps_are_taken_from_the_options_of_a_policy() -> None
 @pytest.mark.parametrize(
     "option", [{"control_frequency": 50.1}, {"control_frequency": 0}, {"n_steps": 0}, {"n_steps": 2.0}]
 )
-def test_a_rate_above_the_robots_own_and_steps_that_are_none_are_refused(option: dict[str, Any]) -> None:
+def test_bad_rate_or_steps_are_refused(option: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(option))):
         rollout_options("wave", 3, option, 50.0)
 
 
-def test_ticks_are_at_absolute_times_and_missed_ones_are_dropped() -> None:
+def test_ticks_are_at_absolute_times_and_missed_ticks_are_dropped() -> None:
     clock = StepClock()
     clock.late = {3: 0.25}
     one, _ = run(ScriptedPolicy([], always={"a": 0.5}), duration=1.0, hz=10.0, clock=clock)
@@ -73,7 +73,7 @@ def test_ticks_are_at_absolute_times_and_missed_ones_are_dropped() -> None:
     assert (one.step_count, one.missed_ticks) == (8, 2)
 
 
-def test_a_chunk_is_played_one_action_a_step_and_an_empty_one_lets_the_step_pass() -> None:
+def test_chunk_is_played_one_action_a_step_and_an_empty_chunk_skips_a_step() -> None:
     policy = ScriptedPolicy([[{"a": 0.1}, {"a": 0.2}], [], {"a": 0.3}])
     clock = StepClock()
     one, body = run(policy, clock=clock)
@@ -98,7 +98,7 @@ def test_a_chunk_is_played_one_action_a_step_and_an_empty_one_lets_the_step_pass
     ],
     ids=repr,
 )
-def test_a_policy_that_fails_or_asks_for_the_impossible_ends_in_error_and_a_hold(decision: Any) -> None:
+def test_failing_policy_or_bad_action_ends_in_error_and_the_body_holds(decision: Any) -> None:
     policy = ScriptedPolicy([{"a": 0.1}, decision])
     one, body = run(policy)
     assert one.state == "error"
@@ -109,12 +109,12 @@ def test_a_policy_that_fails_or_asks_for_the_impossible_ends_in_error_and_a_hold
     assert len(body.writes) <= 2
 
 
-def test_a_target_beyond_the_range_is_clamped_to_it() -> None:
+def test_target_beyond_the_range_is_clamped() -> None:
     _, body = run(ScriptedPolicy([{"a": 7.0}]))
     assert body.writes[0][1] == {"a": 1.0}
 
 
-def test_a_reset_that_fails_is_an_error_and_the_policy_is_closed() -> None:
+def test_failing_reset_ends_in_error_and_closes_the_policy() -> None:
     class NoCheckpoint(ScriptedPolicy):
         def reset(self, instruction: str, ranges: Any) -> None:
             raise FileNotFoundError("no such checkpoint")
@@ -126,7 +126,7 @@ def test_a_reset_that_fails_is_an_error_and_the_policy_is_closed() -> None:
     assert (policy.closed, body.writes) == (1, [])
 
 
-def test_a_body_that_fails_ends_in_error_and_a_hold() -> None:
+def test_failing_write_ends_in_error_and_the_body_holds() -> None:
     body = RecordingBody()
 
     def broken() -> None:
@@ -140,7 +140,7 @@ def test_a_body_that_fails_ends_in_error_and_a_hold() -> None:
     assert body.holds == 1
 
 
-def test_a_hold_that_fails_is_an_error_that_says_so() -> None:
+def test_failing_hold_ends_in_error_that_names_it() -> None:
     class Wedged(RecordingBody):
         def hold(self, permit: Any = None) -> None:
             raise ConnectionError("dead servo 3")
@@ -151,7 +151,7 @@ def test_a_hold_that_fails_is_an_error_that_says_so() -> None:
     assert "hold failed" in one.error
 
 
-def test_observers_are_told_started_each_step_and_finished() -> None:
+def test_observers_get_started_each_step_and_finished() -> None:
     seen: list[RolloutEvent] = []
     observers = RolloutObservers()
     observers.subscribe(seen.append)
@@ -163,7 +163,7 @@ def test_observers_are_told_started_each_step_and_finished() -> None:
     assert (seen[-1].state, seen[-1].policy, seen[-1].robot) == ("completed", "scripted", "body")
 
 
-def test_an_observer_that_raises_harms_neither_the_loop_nor_the_others(caplog: pytest.LogCaptureFixture) -> None:
+def test_raising_observer_affects_neither_the_loop_nor_the_others(caplog: pytest.LogCaptureFixture) -> None:
     def broken(event: RolloutEvent) -> None:
         raise RuntimeError("observer broke")
 
@@ -177,7 +177,7 @@ def test_an_observer_that_raises_harms_neither_the_loop_nor_the_others(caplog: p
     assert len([record for record in caplog.records if record.name == "strands_robots.policies.rollout"]) == 1
 
 
-def test_an_observer_that_unsubscribed_is_told_no_more() -> None:
+def test_unsubscribed_observer_gets_no_events() -> None:
     seen: list[RolloutEvent] = []
     observers = RolloutObservers()
     first, second = observers.subscribe(seen.append), observers.subscribe(seen.append)
@@ -190,7 +190,7 @@ def test_an_observer_that_unsubscribed_is_told_no_more() -> None:
     assert len(seen) == 1
 
 
-def test_a_stop_ends_the_loop_at_once_and_it_says_stopped() -> None:
+def test_stop_ends_the_loop_at_once() -> None:
     body, policy = RecordingBody(), ScriptedPolicy([], always={"a": 0.5})
     # A step in a hundred seconds: what ends sooner was woken.
     one = rollout(body, policy, hz=0.01)
@@ -201,7 +201,7 @@ def test_a_stop_ends_the_loop_at_once_and_it_says_stopped() -> None:
     assert policy.interrupted.is_set()
 
 
-def test_a_loop_that_outlives_its_stop_is_not_called_stopped_and_writes_nothing_more() -> None:
+def test_loop_that_outlives_its_stop_is_not_reported_stopped_and_writes_nothing() -> None:
     thinks, go_on = threading.Event(), threading.Event()
     body = RecordingBody()
 
@@ -222,7 +222,7 @@ def test_a_loop_that_outlives_its_stop_is_not_called_stopped_and_writes_nothing_
     assert one.state == "stopped"
 
 
-def test_after_a_halt_has_passed_the_lock_nothing_is_written() -> None:
+def test_nothing_is_written_after_a_halt_has_passed_the_lock() -> None:
     for _ in range(30):
         gate, body = MotionGate(), RecordingBody()
         one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), gate, hz=2000.0)
@@ -237,8 +237,8 @@ def test_after_a_halt_has_passed_the_lock_nothing_is_written() -> None:
         assert body.holds == 0, "a halt freezes the body itself"
 
 
-class NotingClock(Clock):
-    """The real clock; notes what was waited for and when each wait was over."""
+class RecordingClock(Clock):
+    """The real clock, with a record of each wait and its end."""
 
     def __init__(self) -> None:
         self.waits: list[tuple[float, float]] = []
@@ -248,8 +248,8 @@ class NotingClock(Clock):
         self.waits.append((until, self.now()))
 
 
-def test_a_rollout_keeps_its_rate_on_the_real_clock() -> None:
-    body, clock = RecordingBody(), NotingClock()
+def test_rollout_keeps_its_rate_on_the_real_clock() -> None:
+    body, clock = RecordingBody(), RecordingClock()
     one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), hz=100.0, duration=0.5, clock=clock)
     before = clock.now()
     one.start()
@@ -265,7 +265,7 @@ def test_a_rollout_keeps_its_rate_on_the_real_clock() -> None:
     assert one.elapsed_s >= 0.5
 
 
-def test_the_thread_carries_the_robots_name() -> None:
+def test_thread_has_the_name_of_the_robot() -> None:
     hold = threading.Event()
     one = rollout(RecordingBody(), ScriptedPolicy([lambda: hold.wait(60) and None]))
     one.start()
@@ -274,7 +274,7 @@ def test_the_thread_carries_the_robots_name() -> None:
     assert one.join(20)
 
 
-def test_an_observer_that_stops_its_own_rollout_does_not_deadlock() -> None:
+def test_observer_may_stop_its_own_rollout() -> None:
     observers = RolloutObservers()
     body = RecordingBody()
     one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), observers=observers)
@@ -286,7 +286,7 @@ def test_an_observer_that_stops_its_own_rollout_does_not_deadlock() -> None:
     assert len(body.writes) == 1
 
 
-def test_a_policy_that_exits_instead_of_failing_leaves_a_hold_all_the_same() -> None:
+def test_policy_that_raises_system_exit_ends_in_error_and_the_body_holds() -> None:
     one, body = run(ScriptedPolicy([{"a": 0.1}, SystemExit("a library gave up")]))
     assert (one.state, body.holds) == ("error", 1)
     assert "SystemExit" in one.error

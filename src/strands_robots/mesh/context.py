@@ -13,7 +13,7 @@ from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.wire_identity import Identity
-from strands_robots.policies.registry import policy_names
+from strands_robots.policies import policy_names
 
 logger = logging.getLogger(__name__)
 

@@ -1,8 +1,89 @@
-"""What decides a robot's next action: the policy protocol, the registry, and the providers we bring."""
+"""Policies by name: the built-in ones, and those that other packages register under the entry-point group."""
 
 from __future__ import annotations
 
+import difflib
+import inspect
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
 from strands_robots.policies.base import Action, Policy, Ranges
-from strands_robots.policies.registry import ALIASES, create_policy, policy_names, resolve_provider
+from strands_robots.utils import ValidationError, shown
 
 __all__ = ["ALIASES", "Action", "Policy", "Ranges", "create_policy", "policy_names", "resolve_provider"]
+
+ENTRY_POINT_GROUP = "strands_robots.policies"
+"""Each entry is a callable that takes keyword options and returns a :class:`Policy`."""
+
+ALIASES = {"lerobot": "lerobot_local"}
+
+_BUILT_IN = {
+    "mock": ("strands_robots.policies.mock", "MockPolicy"),
+    "remote": ("strands_robots.policies.remote", "RemotePolicy"),
+    "lerobot_local": ("strands_robots.policies.lerobot_local", "LeRobotPolicy"),
+}
+
+
+def policy_names() -> tuple[str, ...]:
+    """Return every provider that :func:`create_policy` knows by its own name: built-in ones first, then plug-ins."""
+    return (*_BUILT_IN, *(name for name in sorted(_plug_ins()) if name not in _BUILT_IN))
+
+
+def resolve_provider(provider: object) -> str:
+    """Return the registered name of ``provider``, with its alias resolved.
+
+    Raises:
+        ValidationError: no such provider; the message names similar ones.
+    """
+    names = policy_names()
+    name = ALIASES.get(provider, provider) if isinstance(provider, str) else ""
+    if name in names:
+        return name
+    similar = difflib.get_close_matches(str(name), names, n=3)
+    hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
+    raise ValidationError(f"policy_provider must be one of {', '.join(names)}, not {shown(provider)}.{hint}")
+
+
+def create_policy(provider: str, **options: Any) -> Policy:
+    """Make a policy of ``provider``; cheap, because loading and connecting happen in its ``reset``.
+
+    ``policy_port=0`` is the provider's own default, and a port is passed only to a provider that takes one.
+
+    Raises:
+        ValidationError: no such provider, or an option outside its domain.
+        MissingExtraError: the provider needs an extra that is not installed.
+    """
+    name = resolve_provider(provider)
+    factory = policy_factory(name)
+    if not options.get("policy_port") or not _takes(factory, "policy_port"):
+        options.pop("policy_port", None)
+    try:
+        policy = factory(**options)
+    except TypeError as exc:
+        raise ValidationError(f"policy_provider {name} cannot be made with {shown(sorted(options))}: {exc}.") from exc
+    if not isinstance(policy, Policy):
+        raise ValidationError(
+            f"policy_provider {name} made {shown(policy)}, which lacks uses_cameras, reset, act, interrupt or close."
+        )
+    return policy
+
+
+def policy_factory(name: str) -> Callable[..., Any]:
+    """Load the callable that makes policies of a registered name."""
+    if name in _BUILT_IN:
+        module, attribute = _BUILT_IN[name]
+        built_in: Callable[..., Any] = getattr(import_module(module), attribute)
+        return built_in
+    plug_in: Callable[..., Any] = _plug_ins()[name].load()
+    return plug_in
+
+
+def _takes(factory: Callable[..., Any], option: str) -> bool:
+    parameters = inspect.signature(factory).parameters.values()
+    return any(p.name == option or p.kind is p.VAR_KEYWORD for p in parameters)
+
+
+def _plug_ins() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}

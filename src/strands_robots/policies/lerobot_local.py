@@ -1,7 +1,7 @@
 """A LeRobot checkpoint as a policy, computed in this process.
 
 Written against LeRobot 0.4 (``lerobot.policies.factory`` and ``lerobot.policies.utils``). LeRobot with its torch is
-not installed where this project is tested, so this module is **not verified** beyond its refusals.
+not installed in the tests of this project, so this module is **not verified** beyond its refusals.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from strands_robots.utils import ValidationError, missing_extra, text
 
 
 class LeRobotPolicy:
-    """Loads a checkpoint and asks it for every action.
+    """Policy that loads a checkpoint and computes every action with it.
 
     Args:
         pretrained_name_or_path: a model on the Hugging Face hub, ``org/name``, or a local directory.
         device: a torch device; by default the checkpoint's own.
 
     Raises:
-        ValidationError: no checkpoint named.
+        ValidationError: no checkpoint.
         MissingExtraError: the [lerobot] extra is not installed.
     """
 
@@ -45,7 +45,7 @@ class LeRobotPolicy:
         self._after: Any = None
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
-        """Load the checkpoint; the first time it may be fetched from the hub, which takes minutes."""
+        """Load the checkpoint, which is fetched from the hub the first time; that takes minutes."""
         factory = import_module("lerobot.policies.factory")
         config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(self._checkpoint)
         if self._device:
@@ -60,7 +60,7 @@ class LeRobotPolicy:
     def act(self, observation: Mapping[str, Any]) -> Action:
         utils = import_module("lerobot.policies.utils")
         if not self._features:
-            self._features = self._described(observation)
+            self._features = self._dataset_features(observation)
         frame = utils.build_inference_frame(
             observation=dict(observation),
             ds_features=self._features,
@@ -73,16 +73,16 @@ class LeRobotPolicy:
         return action
 
     def interrupt(self) -> None:
-        """A forward pass cannot be broken off; it is short."""
+        """Do nothing: a forward pass cannot be interrupted, and is short."""
 
     def close(self) -> None:
         self._model = self._before = self._after = None
 
-    def _described(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        described = import_module("lerobot.datasets.utils").hw_to_dataset_features
-        seen = {key: tuple(value.shape) if getattr(value, "ndim", 0) else float for key, value in observation.items()}
+    def _dataset_features(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        convert = import_module("lerobot.datasets.utils").hw_to_dataset_features
+        kinds = {key: tuple(value.shape) if getattr(value, "ndim", 0) else float for key, value in observation.items()}
         features: dict[str, Any] = {
-            **described(dict.fromkeys(self._keys, float), "action"),
-            **described(seen, "observation"),
+            **convert(dict.fromkeys(self._keys, float), "action"),
+            **convert(kinds, "observation"),
         }
         return features

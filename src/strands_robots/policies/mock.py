@@ -1,4 +1,4 @@
-"""A policy without a mind: smooth motion inside the joint ranges, the same every time."""
+"""A policy without a model: smooth motion inside the joint ranges, the same every time."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ logger = logging.getLogger(__name__)
 
 
 class MockPolicy:
-    """Every joint follows a sum of two slow sines around the middle of its range, faded in from where it is.
+    """Policy that moves every joint along two slow sines around the middle of its range, faded in from its position.
 
     Motion is a function of the seed, the instruction, the start position and the count of steps, so a run can be
-    repeated exactly. It begins at the present position with zero velocity and acceleration. A joint without a
-    finite range stays where it is.
+    repeated exactly. It starts at the present position with zero velocity and acceleration. A joint without a
+    finite range does not move.
 
     Args:
         seed: any integer; another seed or another instruction is another motion.
-        amplitude: part of each half range that is used, above 0 and at most 1.
-        hz: control rate the steps are counted in; the motion is that much slower when the loop is slower.
-        fade_s: seconds until the motion has left the start position for good.
+        amplitude: used share of each half range, above 0 and at most 1.
+        hz: control rate in which steps are counted; a slower loop makes a slower motion.
+        fade_s: seconds in which the motion fades in from the start position.
     """
 
     uses_cameras = False
@@ -43,20 +43,15 @@ class MockPolicy:
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         self._ranges = {k: (low, high) for k, (low, high) in ranges.items() if math.isfinite(high - low)}
-        still = [key for key in ranges if key not in self._ranges]
         if not self._ranges:
             raise ValidationError("the mock policy needs a robot with at least one action key of finite range.")
-        if still:
-            logger.info("The mock policy leaves %s where they are: they have no range.", ", ".join(still))
+        unbounded = [key for key in ranges if key not in self._ranges]
+        if unbounded:
+            logger.info("The mock policy does not move %s, which have no range.", ", ".join(unbounded))
         digest = hashlib.blake2b(f"{self._seed}|{instruction}".encode(), digest_size=8).digest()
-        dice = random.Random(int.from_bytes(digest))
+        draw = random.Random(int.from_bytes(digest)).uniform
         self._waves = {
-            key: (
-                dice.uniform(0.15, 0.3),
-                dice.uniform(0, math.tau),
-                dice.uniform(0.35, 0.6),
-                dice.uniform(0, math.tau),
-            )
+            key: (draw(0.15, 0.3), draw(0, math.tau), draw(0.35, 0.6), draw(0, math.tau))
             for key in sorted(self._ranges)
         }
         self._start = None
@@ -64,18 +59,18 @@ class MockPolicy:
 
     def act(self, observation: Mapping[str, Any]) -> Action:
         if self._start is None:
-            seen = numbers(observation)
-            self._start = {key: min(max(seen.get(key, (a + b) / 2), a), b) for key, (a, b) in self._ranges.items()}
+            present = numbers(observation)
+            self._start = {key: min(max(present.get(key, (a + b) / 2), a), b) for key, (a, b) in self._ranges.items()}
         seconds = self._step * self._dt
-        share = smooth_step(seconds / self._fade_s)
+        share = _smooth_step(seconds / self._fade_s)
         self._step += 1
         return {key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges}
 
     def interrupt(self) -> None:
-        """It never waits."""
+        """Do nothing: this policy never waits."""
 
     def close(self) -> None:
-        """Nothing to free."""
+        """Do nothing: this policy has no resources."""
 
     def _wave(self, key: str, seconds: float) -> float:
         low, high = self._ranges[key]
@@ -85,7 +80,7 @@ class MockPolicy:
         return (low + high) / 2 + self._amplitude * (high - low) / 2 * swing
 
 
-def smooth_step(part: float) -> float:
-    """0 before 0, 1 after 1, between them the quintic without a jump of velocity or acceleration."""
+def _smooth_step(part: float) -> float:
+    """Return 0 before 0, 1 after 1, and between them the quintic without a jump of velocity or acceleration."""
     x = min(max(part, 0.0), 1.0)
     return x * x * x * (x * (6 * x - 15) + 10)

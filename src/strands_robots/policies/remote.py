@@ -1,16 +1,16 @@
 """A policy behind a WebSocket: the robot sends observations, a server answers with actions.
 
-Every message is an object, as a JSON text frame or a MessagePack binary frame; the server answers in kind. The
-robot asks, with an ``id`` that the answer repeats:
+Every message is an object, as a JSON text frame or a MessagePack binary frame; the server answers with the same kind.
+The robot sends requests with an ``id`` that the answer repeats:
 
 * ``{"id", "type": "reset", "instruction", "action_keys", "ranges"}``, answered by ``{"id", "type": "ready"}``;
   ``ranges`` holds ``[low, high]`` of every key that has a range.
 * ``{"id", "type": "act", "observation"}``, answered by ``{"id", "type": "actions", "actions", "done"}``; each action
-  is ``{key: target}``, they are played one a control step, then it asks again. ``done`` ends the task after them.
+  is ``{key: target}`` and is played for one control step; then the robot asks again. ``done`` ends the task after them.
 
 Anything may be answered by ``{"id", "type": "error", "reason"}``. An image, in MessagePack frames alone, is
 ``{"shape", "dtype", "data"}`` with its bytes in C order. ``examples/policy_server.py`` is the reference server.
-The connection is not encrypted and proves nothing: a server elsewhere is reached through a tunnel.
+The connection is neither encrypted nor authenticated: use a tunnel to a server on another machine.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from strands_robots.utils import ValidationError, choice, dial_host_error, flag,
 
 DEFAULT_PORT = 8765
 CHUNK_MAX = 10_000
-"""Longest chunk of actions that is taken."""
+"""Longest accepted chunk of actions."""
 
 _SLICE_S = 0.05
 _CLOSE_S = 0.5
 
 
 class PolicyServerError(PolicyError):
-    """The policy server refused, answered nonsense, or did not answer in time."""
+    """The policy server refused, sent an unusable answer, or did not answer in time."""
 
 
 class RemotePolicy:
-    """Asks a policy server for every chunk of actions.
+    """Policy that asks a policy server for every chunk of actions.
 
-    A lost connection is opened anew, with the task told again, inside the deadline of the step that noticed.
+    A lost connection is opened again and the task sent again within the deadline of the step that noticed.
 
     Args:
         policy_host: a bare hostname or IP address.
         policy_port: 1 to 65535; 0 for :data:`DEFAULT_PORT`.
-        deadline_s: how long one step may take, reconnecting included, 0.01 to 60 s.
-        reset_deadline_s: how long connecting and the answer to ``reset`` may take, 0.1 to 600 s.
+        deadline_s: longest step, reconnecting included, 0.01 to 60 s.
+        reset_deadline_s: longest time for connecting and the answer to ``reset``, 0.1 to 600 s.
         frames: ``json`` or ``msgpack``.
         uses_cameras: send images too; with ``msgpack`` only.
 
@@ -73,16 +73,16 @@ class RemotePolicy:
         host = f"[{policy_host}]" if ":" in policy_host and not policy_host.startswith("[") else policy_host
         self.url = f"ws://{host}:{whole('policy_port', policy_port, low=0, high=65535) or DEFAULT_PORT}"
         self.uses_cameras = flag("uses_cameras", uses_cameras)
-        self._packed = choice("frames", frames, ("json", "msgpack")) == "msgpack"
-        if uses_cameras and not self._packed:
+        packed = choice("frames", frames, ("json", "msgpack")) == "msgpack"
+        if uses_cameras and not packed:
             raise ValidationError("frames must be msgpack for images, not 'json'.")
         self._deadline_s = number("deadline_s", deadline_s, low=0.01, high=60)
         self._reset_s = number("reset_deadline_s", reset_deadline_s, low=0.1, high=600)
         self._client = _module("websockets.sync.client")
-        self._broken = (_module("websockets.exceptions").WebSocketException, OSError)
-        self._msgpack = _module("msgpack") if self._packed else None
+        self._connection_errors = (_module("websockets.exceptions").WebSocketException, OSError)
+        self._msgpack = _module("msgpack") if packed else None
         self._connection: Any = None
-        self._held = contextlib.ExitStack()
+        self._open_connection = contextlib.ExitStack()
         self._task: dict[str, Any] = {}
         self._ranges: Ranges = {}
         self._last_id = 0
@@ -96,21 +96,21 @@ class RemotePolicy:
         self._task = {"type": "reset", "instruction": instruction, "action_keys": list(ranges), "ranges": finite}
         try:
             self._open(time.monotonic() + self._reset_s)
-        except self._broken as exc:
+        except self._connection_errors as exc:
             raise PolicyServerError(f"no policy server answers at {self.url}: {exc}") from exc
 
     def act(self, observation: Mapping[str, Any]) -> list[Action] | None:
         if self._done:
             return None
         deadline = time.monotonic() + self._deadline_s
-        asked = {"type": "act", "observation": self._seen(observation)}
+        request = {"type": "act", "observation": self._encoded_observation(observation)}
         try:
-            answer = self._ask(asked, deadline)
-        except self._broken:
+            answer = self._request(request, deadline)
+        except self._connection_errors:
             try:
                 self._open(deadline)
-                answer = self._ask(asked, deadline)
-            except self._broken as exc:
+                answer = self._request(request, deadline)
+            except self._connection_errors as exc:
                 raise PolicyServerError(f"the policy server at {self.url} was lost: {exc}") from exc
         return self._actions(answer)
 
@@ -119,8 +119,8 @@ class RemotePolicy:
 
     def close(self) -> None:
         self._connection = None
-        with contextlib.suppress(*self._broken):  # a connection that is lost already is closed
-            self._held.close()
+        with contextlib.suppress(*self._connection_errors):  # a lost connection is closed already
+            self._open_connection.close()
 
     def _open(self, deadline: float) -> None:
         self.close()
@@ -132,12 +132,12 @@ class RemotePolicy:
             proxy=None,
             max_size=8 * 2**20,
         )
-        self._connection = self._held.enter_context(opening)
-        answer = self._ask(self._task, deadline)
+        self._connection = self._open_connection.enter_context(opening)
+        answer = self._request(self._task, deadline)
         if answer.get("type") != "ready":
-            self._nonsense(answer)
+            self._refuse(answer)
 
-    def _ask(self, message: Mapping[str, Any], deadline: float) -> dict[str, Any]:
+    def _request(self, message: Mapping[str, Any], deadline: float) -> dict[str, Any]:
         if self._connection is None:
             raise ConnectionError("not connected")
         self._last_id += 1
@@ -153,7 +153,7 @@ class RemotePolicy:
             except TimeoutError:
                 continue
             answer = self._decoded(frame)
-            # An answer to an older question, which was given up on, is of no use any more.
+            # An answer to an older request, which timed out, is of no use any more.
             if answer.get("id") == self._last_id:
                 break
         if answer.get("type") == "error":
@@ -163,7 +163,7 @@ class RemotePolicy:
     def _actions(self, answer: dict[str, Any]) -> list[Action] | None:
         actions = answer.get("actions")
         if answer.get("type") != "actions" or not isinstance(actions, list) or len(actions) > CHUNK_MAX:
-            self._nonsense(answer)
+            self._refuse(answer)
         try:
             chunk = [checked_action(action, self._ranges) for action in actions]
         except ValidationError as exc:
@@ -171,16 +171,16 @@ class RemotePolicy:
         self._done = answer.get("done") is True
         return None if self._done and not chunk else chunk
 
-    def _nonsense(self, answer: object) -> NoReturn:
+    def _refuse(self, answer: object) -> NoReturn:
         raise PolicyServerError(f"the policy server at {self.url} answered {shown(answer)}")
 
-    def _seen(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        seen: dict[str, Any] = dict(numbers(observation))
+    def _encoded_observation(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        encoded: dict[str, Any] = dict(numbers(observation))
         if self.uses_cameras:
             for key, value in observation.items():
                 if getattr(value, "ndim", 0):
-                    seen[key] = {"shape": list(value.shape), "dtype": str(value.dtype), "data": value.tobytes()}
-        return seen
+                    encoded[key] = {"shape": list(value.shape), "dtype": str(value.dtype), "data": value.tobytes()}
+        return encoded
 
     def _encoded(self, message: Mapping[str, Any]) -> str | bytes:
         if self._msgpack is None:
@@ -194,7 +194,7 @@ class RemotePolicy:
         except (ValueError, RecursionError) as exc:
             raise PolicyServerError(f"the policy server at {self.url} sent a frame that cannot be read: {exc}") from exc
         if not isinstance(answer, dict):
-            self._nonsense(answer)
+            self._refuse(answer)
         return answer
 
 

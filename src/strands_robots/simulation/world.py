@@ -15,7 +15,7 @@ from typing import Any, Literal, ParamSpec
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.policies.registry import create_policy
+from strands_robots.policies import create_policy
 from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options
 from strands_robots.safety.gate import MotionGate, MotionRefused, PermitVoidError, Waiting
 from strands_robots.safety.stopping import StopVerdict, halt_each

@@ -45,11 +45,11 @@ def fleet(link: LinkConfig, sim: Simulation) -> Iterator[FleetClient]:
         client.stop("sim-1")
 
 
-def test_the_simulation_is_served_as_one_whatever_the_peer_type(sim: Simulation) -> None:
+def test_simulation_gets_the_simulation_driver_for_any_peer_type(sim: Simulation) -> None:
     assert isinstance(driver_for(sim, "robot"), SimulationDeviceDriver)
 
 
-def test_its_features_and_state_reach_a_caller(fleet: FleetClient) -> None:
+def test_features_and_state_are_answered(fleet: FleetClient) -> None:
     features = fleet.call("sim-1", "getFeatures")
     assert features["status"] == "success"
     assert "left" in str(features)
@@ -58,7 +58,7 @@ def test_its_features_and_state_reach_a_caller(fleet: FleetClient) -> None:
     assert state["running_policies"] == {} or state["running_policies"] == []
 
 
-def test_physics_is_stepped_and_reset_by_hand(fleet: FleetClient) -> None:
+def test_physics_is_stepped_and_reset_remotely(fleet: FleetClient) -> None:
     before = fleet.call("sim-1", "getStatus")["step_count"]
     assert fleet.call("sim-1", "step", {"n_steps": 10})["status"] == "success"
     assert fleet.call("sim-1", "getStatus")["step_count"] == before + 10
@@ -66,25 +66,25 @@ def test_physics_is_stepped_and_reset_by_hand(fleet: FleetClient) -> None:
     assert fleet.call("sim-1", "getStatus")["sim_time"] == pytest.approx(0.0, abs=0.1)
 
 
-def test_an_arm_moves_and_stands_still_after_the_stop(fleet: FleetClient, sim: Simulation) -> None:
-    heard: list[DeviceEvent] = []
-    with fleet.subscription("sim-1", heard.append):
+def test_arm_moves_with_events_and_stands_still_after_the_stop(fleet: FleetClient, sim: Simulation) -> None:
+    events: list[DeviceEvent] = []
+    with fleet.subscription("sim-1", events.append):
         answer = fleet.call("sim-1", "execute", {"instruction": "wave", "duration": 100})
         assert answer["status"] == "success", answer
         assert answer["robot_name"] == "left"
         start = joints(fleet)
-        eventually(lambda: far(joints(fleet), start) > 0.02)
+        eventually(lambda: largest_change(joints(fleet), start) > 0.02)
         assert "stop that first" in fleet.call("sim-1", "execute", {"instruction": "again"})["reason"]
-        told = {"policyStarted", "streamStep", "stateUpdate", "observationUpdate"}
-        eventually(lambda: told <= {event.name for event in list(heard)}, what=f"{told} of a robot that moves")
+        expected = {"policyStarted", "streamStep", "stateUpdate", "observationUpdate"}
+        eventually(lambda: expected <= {event.name for event in list(events)}, what=f"{expected} of a robot that moves")
         stopped = fleet.stop("sim-1")
         assert stopped["status"] == "success", stopped
         assert stopped["stopped"] == ["left"]
         assert stopped["not_stopped"] == []
-        eventually(lambda: any(event.name == "policyComplete" for event in heard))
-    complete = next(event.payload for event in heard if event.name == "policyComplete")
+        eventually(lambda: any(event.name == "policyComplete" for event in events))
+    complete = next(event.payload for event in events if event.name == "policyComplete")
     assert (complete["robot_name"], complete["state"]) == ("left", "stopped")
-    steps = [event.payload for event in heard if event.name == "streamStep"]
+    steps = [event.payload for event in events if event.name == "streamStep"]
     assert [step["step"] for step in steps] == sorted(step["step"] for step in steps)
     assert all(
         isinstance(v, float) for step in steps for v in (*step["observation"].values(), *step["action"].values())
@@ -99,13 +99,13 @@ def test_two_robots_move_at_once_and_one_stop_halts_both(fleet: FleetClient) -> 
     assert sorted(fleet.stop("sim-1")["stopped"]) == ["left", "right"]
 
 
-def test_nothing_is_lost_of_a_stream(fleet: FleetClient) -> None:
-    heard: list[DeviceEvent] = []
-    with fleet.subscription("sim-1", heard.append):
+def test_stream_loses_no_step(fleet: FleetClient) -> None:
+    events: list[DeviceEvent] = []
+    with fleet.subscription("sim-1", events.append):
         fleet.call("sim-1", "execute", {"instruction": "wave", "duration": 3})
-        eventually(lambda: any(event.name == "policyComplete" for event in heard), within=20)
-    complete = next(event.payload for event in heard if event.name == "policyComplete")
-    steps = [event.payload["step"] for event in heard if event.name == "streamStep"]
+        eventually(lambda: any(event.name == "policyComplete" for event in events), within=20)
+    complete = next(event.payload for event in events if event.name == "policyComplete")
+    steps = [event.payload["step"] for event in events if event.name == "streamStep"]
     assert complete["state"] == "completed"
     assert len(steps) == len(set(steps))
     assert abs(len(steps) - complete["steps"]) <= 1
@@ -118,6 +118,6 @@ def joints(fleet: FleetClient) -> dict[str, float]:
     return numbers(robots["left"].get("joints", robots["left"]))
 
 
-def far(now: dict[str, float], then: dict[str, float]) -> float:
+def largest_change(now: dict[str, float], then: dict[str, float]) -> float:
     assert now
     return max(abs(now[name] - then[name]) for name in now)
