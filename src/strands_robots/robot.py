@@ -128,7 +128,7 @@ def run(
         try:
             stop.wait()
         finally:
-            free = put_away(getattr(body, "robot", body))
+            free = put_away(body)
             verdict = body.halt("run ended")
             summary = text_of(verdict.envelope())
             if verdict.stopped is True:

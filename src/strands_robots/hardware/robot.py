@@ -18,8 +18,8 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
 from strands_robots.hardware.motors import joint_units, tells_temperature, temperatures
-from strands_robots.policies.base import checked_action
 from strands_robots.policies import create_policy, resolve_provider
+from strands_robots.policies.base import checked_action
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
 from strands_robots.recording.cameras import Shots
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, PermitVoidError, Waiting
