@@ -12,7 +12,7 @@ from tests.mesh.peers import Clock
 
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport import bridge as bridges
-from strands_robots.mesh.transport.bridge import BridgeTransport, Near, Seen
+from strands_robots.mesh.transport.bridge import BridgeTransport, LocalPeers, SeenCommands
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 
 
@@ -38,6 +38,11 @@ def on(bus: MemoryBus) -> MemoryTransport:
     transport = MemoryTransport(bus)
     transport.connect()
     return transport
+
+
+def repairing() -> list[threading.Thread]:
+    """The threads that bring up what is missing on a leg of a bridge."""
+    return [each for each in threading.enumerate() if each.name == "mesh-bridge-repair"]
 
 
 def test_presence_goes_both_ways_and_state_stays_local(buses: tuple[MemoryBus, MemoryBus]) -> None:
@@ -89,14 +94,14 @@ def test_who_is_near_is_heard_on_the_local_leg_alone(buses: tuple[MemoryBus, Mem
 
 def test_who_is_not_heard_nearby_any_more_is_heard_from_the_broker_again() -> None:
     clock = Clock()
-    near = Near(clock)
+    near = LocalPeers(clock)
     near.note("a")
-    assert near.holds("a")
+    assert "a" in near
     clock.pass_(4)
-    assert not near.holds("a")
+    assert "a" not in near
     for number in range(2000):
         near.note(f"p{number}")
-    assert not near.holds("p0")
+    assert "p0" not in near
 
 
 def test_it_is_connected_while_either_leg_is(buses: tuple[MemoryBus, MemoryBus]) -> None:
@@ -147,7 +152,7 @@ def test_a_leg_that_is_down_at_start_is_brought_up_with_what_was_subscribed_and_
         eventually(late.is_alive)
         far.put(f"strands/{name}/cmd", body)
     assert heard == ["strands/a/cmd"]
-    eventually(lambda: not [each for each in threading.enumerate() if each is both._mender])
+    eventually(lambda: not repairing())
     kept.undeclare()
     both.close()
 
@@ -155,10 +160,9 @@ def test_a_leg_that_is_down_at_start_is_brought_up_with_what_was_subscribed_and_
 def test_a_bridge_that_is_closed_while_a_leg_is_down_leaves_no_thread(buses: tuple[MemoryBus, MemoryBus]) -> None:
     half = BridgeTransport(MemoryTransport(buses[0]), Down(buses[1]))
     half.connect()
-    mender = half._mender
-    assert mender is not None and mender.is_alive()
+    assert repairing()
     half.close()
-    eventually(lambda: not mender.is_alive())
+    eventually(lambda: not repairing())
 
 
 def test_an_unknown_topic_in_the_setting_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +173,7 @@ def test_an_unknown_topic_in_the_setting_is_refused(monkeypatch: pytest.MonkeyPa
 
 def test_what_was_seen_is_forgotten_by_age_and_number() -> None:
     clock = Clock()
-    seen = Seen(clock)
+    seen = SeenCommands(clock)
     message = b'{"sender_id":"x","turn_id":"t","command":{}}'
     assert seen.first(message) is True
     assert seen.first(message) is False

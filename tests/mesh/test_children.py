@@ -191,10 +191,9 @@ class Wedged(World):
         return super().list_policies_running()
 
 
-def shown(peers: Fleet) -> list[str]:
-    """What the robots of ``sim-1`` have declared."""
-    held, own = [*peers.bus._subscribers, *peers.bus._tokens], peers.transports["sim-1"]
-    return [each.key for each in held if each.owner is own and "sim-1__" in each.key]
+def declared_keys(peers: Fleet) -> list[str]:
+    """The keys that the robots of ``sim-1`` have declared."""
+    return [each.key for each in peers.bus.declared_by(peers.transports["sim-1"]) if "sim-1__" in each.key]
 
 
 def test_robots_whose_world_hangs_in_its_read_take_commands_and_are_announced_by_name_alone(peers: Fleet) -> None:
@@ -217,7 +216,7 @@ def test_robots_whose_world_hangs_in_its_read_take_commands_and_are_announced_by
         assert "tool_name" not in console.peers_by_id["sim-1__right"]
         assert console.ping("sim-1__right", timeout=20)["status"] == "ok"
         children.close()
-        assert shown(peers) == []
+        assert declared_keys(peers) == []
     finally:
         world.free.set()
         reading.join(20)
@@ -242,7 +241,7 @@ def test_a_robot_that_begins_while_its_world_leaves_is_taken_away(
     monkeypatch.setattr(transport, "declare_token", while_leaving)
     world.names.append("right")
     eventually(lambda: declared)
-    eventually(lambda: not shown(peers))
+    eventually(lambda: not declared_keys(peers))
     assert len(declared) == 1
 
 
@@ -256,7 +255,7 @@ def test_who_hears_a_robot_may_leave_the_mesh_on_the_thread_that_announces_it(pe
 
     peers.stranger().declare_subscriber("strands/sim-1__left/presence", leave)
     eventually(left.is_set)
-    assert shown(peers) == []
+    assert declared_keys(peers) == []
 
 
 def test_a_broker_that_pins_a_peer_to_its_topics_is_shown_no_children(

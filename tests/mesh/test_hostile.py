@@ -21,7 +21,7 @@ from tests.mesh.peers import Fleet
 from strands_robots.mesh import keys, topics, wire
 from strands_robots.mesh.input import InputReceiver
 from strands_robots.mesh.security import ValidationError, validate_command, validate_input_frame
-from strands_robots.mesh.transport.bridge import Seen
+from strands_robots.mesh.transport.bridge import SeenCommands
 from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
 
 LIMIT = 16 * 1024
@@ -138,7 +138,7 @@ def test_any_signature_is_verified_or_refused(certified: Path, body: dict[str, A
 @given(st.binary(max_size=100) | bodies.map(lambda body: json.dumps(body).encode()))
 @settings(max_examples=120)
 def test_any_bytes_are_a_command_that_was_seen_or_not(data: bytes) -> None:
-    seen = Seen()
+    seen = SeenCommands()
     assert seen.first(data) is True
     assert isinstance(seen.first(data), bool)
 

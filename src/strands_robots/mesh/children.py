@@ -23,7 +23,7 @@ from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.serving import Line, MotionDoor, Server
 from strands_robots.mesh.teleop import TeleopDesk
 from strands_robots.mesh.throttle import AuditThrottle
-from strands_robots.mesh.transport import Handle, LiveTransport, TransportError
+from strands_robots.mesh.transport import Declaration, LiveTransport, TransportError
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, identifier
 
@@ -99,7 +99,7 @@ class OneRobot:
 class _Child:
     context: Context
     herald: PresencePublisher
-    held: list[Handle]
+    held: list[Declaration]
     begun: float
     # In memory a heartbeat is delivered on the thread that announces, and who hears it may leave the mesh there.
     leaving: threading.RLock = field(default_factory=threading.RLock)
@@ -213,7 +213,7 @@ class Children:
         server = Server(
             context, self._lanes, door, self._locked, dispatch, line=self._line.of(name), meant=dispatcher.meant
         )
-        held: list[Handle] = []
+        held: list[Declaration] = []
         child = _Child(context, PresencePublisher(context, self._kind, robot.facts), held, context.monotonic())
         held.append(transport.declare_subscriber(topics.command(peer), server.on_command))
         held.append(transport.declare_subscriber(topics.broadcast(), server.on_command))

@@ -12,7 +12,7 @@ from typing import Any
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.transport import Handle, LiveTransport, Sample, TransportError
+from strands_robots.mesh.transport import Declaration, LiveTransport, Sample, TransportError
 from strands_robots.mesh.wire_identity import IdentityError
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class PresencePublisher:
         self._leaving: dict[tuple[str, str], float] = {}
         self._judged_later = self._token_declared = False
         self._anchored_at: float | None = None
-        self._handles: list[Handle] = []
+        self._handles: list[Declaration] = []
         self._host = socket.gethostname()
 
     def start(self) -> None:

@@ -1,4 +1,4 @@
-"""The operator's resume key: the mesh's documented door to :mod:`strands_robots.safety.resume`.
+"""The operator's resume key: signing and checking, with the ``keygen`` command.
 
 ``python -m strands_robots.mesh.resume_authority keygen FILE`` asks for a passphrase twice, writes the encrypted key
 and prints its public half for ``STRANDS_MESH_RESUME_PUBLIC_KEY``.
@@ -20,7 +20,7 @@ USAGE = "usage: python -m strands_robots.mesh.resume_authority keygen FILE"
 
 
 def main(arguments: Sequence[str], ask: Callable[[str], str] = getpass.getpass) -> int:
-    """The command; 0 when the key was written, 1 when it was refused, 2 for another command line."""
+    """Run the command; 0 when the key was written, 1 when it was refused, 2 for another command line."""
     if len(arguments) != 2 or arguments[0] != "keygen":
         print(USAGE, file=sys.stderr)
         return 2

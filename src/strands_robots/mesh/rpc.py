@@ -1,4 +1,4 @@
-"""Asking other peers: turns, who may answer them, and what their answers are worth."""
+"""Requests to other peers: turns, the peers that may answer them, and the checks of their replies."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ REPLIES_MAX = 4096
 _NO_ID = frozenset("/*$?#")
 REPEAT_S = 0.5
 
-Refusal = dict[str, Any]
-
 
 @dataclass(slots=True)
 class Turn:
-    """One question under way. ``arrived`` gives the replies that count, in turn, and None when the mesh was stopped.
+    """One pending request.
 
-    A question that is asked again has another id: a receiver refuses the second command of one id as a replay.
+    A request that is sent again has another id: a receiver refuses the second command of one id as a replay.
 
     Attributes:
-        ids: every id that it was asked under.
-        via: ``direct`` where the transport tells whether anybody takes the command, else ``publish``.
-        confirmed: the transport said that somebody takes it.
+        expected: id of the responder, or :data:`BROADCAST_RESPONDER`.
+        ids: every id that the request was sent under.
+        arrived: the replies that count, in order, and None when the mesh was stopped.
+        via: ``direct`` where the transport reports whether the topic has subscribers, else ``publish``.
+        confirmed: the transport reported a subscriber.
     """
 
     expected: str
@@ -53,11 +53,11 @@ class Turn:
     confirmed: bool = False
 
     def next(self, seconds: float) -> dict[str, Any] | None:
-        """The next reply. Raises Empty after ``seconds`` without one."""
+        """Wait for the next reply. Raises Empty after ``seconds`` without one."""
         return self.arrived.get(timeout=min(seconds, threading.TIMEOUT_MAX))
 
     def delivery(self) -> dict[str, Any]:
-        """How the command travelled, for whoever sent it."""
+        """The fields that report the delivery of the command to its sender."""
         return {"via": self.via, "confirmed": self.confirmed}
 
 
@@ -70,9 +70,9 @@ class Requester:
         self._lock = threading.Lock()
 
     def send(self, target: object, command: object, timeout: object) -> dict[str, Any]:
-        """The raw reply of ``target``; or status ``timeout``; or status ``error`` with the refused precondition.
+        """Return the raw reply of ``target``, or status ``timeout``, or status ``error`` with the reason.
 
-        What was sent is told how: ``via`` and ``confirmed`` are ours, whatever a reply says under these names.
+        ``via`` and ``confirmed`` report the delivery, and replace fields of these names in the reply.
         """
         prepared = self._prepare(target, command, timeout)
         if isinstance(prepared, str):
@@ -91,7 +91,7 @@ class Requester:
             self._close(turn)
 
     def ping(self, target: object, timeout: object) -> dict[str, Any]:
-        """One ping: status ok, timeout or error; the round trip in milliseconds; how it was delivered."""
+        """Ping a peer: status ok, timeout, offline or error, the round trip in milliseconds, and the delivery."""
         started = time.perf_counter()
         reply = self.send(target, {"action": "ping"}, timeout)
         latency = round((time.perf_counter() - started) * 1000, 3)
@@ -109,12 +109,12 @@ class Requester:
     def broadcast(
         self, command: object, timeout: object, missing: Callable[[list[dict[str, Any]]], set[str]] | None = None
     ) -> list[dict[str, Any]]:
-        """The reply of each that answered within ``timeout``; ``[]`` for a refused precondition.
+        """Return the reply of each peer that answered within ``timeout``; ``[]`` for a refused precondition.
 
         Args:
-            missing: the peers still to answer, by the results so far. The collection ends when there is none, and
-                until then the command is sent to each of them again twice a second. A peer's result stands over an
-                error of it.
+            missing: returns the peers still to answer, given the results so far. The collection ends when there is
+                none, and until then the command is sent to each of them again twice a second. A peer's result
+                replaces an error of it.
         """
         prepared = self._prepare("all", command, timeout)
         if isinstance(prepared, str):
@@ -147,13 +147,13 @@ class Requester:
         deadline = now + seconds
         again = now + REPEAT_S if missing is not None else deadline
         while now < deadline and (missing is None or absent()):
-            with contextlib.suppress(Empty):  # nobody answered in this stretch
+            with contextlib.suppress(Empty):  # no answer in this interval
                 reply = turn.next(min(deadline, again) - now)
                 if reply is None:
                     break
-                who = str(reply["responder_id"])
-                if who not in replies or (replies[who]["type"], reply["type"]) == ("error", "response"):
-                    replies[who] = reply
+                peer = str(reply["responder_id"])
+                if peer not in replies or (replies[peer]["type"], reply["type"]) == ("error", "response"):
+                    replies[peer] = reply
             now = time.monotonic()
             if missing is not None and now >= again:
                 again = now + REPEAT_S
@@ -162,7 +162,7 @@ class Requester:
         return list(replies.values())
 
     def on_response(self, sample: Sample) -> None:
-        """A sample on our response topic: counted, or refused and audited."""
+        """Take a sample on our response topic: count it, or refuse and audit it."""
         context = self._context
         try:
             body = wire.decode(sample.payload, topics.BY_NAME["response"].max_bytes)
@@ -174,7 +174,7 @@ class Requester:
             turn = self._turns.get(reply.turn_id)
         if turn is None:
             return
-        why = self._hijacked(sample, reply, turn)
+        why = self._hijack_reason(sample, reply, turn)
         if why is not None:
             logger.warning("A reply in the name of %s was refused: %s.", shown(reply.responder_id), why)
             context.audit("response_hijack_rejected", reply.responder_id, turn_id=reply.turn_id, reason=why)
@@ -182,13 +182,13 @@ class Requester:
         self._count(sample, reply, turn, body)
 
     def close(self) -> None:
-        """Wake everybody who waits for a reply."""
+        """Wake every thread that waits for a reply."""
         with self._lock:
             turns = list(self._turns.values())
         for turn in turns:
             turn.arrived.put(None)
 
-    def _hijacked(self, sample: Sample, reply: wire.Reply, turn: Turn) -> str | None:
+    def _hijack_reason(self, sample: Sample, reply: wire.Reply, turn: Turn) -> str | None:
         parts = sample.key.split("/")
         if len(parts) != 5:
             return "the legacy key names no responder"
@@ -205,12 +205,12 @@ class Requester:
         return None
 
     def _count(self, sample: Sample, reply: wire.Reply, turn: Turn, body: dict[str, Any]) -> None:
-        who = (sample.session, reply.responder_id, reply.turn_id)
+        responder = (sample.session, reply.responder_id, reply.turn_id)
         with self._lock:
-            duplicate = who in turn.answered
+            duplicate = responder in turn.answered
             counts = not duplicate and len(turn.answered) < REPLIES_MAX
             if counts:
-                turn.answered.add(who)
+                turn.answered.add(responder)
         if counts:
             body.pop("sig", None)
             turn.arrived.put(body)
@@ -261,12 +261,12 @@ class Requester:
 
 
 def stop_outcome(reply: Mapping[str, Any]) -> Outcome:
-    """What a raw reply to a ``stop`` says; only a peer's result can say stopped, and what is no reply is silence."""
+    """Grade a raw reply to a ``stop``: only a result can say stopped, and what is no reply counts as no answer."""
     if reply.get("type") == "response":
         return grade(reply.get("result"))
     return Outcome.RAISED if reply.get("type") == "error" else Outcome.TIMED_OUT
 
 
-def refused(why: str) -> Refusal:
-    """The answer for a command that never left."""
+def refused(why: str) -> dict[str, Any]:
+    """Return the answer for a command that was not sent."""
     return {"status": "error", "error": why, "reason": why}

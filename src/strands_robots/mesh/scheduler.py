@@ -1,6 +1,6 @@
-"""One paced scheduler for everything a peer publishes periodically.
+"""Scheduler of the periodic jobs of a peer.
 
-Two threads, whatever the number of jobs: a timer that runs the quick ones itself (presence must not wait for a
+It has two threads, whatever the number of jobs: a timer that runs the quick ones itself (presence must not wait for a
 motor bus), and a sampler for those that read hardware. A job that is late or still running skips its missed
 deadlines; it never catches up in a burst.
 """
@@ -58,11 +58,6 @@ class Scheduler:
                 period = max(MIN_PERIOD_S, 1.0 / hz)
                 self._jobs[name] = Job(name, period, run, quick, self._clock())
             self._wake.notify_all()
-
-    def cancel(self, name: str) -> None:
-        """Forget a job; one that runs at this moment ends its turn."""
-        with self._wake:
-            self._jobs.pop(name, None)
 
     def start(self) -> None:
         with self._wake:

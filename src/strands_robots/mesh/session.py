@@ -1,6 +1,6 @@
-"""The mesh's shared session and the registry of peers: one of each in a process.
+"""The shared session of the mesh and the registry of peers: one of each in a process.
 
-The session is opened with its first user and closed with its last. Without stated endpoints (``ZENOH_CONNECT``,
+The session is opened for its first user and closed with its last. Without stated endpoints (``ZENOH_CONNECT``,
 ``ZENOH_LISTEN``) the first process of a machine is the hub on ``tcp/127.0.0.1:STRANDS_MESH_PORT`` and the others
 are its clients; when it dies a survivor takes the port. Zenoh is imported with the first session, not before.
 """
@@ -46,12 +46,12 @@ _registry = PeerRegistry(
 
 
 class _Shared:
-    """The one transport of this process and how many hold it."""
+    """The one transport of this process, and the number of references to it."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.transport: Transport | None = None
-        self.holders = 0
+        self.references = 0
 
     def acquire(self) -> Transport | None:
         if mesh_env_request() is False:
@@ -65,17 +65,17 @@ class _Shared:
                     logger.error("The mesh has no session: %s", exc)  # noqa: TRY400 - one sentence, no trace
                     return None
                 self.transport = transport
-            self.holders += 1
+            self.references += 1
             return self.transport
 
     def release(self) -> None:
         with self.lock:
             if self.transport is None:
                 return
-            self.holders -= 1
-            if self.holders > 0:
+            self.references -= 1
+            if self.references > 0:
                 return
-            transport, self.transport, self.holders = self.transport, None, 0
+            transport, self.transport, self.references = self.transport, None, 0
         try:
             transport.close()
         except zenoh_error_types() as exc:
@@ -83,39 +83,39 @@ class _Shared:
         else:
             logger.info("The mesh's session is closed.")
 
-    def end(self) -> None:
-        """Close whoever still holds it: Zenoh hangs an interpreter that ends with a subscriber declared."""
+    def close(self) -> None:
+        """Close it whatever the references: an interpreter that ends with a Zenoh subscriber declared hangs."""
         with self.lock:
-            self.holders = min(self.holders, 1)
+            self.references = min(self.references, 1)
         self.release()
 
 
 _shared = _Shared()
-atexit.register(_shared.end)
+atexit.register(_shared.close)
 
 
 def acquire() -> Transport | None:
-    """One reference to the shared transport; None when the mesh is off or cannot be opened, which is logged."""
+    """Take a reference to the shared transport; None when the mesh is off or cannot be opened, which is logged."""
     return _shared.acquire()
 
 
 def get_session() -> Any | None:
-    """One reference to the shared session: a ``zenoh.Session``, or the transport of another backend, or None."""
-    return _shown(acquire())
+    """Take a reference to the shared session: a ``zenoh.Session``, the transport of another backend, or None."""
+    return _session_of(acquire())
 
 
 def release_session() -> None:
-    """Give one reference back; the last one closes the session."""
+    """Release one reference; the last one closes the session."""
     _shared.release()
 
 
 def current_session() -> Any | None:
-    """The session as it is, without taking a reference."""
-    return _shown(_shared.transport)
+    """Return the session, if it is open, without taking a reference."""
+    return _session_of(_shared.transport)
 
 
 def session_alive() -> bool:
-    """Whether the session is open."""
+    """True while the session is open."""
     transport = _shared.transport
     return transport is not None and transport.is_alive()
 
@@ -135,7 +135,7 @@ def put(key: str, data: dict[str, Any]) -> None:
 
 
 def zenoh_error_types() -> tuple[type[BaseException], ...]:
-    """What Zenoh raises for faults of the transport, besides the operating system's; no ZError without Zenoh."""
+    """Exception types of a transport's faults: Zenoh's, where it is installed, and the operating system's."""
     try:
         import zenoh  # noqa: PLC0415 - optional, loaded when used
     except ImportError:
@@ -144,17 +144,17 @@ def zenoh_error_types() -> tuple[type[BaseException], ...]:
 
 
 def registry() -> PeerRegistry:
-    """The registry that every mesh of this process shares."""
+    """Return the registry that every mesh of this process shares."""
     return _registry
 
 
 def get_peers() -> list[dict[str, Any]]:
-    """All known peers, as plain dicts."""
+    """Return all known peers as plain dicts."""
     return _registry.all()
 
 
 def get_peer(peer_id: str, max_age_s: float | None = None) -> dict[str, Any] | None:
-    """One peer, or None when it is unknown or silent for longer than ``max_age_s`` seconds.
+    """Return one peer, or None when it is unknown or silent for longer than ``max_age_s`` seconds.
 
     Raises:
         ValidationError: ``max_age_s`` is not positive and finite.
@@ -163,20 +163,20 @@ def get_peer(peer_id: str, max_age_s: float | None = None) -> dict[str, Any] | N
 
 
 def update_peer(peer_id: str, peer_type: str, hostname: str, caps: dict[str, Any]) -> bool:
-    """Insert or refresh a peer. True when it is new."""
+    """Insert or refresh a peer; True when it is new."""
     return _registry.update(peer_id, peer_type, hostname, caps)
 
 
 def clear_peers() -> None:
-    """Forget every peer. For tests."""
+    """Remove every peer; for tests."""
     _registry.clear()
 
 
 def prune_peers(timeout: float = PEER_TIMEOUT) -> list[str]:
-    """Forget the peers silent for longer than ``timeout`` and ``STRANDS_MESH_PEER_RETENTION_S``; their ids."""
+    """Remove peers silent for more than ``timeout`` s and ``STRANDS_MESH_PEER_RETENTION_S``; return their ids."""
     return _registry.prune(number("timeout", timeout, above=0))
 
 
-def _shown(transport: Transport | None) -> Any | None:
-    # A Zenoh user is given the raw session, which its documentation speaks of.
+def _session_of(transport: Transport | None) -> Any | None:
+    # Users of Zenoh expect its own session object.
     return getattr(transport, "session", None) or transport

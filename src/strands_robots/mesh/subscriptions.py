@@ -1,4 +1,4 @@
-"""What the user of a mesh subscribed to, delivered off the transport's thread."""
+"""Subscriptions of a mesh's user, delivered off the transport's thread."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.executor import Lane
-from strands_robots.mesh.transport import Handle, Sample, Transport, TransportError
+from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError
 
 logger = logging.getLogger(__name__)
 
@@ -22,22 +21,16 @@ SampleCallback = Callable[[str, dict[str, Any], str | None], None]
 INBOX_MAX = 256
 
 
-@dataclass(slots=True)
-class _Entry:
-    topic: str
-    handle: Handle
-
-
 class Subscriptions:
-    """Named subscriptions of one peer. Callbacks run one after another on the delivery lane.
+    """Named subscriptions of one peer. Callbacks run one after another on the delivery thread.
 
-    A callback that is slow loses the oldest messages; it never holds up a command or a stop.
+    A slow callback loses the oldest messages; it never delays a command or a stop.
     """
 
     def __init__(self, lane: Lane) -> None:
         self._lane = lane
         self._lock = threading.Lock()
-        self._entries: dict[str, _Entry] = {}
+        self._declared: dict[str, Declaration] = {}
         self.inbox: dict[str, deque[dict[str, Any]]] = {}
 
     def add(
@@ -53,17 +46,16 @@ class Subscriptions:
         """Subscribe under ``name``, replacing what had that name; False when the transport refused.
 
         Args:
-            direct: hears the raw sample on the transport's thread instead, for parts of the mesh.
+            direct: called with the raw sample on the transport's thread instead, for parts of the mesh.
         """
-        heard = direct or self._deliverer(topic, callback, name, on_sample)
         try:
-            handle = transport.declare_subscriber(topic, heard)
+            declared = transport.declare_subscriber(topic, direct or self._deliverer(callback, name, on_sample))
         except TransportError as exc:
             logger.warning("subscribe %s: %s", topic, exc)
             return False
         self.remove(name)
         with self._lock:
-            self._entries[name] = _Entry(topic, handle)
+            self._declared[name] = declared
             if callback is None and on_sample is None and direct is None:
                 self.inbox.setdefault(name, deque(maxlen=INBOX_MAX))
         return True
@@ -71,21 +63,21 @@ class Subscriptions:
     def remove(self, name: str) -> bool:
         """Undeclare; False when there is none of that name."""
         with self._lock:
-            entry = self._entries.pop(name, None)
+            declared = self._declared.pop(name, None)
             self.inbox.pop(name, None)
-        if entry is None:
+        if declared is None:
             return False
         with contextlib.suppress(TransportError):  # the session may be gone, and the subscriber with it
-            entry.handle.undeclare()
+            declared.undeclare()
         return True
 
     def clear(self) -> int:
         """Undeclare all of them; how many there were."""
-        names = list(self._entries)
+        names = list(self._declared)
         return sum(self.remove(name) for name in names)
 
     def _deliverer(
-        self, topic: str, callback: DataCallback | None, name: str, on_sample: SampleCallback | None
+        self, callback: DataCallback | None, name: str, on_sample: SampleCallback | None
     ) -> Callable[[Sample], None]:
         def deliver(sample: Sample) -> None:
             try:
@@ -98,11 +90,11 @@ class Subscriptions:
             elif callback is not None:
                 callback(sample.key, data)
             else:
-                box = self.inbox.get(name)
-                if box is not None:
-                    box.append({"key": sample.key, **data})
+                inbox = self.inbox.get(name)
+                if inbox is not None:
+                    inbox.append({"key": sample.key, **data})
 
-        def heard(sample: Sample) -> None:
+        def submit(sample: Sample) -> None:
             self._lane.submit(lambda: deliver(sample))
 
-        return heard
+        return submit

@@ -1,7 +1,7 @@
-"""What each topic carries: one table of keys, rates, sizes, quality of service and retention.
+"""The table of topics: keys, rates, sizes, quality of service and retention.
 
 The Zenoh configuration, the MQTT mapping, the bridge and the publishers read this table and nothing else. A key
-is written without Zenoh's namespace, which the session adds on top.
+is written without Zenoh's namespace, which the session adds.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ class Topic:
     Attributes:
         pattern: key expression, ``*`` one segment and ``**`` any number of them.
         rate_hz: the publisher's default rate; 0 is off or on event.
-        ceiling_hz: what the transport lets through from one link. None where a lawful message must never be
-            dropped: a Zenoh downsampler drops by spacing, so two commands sent side by side would lose one.
+        ceiling_hz: rate that the transport admits from one link. None where a valid message must never be dropped:
+            a Zenoh downsampler drops by spacing, so of two commands sent side by side one would be lost.
         max_bytes: largest encoded message.
         reliable: delivered in order without loss while a link holds, and sent before telemetry.
         qos: MQTT quality of service; None is not sent over MQTT.
-        retain: the MQTT broker keeps the last one for late joiners.
+        retain: the MQTT broker stores the last one for late joiners.
         bridged: the bridge carries it to the cloud leg.
     """
 
@@ -66,7 +66,7 @@ TABLE: tuple[Topic, ...] = (
 BY_NAME = {topic.name: topic for topic in TABLE}
 
 OTHER = Topic("other", "**", 0, None, 1024 * KIB)
-"""A topic of somebody's own, outside the table."""
+"""A topic outside the table, such as one of the user's own."""
 
 
 def presence(peer: str) -> str:
@@ -128,30 +128,27 @@ def resume() -> str:
 
 
 def matches(pattern: str, key: str) -> bool:
-    """Whether a key expression of ``*`` and ``**`` segments covers a concrete key."""
-    return _covers(tuple(pattern.split("/")), tuple(key.split("/")))
-
-
-def _covers(pattern: tuple[str, ...], key: tuple[str, ...]) -> bool:
+    """True where a key expression of ``*`` and ``**`` segments covers a concrete key."""
     # Iterative with one point to come back to, so that a hostile pattern of many ** costs no exponential time.
+    wanted, parts = pattern.split("/"), key.split("/")
     at = here = 0
     star, mark = -1, 0
-    while here < len(key):
-        if at < len(pattern) and pattern[at] == "**":
+    while here < len(parts):
+        if at < len(wanted) and wanted[at] == "**":
             star, mark = at, here
             at += 1
-        elif at < len(pattern) and pattern[at] in ("*", key[here]):
+        elif at < len(wanted) and wanted[at] in ("*", parts[here]):
             at, here = at + 1, here + 1
         elif star >= 0:
             mark += 1
             at, here = star + 1, mark
         else:
             return False
-    return all(part == "**" for part in pattern[at:])
+    return all(part == "**" for part in wanted[at:])
 
 
 def topic_of(key: str) -> Topic:
-    """The row a key falls under; :data:`OTHER` where it is nobody's."""
+    """Return the row that a key falls under, :data:`OTHER` where there is none."""
     # A reply's key is used once, so remembering it would only push the others out.
     parts = key.split("/", 3)
     if len(parts) > 2 and parts[0] == ROOT and parts[2] == "response":

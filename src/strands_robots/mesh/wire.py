@@ -20,7 +20,7 @@ AHEAD_S = 5.0
 
 
 class WireError(StrandsRobotsError, ValueError):
-    """Bytes that are no message of this wire, and why."""
+    """Bytes that are no message of this wire; the message says why."""
 
 
 class TooLargeError(WireError):
@@ -28,7 +28,7 @@ class TooLargeError(WireError):
 
 
 def encode(payload: Mapping[str, Any], limit: int) -> bytes:
-    """UTF-8 JSON. A number that is not finite becomes null, because JSON has none.
+    """Return UTF-8 JSON. A number that is not finite becomes null, because JSON has none.
 
     Raises:
         TooLargeError: more than ``limit`` bytes.
@@ -46,7 +46,7 @@ def encode(payload: Mapping[str, Any], limit: int) -> bytes:
 
 
 def decode(data: bytes, limit: int) -> dict[str, Any]:
-    """The JSON object in ``data``.
+    """Return the JSON object in ``data``.
 
     Raises:
         WireError: too long, not UTF-8, not JSON, not an object, or a number that is not finite.
@@ -63,12 +63,12 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
 
 
 def canonical(value: object) -> bytes:
-    """Sorted compact JSON: the bytes that signatures cover."""
+    """Return sorted compact JSON: the bytes that signatures cover."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def finite(value: object) -> float | None:
-    """A finite JSON number as a float, or None; a boolean is no number."""
+    """Return a finite JSON number as a float, or None; a boolean is no number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -79,12 +79,12 @@ def finite(value: object) -> float | None:
 
 
 def fresh(stamp: float, now: float) -> bool:
-    """Whether a sender's wall-clock time is at most 60 s old and 5 s ahead."""
+    """True for a sender's wall-clock time at most 60 s old and 5 s ahead."""
     return -AHEAD_S <= now - stamp <= FRESH_S
 
 
-def _refuse_constant(word: str) -> float:
-    raise WireError(f"{word} is no JSON number")
+def _refuse_constant(name: str) -> float:
+    raise WireError(f"{name} is no JSON number")
 
 
 def _encode_finite(payload: Mapping[str, Any]) -> bytes:
@@ -111,7 +111,7 @@ _DECODER = json.JSONDecoder(parse_constant=_refuse_constant)
 
 @dataclass(frozen=True, slots=True)
 class Presence:
-    """A heartbeat: who is there and what it can do. ``body`` is the message as it came, signature included."""
+    """A heartbeat: a peer and its capabilities. ``body`` is the message as received, signature included."""
 
     robot_id: str
     robot_type: str
@@ -121,7 +121,7 @@ class Presence:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Presence:
-        """Raises WireError for a missing id or time; type and host are text of at most 256 characters."""
+        """Parse ``body``. Raises WireError for a missing id or time; type and host are cut to 256 characters."""
         return cls(
             _identifier(body, "robot_id"),
             _label(body.get("robot_type"), "robot"),
@@ -131,7 +131,7 @@ class Presence:
         )
 
     def facts(self) -> dict[str, Any]:
-        """What a registry keeps besides id, type and host."""
+        """The fields of a registry's row besides id, type and host."""
         known = {"robot_id", "robot_type", "hostname", "sig"}
         return {key: value for key, value in self.body.items() if key not in known}
 
@@ -156,14 +156,14 @@ class Request:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Request:
-        """Raises WireError for a sender or a turn that is no identifier; a time may be missing."""
+        """Parse ``body``. Raises WireError for a sender or a turn that is no identifier; a time may be missing."""
         sender, turn = _identifier(body, "sender_id"), _identifier(body, "turn_id")
         return cls(sender, turn, body.get("command"), finite(body.get("timestamp")), body)
 
 
 @dataclass(slots=True)  # not frozen: that would cost each message a microsecond
 class Reply:
-    """What a peer answers in a turn: ``result`` of a response, ``error`` text of an error."""
+    """The answer of a peer in a turn: ``result`` of a response, ``error`` text of an error."""
 
     type: Literal["response", "error"]
     responder_id: str
@@ -174,20 +174,20 @@ class Reply:
     body: Mapping[str, Any] = field(default_factory=dict)
 
     def to_wire(self) -> dict[str, Any]:
-        said: dict[str, Any] = {"error": self.error} if self.type == "error" else {"result": self.result}
+        answer: dict[str, Any] = {"error": self.error} if self.type == "error" else {"result": self.result}
         head = {"type": self.type, "responder_id": self.responder_id, "turn_id": self.turn_id}
-        return {**head, **said, "timestamp": self.timestamp}
+        return {**head, **answer, "timestamp": self.timestamp}
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Reply:
-        """Raises WireError for another ``type`` or an id that is none."""
+        """Parse ``body``. Raises WireError for another ``type`` or an id that is no identifier."""
         kind = body.get("type")
         if kind not in ("response", "error"):
             raise WireError(f"type must be response or error, not {shown(kind)}")
         responder, turn = _identifier(body, "responder_id"), _identifier(body, "turn_id")
-        words = body.get("error")
-        error = words if isinstance(words, str) else ""
-        return cls(kind, responder, turn, body.get("result"), error, finite(body.get("timestamp")) or 0.0, body)
+        error = body.get("error")
+        text, stamp = error if isinstance(error, str) else "", finite(body.get("timestamp")) or 0.0
+        return cls(kind, responder, turn, body.get("result"), text, stamp, body)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +199,6 @@ class EstopNotice:
     estop_id: str | None
     source_zid: str | None
     counts: Mapping[str, Any] = field(default_factory=dict)
-    body: Mapping[str, Any] = field(default_factory=dict)
 
     def to_wire(self) -> dict[str, Any]:
         body = {"peer_id": self.peer_id, "t": self.t, "estop_id": self.estop_id, **self.counts}
@@ -207,7 +206,7 @@ class EstopNotice:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> EstopNotice:
-        """Raises WireError for an empty issuer or a time that is no finite number."""
+        """Parse ``body``. Raises WireError for an empty issuer or a time that is no finite number."""
         issuer = body.get("peer_id")
         if not isinstance(issuer, str) or not issuer.strip() or len(issuer) > 256:
             raise WireError(f"peer_id must name the issuer, not {shown(issuer)}")
@@ -217,7 +216,6 @@ class EstopNotice:
             _time(body, "t"),
             epoch if isinstance(epoch, str) and is_hex(epoch, 32) else None,
             zid if isinstance(zid, str) else None,
-            body=body,
         )
 
 
@@ -236,7 +234,7 @@ class ResumeRelay:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> ResumeRelay:
-        """Raises WireError for a relaying peer that is no identifier or a time that is no finite number."""
+        """Parse ``body``. Raises WireError for a peer that is no identifier or a time that is no finite number."""
         zid = body.get("source_zid")
         return cls(
             _identifier(body, "peer_id"),
@@ -247,7 +245,7 @@ class ResumeRelay:
 
 
 def is_hex(text: str, length: int) -> bool:
-    """Lower-case hexadecimal of exactly ``length`` digits."""
+    """True for lower-case hexadecimal of exactly ``length`` digits."""
     return len(text) == length and all(c in "0123456789abcdef" for c in text)
 
 

@@ -15,7 +15,7 @@ from strands_robots.errors import StrandsRobotsError
 __all__ = [
     "BridgeTransport",
     "Callback",
-    "Handle",
+    "Declaration",
     "IotMqttTransport",
     "LiveTransport",
     "LivenessCallback",
@@ -71,7 +71,7 @@ LivenessCallback = Callable[[str, bool], None]
 """Called with the key of a liveliness token and whether it is there."""
 
 
-class Handle(Protocol):
+class Declaration(Protocol):
     """A declared subscriber or token."""
 
     def undeclare(self) -> None:
@@ -97,7 +97,7 @@ class Transport(Protocol):
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         """Publish. Raises TransportError when closed, WireError for a message above its topic's size."""
 
-    def declare_subscriber(self, key: str, callback: Callback) -> Handle:
+    def declare_subscriber(self, key: str, callback: Callback) -> Declaration:
         """Receive a key expression; ``*`` is one segment, ``**`` any number. Raises TransportError when closed."""
 
 
@@ -105,10 +105,10 @@ class Transport(Protocol):
 class LiveTransport(Protocol):
     """A transport that can tell at once when a session ends."""
 
-    def declare_token(self, key: str) -> Handle:
+    def declare_token(self, key: str) -> Declaration:
         """Show ``key`` as alive until it is undeclared or this session ends."""
 
-    def watch_tokens(self, key: str, callback: LivenessCallback) -> Handle:
+    def watch_tokens(self, key: str, callback: LivenessCallback) -> Declaration:
         """Call back for every token that comes or goes, those already there included."""
 
 

@@ -1,4 +1,4 @@
-"""Both legs at once: everything on Zenoh, and what the fleet's cloud side needs on MQTT."""
+"""Two transports as one: everything on Zenoh, the local leg, and the bridged topics on MQTT, the cloud leg."""
 
 from __future__ import annotations
 
@@ -13,25 +13,34 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport import Callback, Handle, LivenessCallback, Sample, Transport, TransportError
+from strands_robots.mesh.transport import (
+    Callback,
+    Declaration,
+    LivenessCallback,
+    LiveTransport,
+    Sample,
+    Transport,
+    TransportError,
+)
 
 logger = logging.getLogger(__name__)
 
 SEEN_S = 120.0
 SEEN_MAX = 10_000
-NEAR_S = 3.0
-NEAR_MAX = 1024
+LOCAL_S = 3.0
+LOCAL_MAX = 1024
 RETRY_S = 1.0
 RETRY_MAX_S = 8.0
 CLOSE_S = 1.0
-OWED = frozenset({"estop", "resume"})
-OWED_MAX = 64
+SAFETY = frozenset({"estop", "resume"})
+UNSENT_MAX = 64
 
-ALSO_NEAR = frozenset({"presence", "response", "health", "safety_event"})
+LOCAL_FIRST = frozenset({"presence", "response", "health", "safety_event"})
+"""Topics on which a message from the cloud leg is dropped while its publisher is on the local leg."""
 
 
-class Seen:
-    """Commands that came by one leg and need not be served again by the other; bounded by age and number."""
+class SeenCommands:
+    """Commands that came by one leg and are not served again for the other; bounded by age and number."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -39,7 +48,7 @@ class Seen:
         self._lock = threading.Lock()
 
     def first(self, payload: bytes) -> bool:
-        """False when a message with this sender, turn and command was there already."""
+        """False when a message with this sender, turn and command came before."""
         mark = _mark(payload)
         if mark is None:
             return True
@@ -55,10 +64,10 @@ class Seen:
             return True
 
 
-class Near:
-    """Peers heard of on the local leg lately: what the broker brings of them as well says less and is left out.
+class LocalPeers:
+    """Peers that sent a heartbeat on the local leg lately.
 
-    Their heartbeat there names no session, and its signature would count only once.
+    Their heartbeat from the broker is dropped: it names no session, and its signature would count only once.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -70,66 +79,58 @@ class Near:
         with self._lock:
             self._at.pop(peer, None)
             self._at[peer] = self._clock()
-            while len(self._at) > NEAR_MAX:
+            while len(self._at) > LOCAL_MAX:
                 del self._at[next(iter(self._at))]
 
-    def holds(self, peer: str) -> bool:
+    def __contains__(self, peer: str) -> bool:
         at = self._at.get(peer)
-        return at is not None and self._clock() - at <= NEAR_S
+        return at is not None and self._clock() - at <= LOCAL_S
 
 
-class _Nothing:
+class _NoToken:
     def undeclare(self) -> None:
         """There is nothing to undeclare."""
 
 
-class _Both:
-    """One subscriber on the legs it belongs to; what a leg that is down owes it waits."""
+class _BridgedSubscriber:
+    """One subscriber on the legs that carry its topic; ``pending`` are those it is not declared on yet."""
 
-    def __init__(self, key: str, heard: list[tuple[Transport, Callback]]) -> None:
+    def __init__(self, key: str, callbacks: list[tuple[Transport, Callback]]) -> None:
         self.key = key
-        self._waiting = heard
-        self._handles: list[Handle] = []
-        self._gone = False
+        self.pending = callbacks
+        self._declared: list[Declaration] = []
+        self.gone = False
         self._lock = threading.Lock()
 
-    @property
-    def whole(self) -> bool:
-        return not self._waiting
-
-    def settle(self) -> list[str]:
-        """Declare on every leg that is up and has it not; why that failed, for each that refused."""
+    def declare(self) -> list[str]:
+        """Declare on every pending leg that is up; return the reason of each that refused."""
         problems: list[str] = []
         with self._lock:
-            for entry in [] if self._gone else list(self._waiting):
+            for entry in [] if self.gone else list(self.pending):
                 leg, callback = entry
                 if not leg.is_alive():
                     continue
                 try:
-                    self._handles.append(leg.declare_subscriber(self.key, callback))
+                    self._declared.append(leg.declare_subscriber(self.key, callback))
                 except TransportError as exc:
                     problems.append(str(exc))
                 else:
-                    self._waiting.remove(entry)
+                    self.pending.remove(entry)
         return problems
 
     def undeclare(self) -> None:
         with self._lock:
-            handles, self._handles = self._handles, []
-            self._waiting, self._gone = [], True
-        for handle in handles:
-            handle.undeclare()
-
-    @property
-    def gone(self) -> bool:
-        return self._gone
+            declared, self._declared = self._declared, []
+            self.pending, self.gone = [], True
+        for each in declared:
+            each.undeclare()
 
 
 class BridgeTransport:
     """Zenoh and MQTT as one transport; connected while either leg is.
 
-    A leg that is down when the bridge connects is tried again in the background, and then hears what was subscribed
-    meanwhile. The e-stops and resumes that a cloud leg missed are published there as soon as it is up.
+    A leg that is down when the bridge connects is retried in the background, and is then given the subscribers that
+    were declared meanwhile. The e-stops and resumes that a cloud leg missed are published there as soon as it is up.
 
     Args:
         local: the leg that carries everything; Zenoh by default.
@@ -142,16 +143,16 @@ class BridgeTransport:
     def __init__(self, local: Transport | None = None, cloud: Transport | None = None) -> None:
         self._local = local or _zenoh()
         self._cloud = cloud or _iot()
-        self._seen = Seen()
-        self._near = Near()
+        self._seen = SeenCommands()
+        self._local_peers = LocalPeers()
         self._bridged = _bridged_names()
         self._lock = threading.Lock()
         self._joined: set[Transport] = set()
-        self._subscribers: list[_Both] = []
-        self._owed: dict[tuple[str, str], bytes] = {}
+        self._subscribers: list[_BridgedSubscriber] = []
+        self._unsent: dict[tuple[str, str], bytes] = {}
         self._closed = threading.Event()
         self._closed.set()
-        self._mender: threading.Thread | None = None
+        self._repairing: threading.Thread | None = None
 
     @property
     def session_id(self) -> str | None:
@@ -168,20 +169,20 @@ class BridgeTransport:
             raise TransportError(f"neither leg of the bridge connects: {'; '.join(problems)}")
         self._closed = threading.Event()
         for problem in problems:
-            logger.error("One leg of the bridge is down and is tried again: %s", problem)
-        self._mend()
+            logger.error("One leg of the bridge is down and is retried: %s", problem)
+        self._repair()
 
     def close(self) -> None:
         self._closed.set()
         self._local.close()
         self._cloud.close()
         with self._lock:
-            mender, self._mender = self._mender, None
+            repairing, self._repairing = self._repairing, None
             self._joined.clear()
             self._subscribers.clear()
-            self._owed.clear()
-        if mender is not None:
-            mender.join(CLOSE_S)
+            self._unsent.clear()
+        if repairing is not None:
+            repairing.join(CLOSE_S)
 
     def is_alive(self) -> bool:
         return self._local.is_alive() or self._cloud.is_alive()
@@ -195,64 +196,66 @@ class BridgeTransport:
             raise TransportError(f"{key}: {'; '.join(problems)}")
 
     def _put(self, leg: Transport, key: str, topic: topics.Topic, data: bytes) -> str | None:
-        """Why a message did not go by a leg, or None."""
+        """Publish on one leg; return the reason why that failed, or None."""
         cloud = leg is self._cloud
-        said = _sessionless(topic, data) if cloud else data
-        problem = _try(leg.put, key, said) if leg.is_alive() else "this leg of the bridge is not connected"
-        if problem is not None and cloud and topic.name in OWED:
-            self._owe(key, topic, said)
+        sent = _without_session(topic, data) if cloud else data
+        problem = _try(leg.put, key, sent) if leg.is_alive() else "this leg of the bridge is not connected"
+        if problem is not None and cloud and topic.name in SAFETY:
+            self._store_unsent(key, topic, sent)
         return problem
 
-    def declare_subscriber(self, key: str, callback: Callback) -> _Both:
+    def declare_subscriber(self, key: str, callback: Callback) -> _BridgedSubscriber:
         topic = topics.topic_of(key)
         once = topic.name in ("cmd", "broadcast")
 
-        def heard(sample: Sample) -> None:
+        def deliver(sample: Sample) -> None:
             if not once or self._seen.first(sample.payload):
                 callback(sample)
 
-        def near(sample: Sample) -> None:
+        def from_local(sample: Sample) -> None:
             if topic.name == "presence":
-                self._near.note(_publisher(sample.key))
-            heard(sample)
+                self._local_peers.note(_publisher(sample.key))
+            deliver(sample)
 
-        def far(sample: Sample) -> None:
-            if topic.name in ALSO_NEAR and self._near.holds(_publisher(sample.key)):
-                return
-            heard(sample)
+        def from_cloud(sample: Sample) -> None:
+            if topic.name not in LOCAL_FIRST or _publisher(sample.key) not in self._local_peers:
+                deliver(sample)
 
         if not self.is_alive():
             raise TransportError(f"{key}: no leg of the bridge is connected.")
-        both = _Both(key, [(leg, near if leg is self._local else far) for leg in self._legs(topic)])
-        problems = both.settle()
-        if len(problems) == len(self._legs(topic)):
+        legs = self._legs(topic)
+        subscriber = _BridgedSubscriber(key, [(leg, from_local if leg is self._local else from_cloud) for leg in legs])
+        problems = subscriber.declare()
+        if len(problems) == len(legs):
             raise TransportError("; ".join(problems))
         with self._lock:
-            self._subscribers = [each for each in self._subscribers if not each.gone] + [both]
-        self._mend()
-        return both
+            self._subscribers = [each for each in self._subscribers if not each.gone] + [subscriber]
+        self._repair()
+        return subscriber
 
-    def declare_token(self, key: str) -> Handle:
-        declare: Callable[[str], Handle] = getattr(self._local, "declare_token", _nothing)
-        return declare(key) if self._local.is_alive() else _Nothing()
+    def declare_token(self, key: str) -> Declaration:
+        local = self._local
+        return local.declare_token(key) if local.is_alive() and isinstance(local, LiveTransport) else _NoToken()
 
-    def watch_tokens(self, key: str, callback: LivenessCallback) -> Handle:
-        watch: Callable[[str, LivenessCallback], Handle] = getattr(self._local, "watch_tokens", _nothing)
-        return watch(key, callback) if self._local.is_alive() else _Nothing()
+    def watch_tokens(self, key: str, callback: LivenessCallback) -> Declaration:
+        local = self._local
+        return (
+            local.watch_tokens(key, callback) if local.is_alive() and isinstance(local, LiveTransport) else _NoToken()
+        )
 
     @property
     def lost_link_at(self) -> float:
-        """When the local leg last lost its hub, monotonic seconds."""
+        """Monotonic seconds at which the local leg last lost its hub."""
         at: float = getattr(self._local, "lost_link_at", -math.inf)
         return at
 
     def anchored(self) -> bool:
-        """Whether the local leg can tell who is alive."""
+        """True while the local leg can tell which peers are alive."""
         anchored = getattr(self._local, "anchored", None)
         return bool(anchored()) if callable(anchored) else True
 
     def _join(self) -> list[str]:
-        """Connect the legs that never were; why that failed."""
+        """Connect the legs that never were; return the reason of each that failed."""
         problems: list[str] = []
         for leg in (self._local, self._cloud):
             if leg in self._joined:
@@ -264,12 +267,12 @@ class BridgeTransport:
                 problems.append(problem)
         return problems
 
-    def _mend(self) -> None:
-        """Have a thread bring up what is down, for as long as something is."""
+    def _repair(self) -> None:
+        """Start a thread that connects, declares and publishes until nothing is missing on either leg."""
         with self._lock:
-            if self._mender is None and not self._closed.is_set() and not self._whole():
-                self._mender = threading.Thread(target=self._run, name="mesh-bridge-mend", daemon=True)
-                self._mender.start()
+            if self._repairing is None and not self._closed.is_set() and not self._complete():
+                self._repairing = threading.Thread(target=self._run, name="mesh-bridge-repair", daemon=True)
+                self._repairing.start()
 
     def _run(self) -> None:
         pause, closed = RETRY_S, self._closed
@@ -282,34 +285,34 @@ class BridgeTransport:
                 self._cloud.close()
                 return
             for each in list(self._subscribers):
-                each.settle()
-            self._pay()
+                each.declare()
+            self._publish_unsent()
             with self._lock:
-                if self._whole():
-                    self._mender = None
+                if self._complete():
+                    self._repairing = None
                     logger.info("Both legs of the bridge are up.")
                     return
 
-    def _whole(self) -> bool:
-        return len(self._joined) == 2 and not self._owed and all(each.whole for each in self._subscribers)
+    def _complete(self) -> bool:
+        return len(self._joined) == 2 and not self._unsent and all(not each.pending for each in self._subscribers)
 
-    def _owe(self, key: str, topic: topics.Topic, data: bytes) -> None:
-        """Keep a stop or a resume for the cloud, once for each id, until it is back."""
-        mark = _safety_mark(data, topic)
+    def _store_unsent(self, key: str, topic: topics.Topic, data: bytes) -> None:
+        """Store a stop or a resume for the cloud leg, once for each id, until it is back."""
+        name = (key, _safety_id(data, topic))
         with self._lock:
-            self._owed.pop((key, mark), None)
-            self._owed[key, mark] = data
-            while len(self._owed) > OWED_MAX:
-                del self._owed[next(iter(self._owed))]
-        self._mend()
+            self._unsent.pop(name, None)
+            self._unsent[name] = data
+            while len(self._unsent) > UNSENT_MAX:
+                del self._unsent[next(iter(self._unsent))]
+        self._repair()
 
-    def _pay(self) -> None:
-        for name, data in list(self._owed.items()):
+    def _publish_unsent(self) -> None:
+        for name, data in list(self._unsent.items()):
             if not self._cloud.is_alive() or _try(self._cloud.put, name[0], data) is not None:
                 return
             with self._lock:
-                if self._owed.get(name) is data:
-                    del self._owed[name]
+                if self._unsent.get(name) is data:
+                    del self._unsent[name]
 
     def _legs(self, topic: topics.Topic) -> list[Transport]:
         return [self._local, self._cloud] if topic.name in self._bridged else [self._local]
@@ -326,16 +329,16 @@ def _bridged_names() -> frozenset[str]:
 
 
 def _publisher(key: str) -> str:
-    """Whose a key is: a reply's is the responder's."""
+    """Return the peer that publishes on a key; on the key of a reply that is the responder."""
     parts = key.split("/")
     if len(parts) > 3 and parts[2] == "response":
         return parts[3]
     return parts[1] if len(parts) > 1 else ""
 
 
-def _sessionless(topic: topics.Topic, data: bytes) -> bytes:
-    """A stop or a resume as it goes to the broker: one that names a session is refused where samples have none."""
-    if topic.name not in ("estop", "resume"):
+def _without_session(topic: topics.Topic, data: bytes) -> bytes:
+    """Remove the session from a stop or a resume: receivers refuse it where samples carry no session."""
+    if topic.name not in SAFETY:
         return data
     try:
         body = wire.decode(data, topic.max_bytes)
@@ -345,8 +348,8 @@ def _sessionless(topic: topics.Topic, data: bytes) -> bytes:
     return wire.encode(body, topic.max_bytes)
 
 
-def _safety_mark(data: bytes, topic: topics.Topic) -> str:
-    """What makes two messages of a safety topic the same one: the id of a stop, the nonce of a resume."""
+def _safety_id(data: bytes, topic: topics.Topic) -> str:
+    """Return the id of a stop or the nonce of a resume, by which two messages are the same one."""
     try:
         body = wire.decode(data, topic.max_bytes)
     except wire.WireError:
@@ -370,10 +373,6 @@ def _try(verb: Callable[..., Any], *args: Any) -> str | None:
     except (TransportError, ImportError) as exc:
         return str(exc)
     return None
-
-
-def _nothing(*args: Any) -> _Nothing:
-    return _Nothing()
 
 
 def _zenoh() -> Transport:

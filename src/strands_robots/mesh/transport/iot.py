@@ -1,8 +1,8 @@
-"""The mesh over MQTT 5 with mutual TLS, as AWS IoT Core speaks it.
+"""MQTT 5 with mutual TLS as a transport, for brokers such as AWS IoT Core.
 
-A key is a topic; ``*`` becomes ``+`` and ``**`` becomes ``#``. MQTT names no sessions: which client may write to which
-topic is the broker's policy, so a reply is as good as that policy. Quality of service and retention come from the
-topic table. Proven against a local broker; not verified against AWS.
+A key is a topic; ``*`` becomes ``+`` and ``**`` becomes ``#``. MQTT names no sessions: the broker's policy decides
+which client may write to which topic, so a reply is as trustworthy as that policy. Quality of service and retention
+come from the topic table. Tested against a local broker; not verified against AWS.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ACKNOWLEDGE_S = 5.0
 KEEP_ALIVE_S = 35
 DEFAULT_PORT = 8883
 NO_SUBSCRIBERS = 16
-"""MQTT 5 reason code of a PUBACK: nobody has subscribed to the topic."""
+"""MQTT 5 reason code of a PUBACK: the topic has no subscribers."""
 
 CERT_NAMES = ("cert.pem", "certificate.pem.crt", "{thing}.pem", "{thing}.cert.pem")
 KEY_NAMES = ("key.pem", "private.pem.key", "{thing}.key", "{thing}.private.key")
@@ -37,7 +37,7 @@ KEY_NAMES = ("key.pem", "private.pem.key", "{thing}.key", "{thing}.private.key")
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """Where to connect and as whom: ``thing`` is client id, certificate name and peer id."""
+    """Endpoint and credentials; ``thing`` is client id, certificate name and peer id."""
 
     host: str
     port: int
@@ -48,7 +48,7 @@ class Account:
 
     @classmethod
     def from_settings(cls) -> Account:
-        """Raises TransportError for what is not stated or not there."""
+        """The account that the environment names. Raises TransportError for a setting or file that is missing."""
         endpoint, thing = settings.raw("STRANDS_IOT_ENDPOINT"), settings.raw("STRANDS_IOT_THING_NAME")
         folder = settings.raw("STRANDS_IOT_CERT_DIR")
         stated = {
@@ -83,7 +83,7 @@ class _Subscriber:
 
 
 class IotMqttTransport:
-    """One MQTT 5 client as a transport. It reconnects by itself and subscribes anew where the broker forgot it."""
+    """One MQTT 5 client, which reconnects by itself and subscribes anew where the broker has no session of it."""
 
     def __init__(self, account: Account | None = None) -> None:
         self._account = account
@@ -147,7 +147,7 @@ class IotMqttTransport:
         self._publish(key, payload)
 
     def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
-        """Publish and say whether anybody has subscribed to the topic; None where the broker did not tell in time."""
+        """Publish and return whether the topic has subscribers; None where the broker did not answer in time."""
         future = self._publish(key, payload)
         if future is None:
             return None
@@ -225,8 +225,8 @@ class IotMqttTransport:
         key = packet.topic
         sample = Sample(key, bytes(packet.payload or b""), None, sessionless=True, retained=bool(packet.retain))
         with self._lock:
-            hearers = [each for each in self._subscribers if topics.matches(each.key, key)]
-        for each in hearers:
+            matching = [each for each in self._subscribers if topics.matches(each.key, key)]
+        for each in matching:
             try:
                 each.callback(sample)
             except Exception:

@@ -8,78 +8,64 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, TransportError
 
 
-class _Subscriber:
-    def __init__(self, owner: MemoryTransport, key: str, callback: Callback) -> None:
-        self.owner, self.key, self.callback = owner, key, callback
+@dataclass(eq=False, slots=True)
+class _Declared:
+    """A subscriber, a watcher of tokens, or a token, which has neither callback."""
 
-    def undeclare(self) -> None:
-        self.owner.bus.leave(self)
-
-
-class _Token:
-    def __init__(self, owner: MemoryTransport, key: str) -> None:
-        self.owner, self.key = owner, key
-
-    def undeclare(self) -> None:
-        self.owner.bus.drop_token(self)
-
-
-class _Watch:
-    def __init__(self, owner: MemoryTransport, key: str, callback: LivenessCallback) -> None:
-        self.owner, self.key, self.callback = owner, key, callback
+    owner: MemoryTransport
+    key: str
+    on_sample: Callback | None = None
+    on_token: LivenessCallback | None = None
 
     def undeclare(self) -> None:
         self.owner.bus.leave(self)
 
 
 class MemoryBus:
-    """What the in-memory transports of one mesh share. ``partition`` cuts a session off, as a broken link does."""
+    """State that the in-memory transports of one mesh share."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._subscribers: list[_Subscriber | _Watch] = []
-        self._tokens: list[_Token] = []
+        self._declared: list[_Declared] = []
         self._cut: set[MemoryTransport] = set()
 
-    def join(self, subscriber: _Subscriber | _Watch) -> None:
+    def join(self, declared: _Declared) -> None:
+        """Add a subscriber, watcher or token; a watcher is called for the tokens there are."""
         with self._lock:
-            self._subscribers.append(subscriber)
-            tokens = list(self._tokens)
-        if isinstance(subscriber, _Watch):
-            for token in tokens:
-                self._tell(token, True, [subscriber])
+            self._declared.append(declared)
+            tokens, watchers = self._tokens(), self._watchers()
+        if declared.on_token is not None:
+            self._notify(tokens, [declared], alive=True)
+        elif declared.on_sample is None:
+            self._notify([declared], watchers, alive=True)
 
-    def leave(self, subscriber: _Subscriber | _Watch) -> None:
+    def leave(self, declared: _Declared) -> None:
+        """Remove what was added; twice is once."""
         with self._lock:
-            if subscriber in self._subscribers:
-                self._subscribers.remove(subscriber)
-
-    def add_token(self, token: _Token) -> None:
-        with self._lock:
-            self._tokens.append(token)
-            watchers = [each for each in self._subscribers if isinstance(each, _Watch)]
-        self._tell(token, True, watchers)
-
-    def drop_token(self, token: _Token) -> None:
-        with self._lock:
-            if token not in self._tokens:
+            if declared not in self._declared:
                 return
-            self._tokens.remove(token)
-            watchers = [each for each in self._subscribers if isinstance(each, _Watch)]
-        self._tell(token, False, watchers)
+            self._declared.remove(declared)
+            watchers = self._watchers()
+        if declared.on_sample is None and declared.on_token is None:
+            self._notify([declared], watchers, alive=False)
 
     def forget(self, owner: MemoryTransport) -> None:
+        """Remove all of a session: first its callbacks, then its tokens."""
+        owned = self.declared_by(owner)
+        for each in sorted(owned, key=lambda each: each.on_sample is None and each.on_token is None):
+            each.undeclare()
+
+    def declared_by(self, owner: MemoryTransport) -> list[_Declared]:
+        """The subscribers, watchers and tokens of a session."""
         with self._lock:
-            self._subscribers = [each for each in self._subscribers if each.owner is not owner]
-            tokens = [token for token in self._tokens if token.owner is owner]
-        for token in tokens:
-            self.drop_token(token)
+            return [each for each in self._declared if each.owner is owner]
 
     def partition(self, transport: MemoryTransport, cut: bool = True) -> None:
         """Lose every message from and to a session, until it is healed with ``cut=False``."""
@@ -87,29 +73,37 @@ class MemoryBus:
             (self._cut.add if cut else self._cut.discard)(transport)
 
     def deliver(self, sender: MemoryTransport, sample: Sample) -> None:
+        """Call every subscriber of a sample's key that is not cut off from its sender."""
         with self._lock:
-            hearers = [
-                each
-                for each in self._subscribers
-                if isinstance(each, _Subscriber)
+            callbacks = [
+                each.on_sample
+                for each in self._declared
+                if each.on_sample is not None
                 and topics.matches(each.key, sample.key)
                 and (each.owner is sender or not {sender, each.owner} & self._cut)
             ]
-        for each in hearers:
-            each.callback(sample)
+        for callback in callbacks:
+            callback(sample)
+
+    def _tokens(self) -> list[_Declared]:
+        return [each for each in self._declared if each.on_sample is None and each.on_token is None]
+
+    def _watchers(self) -> list[_Declared]:
+        return [each for each in self._declared if each.on_token is not None]
 
     @staticmethod
-    def _tell(token: _Token, there: bool, watchers: list[_Watch]) -> None:
-        for watch in watchers:
-            if topics.matches(watch.key, token.key):
-                watch.callback(token.key, there)
+    def _notify(tokens: list[_Declared], watchers: list[_Declared], *, alive: bool) -> None:
+        for token in tokens:
+            for watcher in watchers:
+                if watcher.on_token is not None and topics.matches(watcher.key, token.key):
+                    watcher.on_token(token.key, alive)
 
 
 class MemoryTransport:
     """One session on a :class:`MemoryBus`.
 
     Args:
-        bus: shared by all that should hear each other.
+        bus: shared by all sessions that receive each other's messages.
         session: its id, random by default.
         sessionless: publish without a session, as MQTT does.
     """
@@ -135,28 +129,27 @@ class MemoryTransport:
         return self._open
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
-        if not self._open:
-            raise TransportError("the in-memory session is closed.")
-        limit = topics.topic_of(key).max_bytes
-        data = payload if isinstance(payload, bytes) else wire.encode(payload, limit)
+        self._require_open()
+        data = payload if isinstance(payload, bytes) else wire.encode(payload, topics.topic_of(key).max_bytes)
         self.bus.deliver(self, Sample(key, data, self.session_id, self._sessionless))
 
-    def declare_subscriber(self, key: str, callback: Callback) -> _Subscriber:
+    def declare_subscriber(self, key: str, callback: Callback) -> _Declared:
+        self._require_open()
+        return self._declare(_Declared(self, key, on_sample=callback))
+
+    def declare_token(self, key: str) -> _Declared:
+        return self._declare(_Declared(self, key))
+
+    def watch_tokens(self, key: str, callback: LivenessCallback) -> _Declared:
+        return self._declare(_Declared(self, key, on_token=callback))
+
+    def _declare(self, declared: _Declared) -> _Declared:
+        self.bus.join(declared)
+        return declared
+
+    def _require_open(self) -> None:
         if not self._open:
             raise TransportError("the in-memory session is closed.")
-        subscriber = _Subscriber(self, key, callback)
-        self.bus.join(subscriber)
-        return subscriber
-
-    def declare_token(self, key: str) -> _Token:
-        token = _Token(self, key)
-        self.bus.add_token(token)
-        return token
-
-    def watch_tokens(self, key: str, callback: LivenessCallback) -> _Watch:
-        watch = _Watch(self, key, callback)
-        self.bus.join(watch)
-        return watch
 
 
 SHARED = MemoryBus()

@@ -1,4 +1,4 @@
-"""The mesh over Zenoh: one session per process, a loopback hub that survives the process that held it."""
+"""Zenoh as a transport: one session a process, and a loopback hub that survives the process that opened it."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class ZenohTransport:
     """A Zenoh session as a transport.
 
     Without stated endpoints the first process of the machine is the hub on the loopback port and the others are
-    its clients. When the hub dies, the survivors race for the port: whoever binds it relays for the others, and
-    no session is reopened, so every subscriber and every session id stays.
+    its clients. When the hub dies, the survivors race for the port: the process that binds it relays for the
+    others, and no session is reopened, so every subscriber and every session id stays.
 
     Args:
         posture: endpoints and certificates; the environment's by default.
@@ -63,7 +63,7 @@ class ZenohTransport:
 
     @property
     def posture(self) -> Posture | None:
-        """What the session was opened with; None before the first connect where none was given."""
+        """The posture that the session was opened with; None before the first connect where none was given."""
         return self._posture
 
     def connect(self) -> None:
@@ -94,10 +94,9 @@ class ZenohTransport:
         for publisher, _ in publishers.values():
             with contextlib.suppress(*self.errors()):  # closing the session takes it along anyway
                 publisher.undeclare()
-        for each in (links,):
-            if each is not None:
-                with contextlib.suppress(*self.errors()):  # likewise
-                    each.undeclare()
+        if links is not None:
+            with contextlib.suppress(*self.errors()):  # likewise
+                links.undeclare()
         for each in (session, relay):
             if each is not None:
                 each.close()
@@ -111,14 +110,14 @@ class ZenohTransport:
         return session is not None and not session.is_closed()
 
     def linked(self) -> bool:
-        """Whether any other Zenoh session is connected to ours."""
+        """True while any other Zenoh session is connected to ours."""
         session = self._session
         if session is None:
             return False
         return bool(session.info.peers_zid() or session.info.routers_zid())
 
     def anchored(self) -> bool:
-        """Whether others' liveliness can be told: we listen ourselves, or the hub we depend on is there."""
+        """True while liveliness tokens of others can reach us: we listen ourselves, or are linked to the hub."""
         posture = self._posture
         listens = self._hub or (posture is not None and bool(posture.listen))
         return listens or self.linked()
@@ -138,7 +137,7 @@ class ZenohTransport:
             raise TransportError(f"{key}: {exc}") from None
 
     def declare_subscriber(self, key: str, callback: Callback) -> Any:
-        def heard(sample: Any) -> None:
+        def deliver(sample: Any) -> None:
             if sample.kind != self._zenoh.SampleKind.PUT:
                 return
             source = sample.source_info
@@ -148,7 +147,7 @@ class ZenohTransport:
             except Exception:
                 logger.exception("A subscriber of %s failed.", key)
 
-        return self._declare(lambda session, direct: session.declare_subscriber(key, direct), heard, key)
+        return self._declare(lambda session, direct: session.declare_subscriber(key, direct), deliver, key)
 
     def declare_token(self, key: str) -> Any:
         session = self._require()
@@ -158,7 +157,7 @@ class ZenohTransport:
             raise TransportError(f"{key}: {exc}") from None
 
     def watch_tokens(self, key: str, callback: LivenessCallback) -> Any:
-        def heard(sample: Any) -> None:
+        def deliver(sample: Any) -> None:
             try:
                 callback(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
             except Exception:
@@ -167,10 +166,10 @@ class ZenohTransport:
         def declare(session: Any, direct: Any) -> Any:
             return session.liveliness().declare_subscriber(key, direct, history=True)
 
-        return self._declare(declare, heard, key)
+        return self._declare(declare, deliver, key)
 
     def errors(self) -> tuple[type[BaseException], ...]:
-        """What Zenoh raises for a fault of the transport."""
+        """Exception types that Zenoh raises for a fault of the transport."""
         return (self._zenoh.ZError,) if self._zenoh is not None else (TransportError,)
 
     def _require(self) -> Any:
@@ -179,18 +178,18 @@ class ZenohTransport:
             raise TransportError("the Zenoh session is closed.")
         return session
 
-    def _declare(self, declare: Any, heard: Any, key: str) -> Any:
+    def _declare(self, declare: Any, deliver: Any, key: str) -> Any:
         session = self._require()
-        # On Zenoh's own thread. An indirect callback has one that the interpreter waits for before it ends, so a
-        # process whose mesh is still open would never end; and a motion that waits there is overtaken by its stop.
-        direct = self._zenoh.handlers.Callback(heard, indirect=False)
+        # On Zenoh's own thread. The interpreter waits for the thread of an indirect callback before it ends, so a
+        # process whose mesh is still open would never end; and a stop would overtake a motion that waits there.
+        direct = self._zenoh.handlers.Callback(deliver, indirect=False)
         try:
             return declare(session, direct)
         except self.errors() as exc:
             raise TransportError(f"{key}: {exc}") from None
 
     def _put_once(self, key: str, data: bytes) -> None:
-        """Publish on a key that is used once, such as a reply's: a publisher would be declared for nothing."""
+        """Publish on a key that is used once, such as that of a reply, without declaring a publisher."""
         zenoh, session = self._zenoh, self._require()
         session.put(
             key,
@@ -206,18 +205,18 @@ class ZenohTransport:
         session = self._require()
         publisher = session.declare_publisher(
             key,
-            # One peer that stopped reading must not hold up what is meant for the others.
+            # A peer that stopped reading must not delay the messages to the others.
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH if topic.urgent else zenoh.Priority.DATA,
             express=topic.urgent,
         )
-        found = (publisher, publisher.id)
+        declared = (publisher, publisher.id)
         with self._lock:
             while len(self._publishers) >= PUBLISHERS_MAX:
                 oldest, _ = self._publishers.pop(next(iter(self._publishers)))
                 oldest.undeclare()
-            self._publishers[key] = found
-        return found
+            self._publishers[key] = declared
+        return declared
 
     def _open(self, config: dict[str, Any]) -> Any:
         try:
@@ -228,7 +227,7 @@ class ZenohTransport:
     def _open_on_loopback(self, posture: Posture) -> Any:
         deadline = time.monotonic() + OPEN_S
         while True:
-            with contextlib.suppress(TransportError):  # somebody else is the hub
+            with contextlib.suppress(TransportError):  # another process is the hub
                 session = self._open(zenoh_config.hub(posture, self._id))
                 self._hub = True
                 logger.info("This process is the mesh's hub on %s.", posture.hub)
@@ -254,7 +253,7 @@ class ZenohTransport:
         self._links = session.info.declare_transport_events_listener(direct, history=False)
 
     def _rescue(self) -> None:
-        """Until our session has a hub again, try to be one."""
+        """Try to become the hub until our session is linked to one again."""
         if not self._rescuing.acquire(blocking=False):
             return
         try:
