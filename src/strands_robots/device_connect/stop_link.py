@@ -1,4 +1,4 @@
-"""The stop lane's own connections to Device Connect: one Zenoh session or one NATS connection for each link.
+"""The e-stop listener's own connections to Device Connect: one Zenoh session or one NATS connection for each link.
 
 They take the configuration of a device's link and nothing else of it: no session, loop, queue or lock is shared.
 """
@@ -8,41 +8,46 @@ from __future__ import annotations
 import asyncio
 import atexit
 import contextlib
-import json
 import logging
 import threading
 import weakref
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig, backend_for
 from strands_robots.safety.links import Hear, OnState, StopLink
 
+if TYPE_CHECKING:
+    from strands_robots.device_connect.backends.zenoh_session import LinkedSession
+
 logger = logging.getLogger(__name__)
 
 RETRY_S = 0.25
 TRY_MS = 1000
-"""How long a client's session tries to open before it looks whether it is still wanted."""
+"""Time in which a client's session tries to open before it checks whether it is still wanted."""
 
 LEASE_MS = 4000
-"""A silent far side is given up after this long; shorter, and a lossy link would flap under a stop."""
+"""Time after which a silent peer is given up; with a shorter one a lossy link would flap under a stop."""
 
 OVERLAP_S = 2.0
-"""How long a session that is replaced still carries stops: peers learn of the new one and of one another meanwhile."""
+"""Time in which a replaced session still carries stops: peers learn of the new one and of one another meanwhile."""
+
+CLOSE_S = 10.0
+"""Seconds that a close waits for the link's thread."""
 
 
 def stop_link(link: LinkConfig) -> StopLink:
-    """A connection of the lane's own to where ``link`` leads."""
+    """Return a connection of the e-stop listener's own to where ``link`` leads."""
     return NatsStopLink(link) if link.transport == "nats" else ZenohStopLink(link)
 
 
 def _apart(link: LinkConfig) -> LinkConfig:
-    """``link`` without what one session alone can have: the meeting port, and ports that are listened on.
+    """Return ``link`` without what one session alone can have: the meeting port, and ports that are listened on.
 
-    The lane joins the others there and listens on ports of its own, of which they learn by gossip.
+    The e-stop listener joins the others there and listens on ports of its own, of which they learn by gossip.
     """
     if not link.is_peer or not (link.meeting_point or link.listen):
         return link
@@ -54,15 +59,15 @@ def _apart(link: LinkConfig) -> LinkConfig:
 
 
 def _from_here(endpoint: str) -> str:
-    """How this machine itself dials what it listens on; the certificate is checked, its name cannot be."""
+    """Return the endpoint at which this machine dials what it listens on; the certificate's name is not checked."""
     host, _, port = endpoint.rpartition(":")
     scheme, _, name = host.partition("/")
-    near = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}.get(name, name)
-    return f"{scheme}/{near}:{port}" + ("#verify_name_on_connect=false" if scheme == "tls" else "")
+    local = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}.get(name, name)
+    return f"{scheme}/{local}:{port}" + ("#verify_name_on_connect=false" if scheme == "tls" else "")
 
 
 class _State:
-    """Up or down, told at each change."""
+    """Up or down; reports each change."""
 
     def __init__(self, on_state: OnState) -> None:
         self.up = False
@@ -74,28 +79,18 @@ class _State:
             self._on_state(up)
 
 
-class _Session:
-    """A Zenoh session, what is declared on it, and who is at its far side."""
-
-    def __init__(self, session: Any) -> None:
-        self.session = session
-        self.declared: list[Any] = []
-        self.far_sides: set[str] = set()
-
-
 class ZenohStopLink:
     """A Zenoh session of its own; callbacks run on Zenoh's receiving threads and only hand over."""
 
     def __init__(self, link: LinkConfig) -> None:
         self._link = _apart(link)
         self._root = f"device-connect/{link.tenant}"
-        self._sessions: tuple[_Session, ...] = ()
-        self._closing_session = threading.Lock()
-        self._telling, self._starting = threading.Lock(), threading.Lock()
+        self._sessions: tuple[LinkedSession, ...] = ()
+        self._dropping, self._reporting, self._starting = threading.Lock(), threading.Lock(), threading.Lock()
         self._state = _State(lambda up: None)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._heard: tuple[Collection[str], Hear] = ((), lambda event, source, payload: None)
+        self._subscribed: tuple[Collection[str], Hear] = ((), lambda event, source, payload: None)
         self._put_options: dict[str, Any] = {}
 
     @property
@@ -103,13 +98,13 @@ class ZenohStopLink:
         return self._state.up
 
     @property
-    def far_sides(self) -> set[str]:
-        """The Zenoh ids of whoever it reaches."""
-        return {zid for each in self._sessions for zid in tuple(each.far_sides)}
+    def remotes(self) -> set[str]:
+        """The Zenoh ids of the sessions it is linked to."""
+        return {zid for each in self._sessions for zid in tuple(each.remotes)}
 
     def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
         self._state = _State(on_state)
-        self._heard = (events, hear)
+        self._subscribed = (events, hear)
         with self._starting:
             self._start(self._open)
         _OPEN.add(self)
@@ -117,19 +112,19 @@ class ZenohStopLink:
     def renew(self) -> None:
         """Open another session, and close the one before it once both have carried what was sent for a while.
 
-        On a thread; nothing while the last one is still at it.
+        The work is done on a thread; a call while that thread still works does nothing.
         """
         with self._starting:
             if self._thread is not None and not self._thread.is_alive() and not self._closing.is_set():
-                self._start(self._again)
+                self._start(self._replace)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
         sent = False
         for each in self._sessions:
-            if not each.far_sides:
+            if not each.remotes:
                 continue
             try:
-                each.session.put(f"{self._root}/{source}/event/{event}", payload, **self._put_options)
+                each.zenoh.put(f"{self._root}/{source}/event/{event}", payload, **self._put_options)
             except Exception as exc:  # noqa: BLE001 - the binding has one error for a closed session and a bad key
                 logger.warning("%s was not sent: %s", event, exc)
             else:
@@ -141,82 +136,67 @@ class ZenohStopLink:
         with self._starting:
             thread = self._thread
         if thread is not None:
-            thread.join(10.0)
+            thread.join(CLOSE_S)
         for each in self._sessions:
             self._drop(each)
         _OPEN.discard(self)
 
-    def _start(self, work: Callable[..., None]) -> None:
-        self._thread = threading.Thread(target=work, args=self._heard, name="stop-link", daemon=True)
+    def _start(self, work: Callable[[], None]) -> None:
+        self._thread = threading.Thread(target=work, name="stop-link", daemon=True)
         self._thread.start()
 
-    def _again(self, events: Collection[str], hear: Hear) -> None:
+    def _replace(self) -> None:
         before = self._sessions
-        self._open(events, hear)
+        self._open()
         self._closing.wait(OVERLAP_S)
         for each in before:
             self._drop(each)
 
-    def _drop(self, each: _Session) -> None:
-        """Close a session."""
-        # Whoever comes second waits too: a thread that is inside Zenoh while the interpreter ends aborts the process.
-        with self._closing_session:
-            if each not in self._sessions:
+    def _drop(self, session: LinkedSession) -> None:
+        # A second caller waits too: a thread that is inside Zenoh while the interpreter ends aborts the process.
+        with self._dropping:
+            if session not in self._sessions:
                 return
-            self._sessions = tuple(other for other in self._sessions if other is not each)
-            for declared in each.declared:
-                # Closing ends links, which Zenoh would tell on its own threads after this has returned.
-                try:
-                    declared.undeclare()
-                except Exception as exc:  # noqa: BLE001 - the binding has one error for all; the close goes on
-                    logger.debug("a declaration of the stop lane was gone already: %s", exc)
-            each.session.close()
-        self._tell()
+            self._sessions = tuple(other for other in self._sessions if other is not session)
+            session.close()
+        self._report()
 
-    def _open(self, events: Collection[str], hear: Hear) -> None:
+    def _open(self) -> None:
         import zenoh  # noqa: PLC0415 - an optional package, loaded with the first link
 
-        def direct(sink: Callable[[Any], None]) -> Any:
-            return zenoh.handlers.Callback(sink, None, indirect=False)
+        from strands_robots.device_connect.backends.zenoh_session import LinkedSession  # noqa: PLC0415 - as above
 
         self._put_options = {
             "priority": zenoh.Priority.REAL_TIME,
             "congestion_control": zenoh.CongestionControl.DROP,
             "express": True,
         }
+        events, hear = self._subscribed
         session = None
-        while session is None and not self._closing.is_set():
+        while session is None:
+            if self._closing.is_set():
+                return
             try:
-                session = zenoh.open(zenoh.Config.from_json5(json.dumps(self._config())))
+                session = LinkedSession(self._config(), self._report)
             except zenoh.ZError as exc:
-                logger.debug("the stop lane's session does not open yet: %s", exc)
+                logger.debug("the e-stop listener's session does not open yet: %s", exc)
                 self._closing.wait(RETRY_S)
-        if session is None:
-            return
-        opened = _Session(session)
 
         def on_sample(sample: Any) -> None:
             parts = str(sample.key_expr).split("/")
             if len(parts) == 5:
                 hear(parts[4], parts[2], sample.payload.to_bytes())
 
-        def on_far_side(event: Any) -> None:
-            # One thread of the session's tells these, in order.
-            change = opened.far_sides.add if str(event.kind).endswith("PUT") else opened.far_sides.discard
-            change(str(event.transport.zid))
-            self._tell()
-
-        opened.declared = [
-            session.declare_subscriber(f"{self._root}/*/event/{event}", direct(on_sample)) for event in events
-        ]
-        self._sessions = (*self._sessions, opened)
-        opened.declared.append(session.info.declare_transport_events_listener(direct(on_far_side), history=True))
+        for event in events:
+            session.subscribe(f"{self._root}/*/event/{event}", on_sample)
+        self._sessions = (*self._sessions, session)
+        session.watch_links()
 
     def _config(self) -> dict[str, Any]:
         config = self._link.zenoh()
         config["connect"]["retry"] = {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2}
         config["transport"]["link"]["tx"]["lease"] = LEASE_MS
-        # The answers of many robots come at once; Zenoh's own queue holds two batches, and drops what finds no room.
+        # Answers of many robots come at once; Zenoh's own queue holds two batches and drops what does not fit.
         config["transport"]["link"]["tx"]["queue"] = {"size": {"real_time": 16}}
         # Zenoh keeps a descriptor of each link that agreed on shared memory; a stop has no use for it.
         config["transport"]["shared_memory"] = {"enabled": False}
@@ -224,9 +204,9 @@ class ZenohStopLink:
             config["connect"]["timeout_ms"] = TRY_MS
         return config
 
-    def _tell(self) -> None:
-        with self._telling:
-            self._state.set(any(each.far_sides for each in self._sessions) and not self._closing.is_set())
+    def _report(self) -> None:
+        with self._reporting:
+            self._state.set(bool(self.remotes) and not self._closing.is_set())
 
 
 class NatsStopLink:
@@ -238,9 +218,9 @@ class NatsStopLink:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._client: Any = None
         self._state = _State(lambda up: None)
-        self._living = threading.Event()
+        self._started = threading.Event()
         self._sending: set[asyncio.Future[None]] = set()
-        self._quit: asyncio.Event | None = None
+        self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
 
     @property
@@ -249,9 +229,9 @@ class NatsStopLink:
 
     def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
         self._state = _State(on_state)
-        self._thread = threading.Thread(target=self._live, args=(events, hear), name="stop-link", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(events, hear), name="stop-link", daemon=True)
         self._thread.start()
-        self._living.wait()
+        self._started.wait()
         _OPEN.add(self)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
@@ -262,48 +242,60 @@ class NatsStopLink:
         return True
 
     def close(self) -> None:
-        loop, quit_, thread = self._loop, self._quit, self._thread
-        if loop is None or quit_ is None or thread is None:
+        loop, end, thread = self._loop, self._end, self._thread
+        if loop is None or end is None or thread is None:
             return
         with contextlib.suppress(RuntimeError):  # the loop has ended already
-            loop.call_soon_threadsafe(quit_.set)
-        thread.join(10.0)
+            loop.call_soon_threadsafe(end.set)
+        thread.join(CLOSE_S)
         _OPEN.discard(self)
 
-    def _live(self, events: Collection[str], hear: Hear) -> None:
+    def _run(self, events: Collection[str], hear: Hear) -> None:
         try:
             with asyncio.Runner() as runner:
-                self._loop, self._quit = runner.get_loop(), asyncio.Event()
-                self._living.set()
-                runner.run(self._serve(events, hear, self._quit))
+                self._loop, self._end = runner.get_loop(), asyncio.Event()
+                self._started.set()
+                runner.run(self._serve(events, hear, self._end))
         except Exception:
-            logger.critical("The stop lane's NATS link ended.", exc_info=True)
+            logger.critical("The e-stop listener's NATS link ended.", exc_info=True)
         finally:
-            self._living.set()
+            self._started.set()
             self._state.set(False)
 
-    async def _serve(self, events: Collection[str], hear: Hear, quit_: asyncio.Event) -> None:
-        while not quit_.is_set():
+    async def _serve(self, events: Collection[str], hear: Hear, end: asyncio.Event) -> None:
+        async def on_message(data: bytes, subject: str, reply: str | None) -> None:
+            parts = subject.split(".")
+            if len(parts) == 5:
+                hear(parts[4], parts[2], data)
+
+        while not end.is_set():
             client = backend_for(self._link)
-            if not await self._connected(client, quit_):
+            if not await self._connected(client, end):
                 continue
             try:
                 for event in events:
-                    await client.subscribe_with_subject(f"{self._root}.*.event.{event}", _hand_over(hear))
+                    await client.subscribe_with_subject(f"{self._root}.*.event.{event}", on_message)
                 # The server has the subscriptions when it has answered this.
                 await client.flush()
                 self._client = client
                 self._state.set(True)
-                await quit_.wait()
+                await end.wait()
             finally:
                 self._client = None
                 self._state.set(False)
                 await client.close()
 
-    async def _connected(self, client: Any, quit_: asyncio.Event) -> bool:
+    async def _connected(self, client: Any, end: asyncio.Event) -> bool:
         """Try once, as long as the link is wanted; False after a pause when it did not come up."""
-        trying = asyncio.ensure_future(client.connect(servers=[], reconnect_cb=self._back, disconnect_cb=self._lost))
-        ending = asyncio.ensure_future(quit_.wait())
+
+        async def back() -> None:
+            self._state.set(True)
+
+        async def lost() -> None:
+            self._state.set(False)
+
+        trying = asyncio.ensure_future(client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost))
+        ending = asyncio.ensure_future(end.wait())
         await asyncio.wait({trying, ending}, return_when=asyncio.FIRST_COMPLETED)
         ending.cancel()
         if not trying.done():
@@ -311,18 +303,12 @@ class NatsStopLink:
         outcome: list[object] = await asyncio.gather(trying, return_exceptions=True)
         problem = outcome[0]
         if isinstance(problem, MessagingError):
-            logger.debug("the stop lane's connection does not open yet: %s", problem)
-            with contextlib.suppress(TimeoutError):  # not asked to end: try again
-                await asyncio.wait_for(quit_.wait(), RETRY_S)
+            logger.debug("the e-stop listener's connection does not open yet: %s", problem)
+            with contextlib.suppress(TimeoutError):  # still wanted: try again
+                await asyncio.wait_for(end.wait(), RETRY_S)
         elif isinstance(problem, Exception):
             raise problem
         return problem is None
-
-    async def _back(self) -> None:
-        self._state.set(True)
-
-    async def _lost(self) -> None:
-        self._state.set(False)
 
     def _send(self, subject: str, payload: bytes) -> None:
         task = asyncio.ensure_future(self._publish(subject, payload))
@@ -336,15 +322,6 @@ class NatsStopLink:
                 await client.publish(subject, payload)
         except MessagingError as exc:
             logger.warning("%s was not sent: %s", subject, exc)
-
-
-def _hand_over(hear: Hear) -> Callable[[bytes, str, str | None], Awaitable[None]]:
-    async def on_message(data: bytes, subject: str, reply: str | None) -> None:
-        parts = subject.split(".")
-        if len(parts) == 5:
-            hear(parts[4], parts[2], data)
-
-    return on_message
 
 
 _OPEN: weakref.WeakSet[Any] = weakref.WeakSet()

@@ -15,9 +15,9 @@ from strands_robots.safety.plane import plane
 
 
 def seen_by(link: StopLink) -> set[str]:
-    """The Zenoh ids at the far side of a lane's link."""
+    """The Zenoh ids of the sessions that a listener's link reaches."""
     assert isinstance(link, ZenohStopLink)
-    return link.far_sides
+    return link.remotes
 
 
 def stopped(hand: ZenohStopLink, world: ToyWorld, estop_id: str) -> None:

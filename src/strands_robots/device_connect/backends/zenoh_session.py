@@ -85,18 +85,66 @@ def direct(sink: Sink, drop: Callable[[], None] | None = None) -> Any:
     return zenoh.handlers.Callback(sink, drop, indirect=False)
 
 
+def undeclare(entity: Any) -> None:
+    """Undeclare a subscriber, queryable or listener; a session that was closed meanwhile has done it already."""
+    with contextlib.suppress(zenoh.ZError):
+        entity.undeclare()
+
+
+class LinkedSession:
+    """An open Zenoh session, what is declared on it, and the ids of the sessions it is linked to.
+
+    Args:
+        config: what ``zenoh.open`` takes.
+        on_change: called on Zenoh's thread when a link came or went.
+
+    Raises:
+        zenoh.ZError: the session cannot be opened.
+    """
+
+    def __init__(self, config: dict[str, Any], on_change: Callable[[], None] = lambda: None) -> None:
+        self.zenoh: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        self.remotes: set[str] = set()
+        self._on_change = on_change
+        self._declared: list[Any] = []
+
+    def watch_links(self) -> None:
+        """Keep ``remotes`` up to date from now on."""
+        events = self.zenoh.info.declare_transport_events_listener(direct(self._on_transport), history=True)
+        self._declared.append(events)
+
+    def subscribe(self, key: str, sink: Sink) -> None:
+        """Have ``sink(sample)`` called for every sample on ``key`` until the session closes."""
+        self._declared.append(self.zenoh.declare_subscriber(key, direct(sink)))
+
+    def close(self) -> None:
+        """Undeclare, then close."""
+        # Closing ends links, which Zenoh would report on its own threads after this has returned.
+        for declared in self._declared:
+            undeclare(declared)
+        try:
+            self.zenoh.close()
+        except zenoh.ZError as problem:
+            logger.warning("a Zenoh session did not close in order: %s", problem)
+
+    def _on_transport(self, event: Any) -> None:
+        change = self.remotes.add if event.kind == zenoh.SampleKind.PUT else self.remotes.discard
+        change(str(event.transport.zid))
+        self._on_change()
+
+
 class SharedSession:
-    """A Zenoh session with its users, its subscribers by key, and the sessions it is linked to."""
+    """The session of one link with its users and its subscribers by key."""
 
     def __init__(self, link: LinkConfig) -> None:
         self.link = link
         self.users = 0
         self.session: Any = None
+        self._linked_session: LinkedSession | None = None
         self._lock = threading.RLock()
         self._topics: dict[str, _Topic] = {}
-        self._remotes: set[str] = set()
+        self._was_linked = False
         self._watchers: list[Callable[[bool], None]] = []
-        self._link_events: Any = None
         self._meeting: MeetingPort | None = None
 
     def open(self) -> None:
@@ -104,35 +152,29 @@ class SharedSession:
         with self._lock:
             if self.session is not None:
                 return
-            self.session, self._meeting = _open(self.link)
+            self._linked_session = opened = self._opened()
+            self.session, self._was_linked = opened.zenoh, self.link.is_peer
             _ever_opened.set()
-            self._link_events = self.session.info.declare_transport_events_listener(
-                direct(self._on_transport), history=True
-            )
+            opened.watch_links()
 
     def close(self) -> None:
         """Close everything. Safe to call twice."""
         with self._lock:
-            session, self.session = self.session, None
+            self.session = None
+            linked_session, self._linked_session = self._linked_session, None
             meeting, self._meeting = self._meeting, None
-            link_events, self._link_events = self._link_events, None
             self._watchers.clear()
             self._topics.clear()
         if meeting is not None:
             meeting.close()
-        if link_events is not None:
-            # Closing ends links, which Zenoh would report on its own threads after this has returned.
-            _undeclare(link_events)
-        if session is not None:
-            try:
-                session.close()
-            except zenoh.ZError as problem:
-                logger.warning("a Zenoh session did not close in order: %s", problem)
+        if linked_session is not None:
+            linked_session.close()
 
     @property
     def linked(self) -> bool:
         """True when the session can send: a client while it has its router, a peer always."""
-        return self.session is not None and (self.link.is_peer or bool(self._remotes))
+        opened = self._linked_session
+        return opened is not None and (self.link.is_peer or bool(opened.remotes))
 
     def watch(self, watcher: Callable[[bool], None]) -> None:
         """Have ``watcher(linked)`` called, on Zenoh's thread, when the link is lost or back."""
@@ -162,7 +204,17 @@ class SharedSession:
     def answer(self, key: str, sink: Sink) -> Callable[[], None]:
         """Have ``sink(query)`` called for every query on ``key``; the result undoes it."""
         queryable = self.session.declare_queryable(key, direct(sink), complete=True)
-        return lambda: _undeclare(queryable)
+        return lambda: undeclare(queryable)
+
+    def _opened(self) -> LinkedSession:
+        link = self.link
+        if link.meeting_point is not None:
+            with contextlib.suppress(zenoh.ZError):  # another process has the meeting port
+                return LinkedSession(link.zenoh(meet=True), self._on_change)
+        opened = LinkedSession(link.zenoh(), self._on_change)
+        if link.meeting_point is not None:
+            self._meeting = MeetingPort(link, opened.zenoh)
+        return opened
 
     def _unsubscribe(self, key: str, sink: Sink) -> None:
         with self._lock:
@@ -173,18 +225,16 @@ class SharedSession:
             if topic.sinks:
                 return
             del self._topics[key]
-        _undeclare(topic.subscriber)
+        undeclare(topic.subscriber)
 
-    def _on_transport(self, event: Any) -> None:
-        zid = str(event.transport.zid)
+    def _on_change(self) -> None:
         with self._lock:
-            before = self.linked
-            (self._remotes.add if event.kind == zenoh.SampleKind.PUT else self._remotes.discard)(zid)
-            after = self.linked
+            linked, before = self.linked, self._was_linked
+            self._was_linked = linked
             watchers = tuple(self._watchers)
-        if before != after:
+        if linked != before:
             for watcher in watchers:
-                watcher(after)
+                watcher(linked)
 
 
 class _Topic:
@@ -212,7 +262,7 @@ class MeetingPort:
     def __init__(self, link: LinkConfig, session: Any) -> None:
         self._link = link
         self._session = session
-        self._host: Any = None
+        self._host: LinkedSession | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="strands-meeting", daemon=True)
         self._thread.start()
@@ -229,7 +279,7 @@ class MeetingPort:
             if self._host is None and not self._is_served() and self._is_free():
                 # A faster process may have it by now; the main session's retry finds that one.
                 with contextlib.suppress(zenoh.ZError):
-                    self._host = zenoh.open(_zenoh_config(self._link.meeting_host()))
+                    self._host = LinkedSession(self._link.meeting_host())
                     logger.info("took over the meeting point %s", self._link.meeting_point)
 
     def _is_served(self) -> bool:
@@ -244,26 +294,6 @@ class MeetingPort:
             except OSError:
                 return False
         return True
-
-
-def _open(link: LinkConfig) -> tuple[Any, MeetingPort | None]:
-    if link.meeting_point is None:
-        return zenoh.open(_zenoh_config(link.zenoh())), None
-    try:
-        return zenoh.open(_zenoh_config(link.zenoh(meet=True))), None
-    except zenoh.ZError:
-        session = zenoh.open(_zenoh_config(link.zenoh()))
-        return session, MeetingPort(link, session)
-
-
-def _zenoh_config(config: dict[str, Any]) -> Any:
-    return zenoh.Config.from_json5(json.dumps(config))
-
-
-def _undeclare(entity: Any) -> None:
-    # A session that was closed meanwhile has undeclared it already.
-    with contextlib.suppress(zenoh.ZError):
-        entity.undeclare()
 
 
 @atexit.register
