@@ -50,11 +50,10 @@ LEANED_ON = {
 """Members that are called, replaced or whose way of working is relied upon."""
 
 HOLD_EVENTS_S = 5.0
-"""Seconds of a lost link for which events are kept; a server that restarts is back sooner, and an older event is a
-lie about the present."""
+"""Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""
 
 CONNECT_AGAIN_S = 1.0
-"""Seconds between two attempts to reach a router or server that was not there."""
+"""Seconds between two attempts to reach a router or server."""
 
 MAX_REFUSALS = 3
 """Attempts with credentials that the server refuses; then the start ends with its reason."""
@@ -87,13 +86,13 @@ def on(event_name: str) -> Callable[[F], F]:
 
 
 class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type information
-    """The framework's runtime on our backend: ready when it says so, ended without remains, events that flow.
+    """The framework's runtime on our backend: it reports when it is ready and leaves nothing open at its end.
 
     Args:
         driver: what to serve.
         device_id: without dots, because discovery cannot see a dotted one.
         link: how to reach the others.
-        allow_insecure: required for a link on which nobody proves who he is.
+        allow_insecure: required for a link without authentication.
         discovery: ``d2d`` announces presence; ``registry`` registers with the framework's registry service.
         before_live: awaited with the connected client before the driver is connected and the device can be found or
             called; what it raises ends the start.
@@ -138,7 +137,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._lost_at: float | None = None
 
     def _warn_if_predicate_extra_missing(self) -> None:
-        """Keep the framework's start-up line about an optional package to those who look for it."""
+        """Log the framework's start-up line about an optional package at DEBUG only."""
         _log.debug("%s: broadcasts with a `where` clause need device-connect-edge[predicate].", self.device_id)
 
     async def run(self) -> None:
@@ -232,7 +231,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
             framework.DeviceConnectTelemetry = _NoTelemetry
         if not self.link.authenticated and not self.allow_insecure:
             raise ValueError(
-                f"{self.device_id}: nobody proves who he is on this link; give certificates or credentials, "
+                f"{self.device_id}: this link is not authenticated; give certificates or credentials, "
                 "or opt in with allow_insecure=True"
             )
 
@@ -296,31 +295,30 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
             self._lost_at = self._loop.time()
         self._linked.clear()
         left = self._lost_at + HOLD_EVENTS_S - self._loop.time()
-        with contextlib.suppress(TimeoutError):  # whether the link is back is asked by whoever waited
+        with contextlib.suppress(TimeoutError):  # the caller checks whether the link is back
             await asyncio.wait_for(self._linked.wait(), max(left, 0.0))
 
 
 class _NoTelemetry:
-    """In place of the framework's tracer where no exporter is configured: it would record spans for nobody, at a cost
-    as large as the call itself."""
+    """Stand-in for the framework's tracer without an exporter: recording spans costs as much as the call itself."""
 
     def __init__(self, **_names: Any) -> None:
         pass
 
     def setup_otlp_exporter(self) -> None:
-        """Nothing to export to."""
+        """Set up nothing."""
 
 
 _telemetry = framework.DeviceConnectTelemetry
 
 
 def _traced() -> bool:
-    """True when somebody records spans or metrics in this process, whether our runtime or the application."""
+    """Return True when spans or metrics are recorded in this process, by our runtime or by the application."""
     try:
         from opentelemetry import metrics, trace  # noqa: PLC0415 - an optional part of the framework
     except ImportError:
         return False
-    # What the API package itself provides until an application sets something up records nothing.
+    # The API package's own providers record nothing; an application replaces them.
     providers = trace.get_tracer_provider(), metrics.get_meter_provider()
     return any(
         not type(each).__module__.startswith(("opentelemetry.trace", "opentelemetry.metrics")) for each in providers
@@ -328,7 +326,7 @@ def _traced() -> bool:
 
 
 def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
-    """An ``@rpc`` method without the framework's log lines, spans and metrics while nobody listens to them.
+    """Return an ``@rpc`` method without the framework's log lines, spans and metrics while none of them is recorded.
 
     The caller is where ``get_rpc_source_device`` looks for it, and failures are logged, as always.
     """
@@ -357,6 +355,6 @@ def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[A
 
 
 def sources() -> dict[str, Callable[..., Any] | Coroutine[Any, Any, Any]]:
-    """The framework's functions named in ``LEANED_ON``, for the test that watches them."""
+    """Return the framework's functions named in ``LEANED_ON``, for the test that watches them."""
     owners = {"DeviceRuntime": DeviceRuntime, "DeviceDriver": DeviceDriver, "decorators": decorators}
     return {f"{owner}.{name}": getattr(owners[owner], name) for owner, names in LEANED_ON.items() for name in names}

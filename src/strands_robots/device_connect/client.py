@@ -1,7 +1,7 @@
 """Client of a fleet for programs without an event loop: find devices, call, follow events, stop.
 
-The command line and the agent tools use it. It says who it is (``source``), as every caller on Device Connect
-only says.
+The command line and the agent tools use it. Its name (``source``) is self-declared, like that of every caller on
+Device Connect.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import uuid
 from collections.abc import Callable, Coroutine, Generator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from device_connect_edge.messaging import MessagingError
@@ -29,13 +28,13 @@ from strands_robots.utils import device_id, shown, text
 T = TypeVar("T")
 
 PROBE_EVERY_S = 0.25
-"""Between two probes while peers are collected: the first one may leave before every link is up."""
+"""Seconds between two probes while peers are collected: the first one may leave before every link is up."""
 
 SETTLED_S = 0.5
-"""Without a new peer after which a collection ends early, where at least one has answered."""
+"""Seconds without a new peer after which a collection ends early, where at least one has answered."""
 
 EVENTS_MAX = 10_000
-"""Events that wait for a slow reader; then the oldest go."""
+"""Events that wait for a slow reader; a further one displaces the oldest."""
 
 
 class NoSuchDeviceError(StrandsRobotsError, LookupError):
@@ -74,7 +73,7 @@ class Peer:
 
     @classmethod
     def of(cls, presence: Mapping[str, Any]) -> Peer:
-        """What a presence message says; whatever it lacks is empty."""
+        """Read a presence message; a field that it lacks is empty."""
         identity, status = _object(presence, "identity"), _object(presence, "status")
         capabilities = _object(presence, "capabilities")
         functions = [each for each in capabilities.get("functions") or () if isinstance(each, Mapping)]
@@ -92,7 +91,7 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
-    """An event as it arrived: whose, which, and what it carries. The sender's name is part of the topic only."""
+    """An event as it arrived. The device is the one that the topic names."""
 
     device: str
     name: str
@@ -121,16 +120,14 @@ class FleetClient:
     def __enter__(self) -> Self:
         self._thread.start()
         try:
-            self._messaging = self._wait(open_client(self.link), self.link.connect_timeout_s + 1.0)
-            self._wait(self._subscribe("*.presence", self._on_presence), 5.0)
+            self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + 1.0)
+            self.run(self._subscribe("*.presence", self._on_presence), 5.0)
         except BaseException:
             self.close()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_exception: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -139,52 +136,52 @@ class FleetClient:
             return
         if self._messaging is not None:
             messaging, self._messaging = self._messaging, None
-            self._wait(messaging.close(), LOOP_JOIN_TIMEOUT_S)
+            self.run(messaging.close(), LOOP_JOIN_TIMEOUT_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(LOOP_JOIN_TIMEOUT_S)
         if not self._thread.is_alive():
             self._loop.close()
 
     def peers(self, timeout: float = 2.0) -> list[Peer]:
-        """Who answers a probe, sorted by id; waits until nobody new has come for half a second.
+        """Return the devices that answer a probe, sorted by id; ends half a second after the last new one.
 
         Args:
             timeout: seconds to wait for the first answer, and for all of them.
         """
-        return self._wait(self._collect(timeout), timeout + 1.0)
+        return self.run(self._collect(timeout), timeout + 1.0)
 
     def known(self) -> tuple[str, ...]:
-        """The ids that have announced themselves since the last look, without those that have departed."""
+        """Return the ids announced since the last call of :meth:`peers`, without those of departed devices."""
         return tuple(sorted(self._seen))
 
     def call(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0
     ) -> Envelope:
-        """Call a function of a device; what it answers.
+        """Call a function of a device; return its answer.
 
         Raises:
-            NoSuchDeviceError: nobody answers to ``device``.
+            NoSuchDeviceError: no device has the id ``device``.
             DeviceTimeoutError: it is there and did not answer within ``timeout`` seconds.
             CallRefusedError: it refused the call as such: an unknown function, a malformed message.
             MessagingError: the network cannot carry the call.
         """
-        return self._wait(self._call(device, function, dict(params or {}), timeout), timeout + 3.0)
+        return self.run(self._call(device, function, dict(params or {}), timeout), timeout + 3.0)
 
     def request(self, device: str, data: bytes, timeout: float = 10.0) -> bytes:
-        """Send bytes as they are on a device's command topic; its reply, as it is. Raises :class:`MessagingError`."""
+        """Send raw bytes on a device's command topic; return its raw reply. Raises :class:`MessagingError`."""
         subject = self._subject(f"{device_id('device', device)}.cmd")
-        reply: bytes = self._wait(self._messaging.request(subject, data, timeout=timeout), timeout + 1.0)
+        reply: bytes = self.run(self._messaging.request(subject, data, timeout=timeout), timeout + 1.0)
         return reply
 
     def events(
         self, device: str = "*", timeout: float | None = None, ready: threading.Event | None = None
     ) -> Generator[DeviceEvent, None, None]:
-        """Events of one device, or of all, as they come.
+        """Yield the events of one device, or of all, as they come.
 
         Args:
             device: an id, or ``*``.
             timeout: seconds without an event after which the iteration ends; None waits for ever.
-            ready: set once events are heard.
+            ready: set once events are received.
         """
         arrived: queue.Queue[DeviceEvent] = queue.Queue(EVENTS_MAX)
         with self.subscription(device, lambda event: _push(arrived, event)):
@@ -197,39 +194,38 @@ class FleetClient:
                     return
 
     def subscription(self, device: str, callback: Callable[[DeviceEvent], None]) -> EventSubscription:
-        """Tell ``callback`` of every event until the subscription is closed. It runs on the client's own thread:
-        it must return at once and may not raise."""
-        who = device if device == "*" else device_id("device", device)
+        """Have ``callback`` called with every event until the subscription is closed.
+
+        It runs on the client's own thread: it must return at once and may not raise.
+        """
+        name = device if device == "*" else device_id("device", device)
 
         async def arrived(data: bytes, subject: str, reply: str | None) -> None:
             event = _event(data, subject)
             if event is not None:
                 callback(event)
 
-        return EventSubscription(self, self._wait(self._subscribe(f"{who}.event.*", arrived), 5.0))
+        return EventSubscription(self, self.run(self._subscribe(f"{name}.event.*", arrived), 5.0))
 
     def stop(self, device: str, timeout: float = 5.0) -> Envelope:
-        """Stop a device: ``stop``, or ``stopMotion`` where it has that. Its own envelope, an error when unanswered.
+        """Stop a device by ``stop``, or ``stopMotion`` where it has that; return its envelope, or an error.
 
         ``stopped`` is true only for an affirmative answer.
         """
-        return self._wait(self._stop(device, timeout), 2 * timeout + 4.0)
+        return self.run(self._stop(device, timeout), 2 * timeout + 4.0)
 
     def stop_all(self, timeout: float = 5.0) -> dict[str, Envelope]:
-        """Stop every device that can be seen, all at once; what each answered, by id."""
+        """Stop every device that answers a probe, all at once; return the answers by id."""
         peers = [peer.id for peer in self.peers() if peer.stop_verb]
 
         async def all_of_them() -> dict[str, Envelope]:
             answers = await asyncio.gather(*(self._stop(peer, timeout) for peer in peers))
             return dict(zip(peers, answers, strict=True))
 
-        return self._wait(all_of_them(), 2 * timeout + 4.0)
+        return self.run(all_of_them(), 2 * timeout + 4.0)
 
     def run(self, work: Coroutine[Any, Any, T], within: float) -> T:
         """Run a coroutine on the client's loop and wait for it."""
-        return self._wait(work, within)
-
-    def _wait(self, work: Coroutine[Any, Any, T], within: float) -> T:
         done: Future[T] = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return done.result(within)
@@ -245,20 +241,17 @@ class FleetClient:
 
     async def _on_presence(self, data: bytes, subject: str, reply: str | None) -> None:
         try:
-            said = json.loads(data)
+            presence = json.loads(data)
         except ValueError:
             return
-        # The topic is what access rules guard, so it outranks what the message calls itself.
+        # Access rules guard the topic, so it outranks the id in the message.
         name = _parts(subject)[2]
-        if not isinstance(said, Mapping) or said.get("device_id") != name:
+        if not isinstance(presence, Mapping) or presence.get("device_id") != name:
             return
-        if said.get("departing"):
+        if presence.get("departing"):
             self._seen.pop(name, None)
         else:
-            self._seen[name] = Peer.of(said)
-
-    async def _probe(self) -> None:
-        await self._messaging.publish(self._subject("discovery.probe"), b'{"probe": true}')
+            self._seen[name] = Peer.of(presence)
 
     async def _collect(self, within: float) -> list[Peer]:
         loop = asyncio.get_running_loop()
@@ -266,7 +259,7 @@ class FleetClient:
         began = changed = loop.time()
         count = 0
         while loop.time() < began + within:
-            await self._probe()
+            await self._messaging.publish(self._subject("discovery.probe"), b'{"probe": true}')
             await asyncio.sleep(min(PROBE_EVERY_S, within))
             if len(self._seen) != count:
                 count, changed = len(self._seen), loop.time()
@@ -275,7 +268,7 @@ class FleetClient:
         return [self._seen[name] for name in sorted(self._seen)]
 
     async def _call(self, device: str, function: str, params: dict[str, Any], within: float) -> Envelope:
-        who, verb = device_id("device", device), text("function", function, longest=100)
+        name, verb = device_id("device", device), text("function", function, longest=100)
         request = {
             "jsonrpc": "2.0",
             "id": uuid.uuid4().hex,
@@ -284,13 +277,13 @@ class FleetClient:
         }
         encoded = json.dumps(request, allow_nan=False).encode()
         try:
-            data = await self._messaging.request(self._subject(f"{who}.cmd"), encoded, timeout=within)
+            data = await self._messaging.request(self._subject(f"{name}.cmd"), encoded, timeout=within)
         except MessagingError as exc:
-            raise await self._why(who, within, exc) from exc
-        return _answer(who, verb, data)
+            raise await self._unanswered(name, within, exc) from exc
+        return _answer(name, verb, data)
 
-    async def _why(self, device: str, within: float, exc: Exception) -> Exception:
-        """What an unanswered call means: nobody there, somebody who does not answer, or a network that fails."""
+    async def _unanswered(self, device: str, within: float, exc: Exception) -> Exception:
+        """Return the error for an unanswered call: no such device, a silent device, or a network that fails."""
         if not self._messaging.is_connected:
             return exc
         if any(peer.id == device for peer in await self._collect(1.0)):
@@ -321,7 +314,7 @@ class EventSubscription:
         self._client, self._handle = client, handle
 
     def close(self) -> None:
-        """Hear no more."""
+        """Receive no more events."""
         handle, self._handle = self._handle, None
         if handle is not None:
             self._client.run(handle.unsubscribe(), 5.0)
@@ -329,9 +322,7 @@ class EventSubscription:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_exception: object) -> None:
         self.close()
 
 
@@ -341,17 +332,17 @@ def _object(presence: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 
 
 def _parts(subject: str) -> list[str]:
-    found = subject.split("/" if "/" in subject else ".")
-    return found if len(found) > 3 else ["", "", "", ""]
+    parts = subject.split("/" if "/" in subject else ".")
+    return parts if len(parts) > 3 else ["", "", "", ""]
 
 
 def _event(data: bytes, subject: str) -> DeviceEvent | None:
     parts = _parts(subject)
     try:
-        said = json.loads(data)
+        notification = json.loads(data)
     except ValueError:
         return None
-    payload = said.get("params") if isinstance(said, Mapping) else None
+    payload = notification.get("params") if isinstance(notification, Mapping) else None
     return DeviceEvent(parts[2], parts[-1], payload if isinstance(payload, Mapping) else {})
 
 
@@ -367,15 +358,15 @@ def _push(arrived: queue.Queue[DeviceEvent], event: DeviceEvent) -> None:
 
 def _answer(device: str, function: str, data: bytes) -> Envelope:
     try:
-        said = json.loads(data)
+        reply = json.loads(data)
     except ValueError:
-        said = None
-    if not isinstance(said, Mapping):
+        reply = None
+    if not isinstance(reply, Mapping):
         raise CallRefusedError(f"{device} answered {function} with {shown(data)}, which is no JSON-RPC.")
-    problem = said.get("error")
+    problem = reply.get("error")
     if problem is not None:
-        told = problem if isinstance(problem, Mapping) else {"message": problem}
-        code = told.get("code")
-        raise CallRefusedError(str(told.get("message", "")), code if isinstance(code, int) else 0)
-    result = said.get("result")
+        fields = problem if isinstance(problem, Mapping) else {"message": problem}
+        code = fields.get("code")
+        raise CallRefusedError(str(fields.get("message", "")), code if isinstance(code, int) else 0)
+    result = reply.get("result")
     return dict(result) if isinstance(result, Mapping) else {"result": result}

@@ -1,4 +1,4 @@
-"""Which link a device gets, and whether it may be used without anybody proving who he is."""
+"""Choice of a device's link from arguments and environment, and the opt-in to an unauthenticated one."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ _NAMES_A_NETWORK = (
 
 
 def usual_link(tenant: str | None = None, port: int | None = None) -> LinkConfig:
-    """The link of a command or a tool that was told none: the network that the environment names, else this machine.
+    """Return the link of a command or a tool without one: the network that the environment names, else this machine.
 
     Args:
         tenant: ``TENANT`` by default.
         port: the loopback port where local robots meet; giving it means this machine alone.
     """
-    whose = tenant or settings.raw("TENANT")
+    tenant = tenant or settings.raw("TENANT")
     if port is None and any(settings.is_set(name) for name in _NAMES_A_NETWORK):
-        return link_from_environment(whose)
-    return loopback_config(port, whose)
+        return link_from_environment(tenant)
+    return loopback_config(port, tenant)
 
 
 def link_for(
     messaging_url: str | None, messaging_backend: str | None, tenant: str, link: LinkConfig | None
 ) -> LinkConfig:
-    """The link that the arguments of ``init_device_connect`` describe.
+    """Return the link that the arguments of ``init_device_connect`` describe.
 
     Raises:
         ValidationError: an argument out of its domain, or a ``link`` beside a URL or a backend.
@@ -64,15 +64,15 @@ def link_for(
 
 
 def transport_of(url: str) -> str:
-    """The transport that a URL names: ``nats://`` and ``tls://`` are NATS, ``tcp/``, ``tls/`` and ``zenoh://`` Zenoh.
+    """Return the transport of a URL: ``nats://`` and ``tls://`` are NATS, ``tcp/``, ``tls/`` and ``zenoh://`` Zenoh.
 
     Raises:
         ValidationError: none of these.
     """
-    word = url.lower()
-    if word.startswith(("nats://", "tls://")):
+    lower = url.lower()
+    if lower.startswith(("nats://", "tls://")):
         return "nats"
-    if word.startswith(("zenoh://", "zenoh+tls://", "tcp/", "tls/", "udp/", "quic/")):
+    if lower.startswith(("zenoh://", "zenoh+tls://", "tcp/", "tls/", "udp/", "quic/")):
         return "zenoh"
     raise ValidationError(
         f"messaging_url must be nats://host:port, tls://host:port or tcp/host:port, not {shown(url)}."
@@ -80,14 +80,14 @@ def transport_of(url: str) -> str:
 
 
 def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bool) -> bool:
-    """Whether the device runs on a link without authentication; a warning is logged whenever it does.
+    """Return True when the device may run on a link without authentication, and log a warning then.
 
     Args:
-        allow_insecure: the caller's word; None leaves it to ``DEVICE_CONNECT_ALLOW_INSECURE``.
-        stated: the caller gave this link himself; where it stays on this machine, that counts as the opt-in.
+        allow_insecure: the caller's choice; None leaves it to ``DEVICE_CONNECT_ALLOW_INSECURE``.
+        stated: the caller gave this link; where it stays on this machine, that counts as the opt-in.
 
     Raises:
-        ValidationError: ``allow_insecure`` is no boolean, or nobody opted in.
+        ValidationError: ``allow_insecure`` is no boolean, or there is no opt-in.
     """
     if allow_insecure is not None and not isinstance(allow_insecure, bool):
         raise ValidationError(
@@ -99,15 +99,15 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
     opted_in = settings.boolean("DEVICE_CONNECT_ALLOW_INSECURE") if allow_insecure is None else allow_insecure
     if opted_in:
         logger.warning(
-            "INSECURE TRANSPORT: nobody proves who he is and nothing is encrypted. Whoever reaches %s can drive and "
-            "read this robot. Not for production.",
+            "INSECURE TRANSPORT: no peer is authenticated and nothing is encrypted. Anyone who reaches %s can drive "
+            "and read this robot. Not for production.",
             ", ".join(link.connect) or ("the local network" if link.uses_multicast else "this machine"),
         )
         return True
     if allow_insecure is None and stated and link.loopback_only:
         logger.warning(
             "No authentication on 127.0.0.1: every program on this machine can drive and read this robot, "
-            "nobody outside it can."
+            "no other machine can."
         )
         return True
     raise ValidationError(

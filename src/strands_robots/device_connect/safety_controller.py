@@ -1,4 +1,4 @@
-"""A safety controller on Device Connect: by itself, or as a device that agents and operators find by name."""
+"""A safety controller on Device Connect: alone, or as a device that agents and operators find by name."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from strands_robots.utils import ValidationError, device_id, number, text
 
 
 def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
-    """A :class:`SafetyController` on ``link``, or on the network that the environment names.
+    """Return a :class:`SafetyController` on ``link``, or on the network that the environment names.
 
     Further arguments are those of :class:`SafetyController`.
     """
-    where = link or usual_link()
-    return SafetyController(controller_id, lambda: stop_link(where), **options)
+    link = link or usual_link()
+    return SafetyController(controller_id, lambda: stop_link(link), **options)
 
 
 def envelope(report: StopReport) -> Envelope:
-    """The report as an answer: an error unless every robot is known to be still."""
+    """Return the report as an answer: an error unless every robot is known to have stopped."""
     fields: dict[str, Any] = {
         "estop_id": report.estop_id,
         "stopped": {name: round(each.latency_ms, 3) for name, each in report.stopped.items()},
@@ -39,12 +39,12 @@ def envelope(report: StopReport) -> Envelope:
     }
     if report.ok:
         return success(f"Stopped {', '.join(sorted(report.stopped))}.", **fields)
-    doubts = [f"{name} did not stop" for name in report.not_stopped]
-    doubts += [f"{name} did not act on it" for name in report.refused]
-    doubts += [f"{name} gave no answer" for name in report.silent]
+    failures = [f"{name} did not stop" for name in report.not_stopped]
+    failures += [f"{name} did not act on it" for name in report.refused]
+    failures += [f"{name} gave no answer" for name in report.silent]
     if not report.link:
-        doubts.append("the stop never left: the link is down")
-    return error(f"{'; '.join(doubts) or 'Nobody answered the emergency stop'}.", **fields)
+        failures.append("the stop was not sent: the link is down")
+    return error(f"{'; '.join(failures) or 'No robot answered the emergency stop'}.", **fields)
 
 
 class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
@@ -58,7 +58,7 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Who this device is."""
+        """Identity of the controller, which has one model."""
         return DeviceIdentity(
             device_type=self.device_type,
             manufacturer="strands-robots",
@@ -68,7 +68,7 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
 
     @property
     def status(self) -> DeviceStatus:
-        """Idle; a controller is never too busy."""
+        """Idle, always; a controller accepts every call."""
         return DeviceStatus(availability="idle", busy_score=0.0)
 
     @rpc(labels={"direction": "write", "safety": "critical"})
@@ -94,7 +94,7 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
 
     @rpc(labels={"direction": "read"})
     async def getStatus(self) -> dict[str, Any]:
-        """Whether the controller's own link reaches anybody."""
+        """Say whether the controller's own link is up."""
         up = self.controller.link_up
         return success("The stop link is up." if up else "The stop link is down.", link_up=up)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
 LOOP_JOIN_TIMEOUT_S = 5.0
@@ -39,9 +39,7 @@ class StopSignal:
             self._previous[each] = signal.signal(each, self._on_signal)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_exception: object) -> None:
         self._restore()
 
     def wait(self, within: float | None = None) -> int | None:

@@ -16,14 +16,13 @@ from strands_robots.policies import base
 logger = logging.getLogger(__name__)
 
 PENDING_MAX = 2000
-"""Steps that may wait for the event loop (40 s of one robot at 50 Hz); starts and ends always wait."""
+"""Steps that may wait for the event loop (40 s of one robot at 50 Hz); starts and ends are never dropped."""
 
-BURST = 50.0
-"""Steps that may follow one another at once after a pause: a loop at 50 Hz that was held up for a second, the longest
-that a simulation makes up for, loses none by catching up."""
+CATCH_UP = 50.0
+"""Steps that may pass at once after a pause: a simulation at 50 Hz catches up one second at most, and loses none."""
 
-FIRST = 2.0
-"""Of these, what a loop has when it starts."""
+CATCH_UP_AT_START = 2.0
+"""The same for a loop that has just started."""
 
 
 def numbers(values: object) -> dict[str, float]:
@@ -36,7 +35,7 @@ def numbers(values: object) -> dict[str, float]:
 
 
 class Throttle:
-    """At most ``hz`` passes a second for each key, with bursts of :data:`BURST` after a pause."""
+    """At most ``hz`` passes a second for each key, and :data:`CATCH_UP` at once after a pause."""
 
     def __init__(self, hz: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._hz = hz
@@ -44,16 +43,16 @@ class Throttle:
         self._tokens: dict[str, tuple[float, float]] = {}
 
     def passes(self, key: str) -> bool:
-        """True when one more may pass now."""
+        """Return True when one more may pass now."""
         now = self._clock()
-        tokens, since = self._tokens.get(key, (FIRST, now))
-        tokens = min(BURST, tokens + (now - since) * self._hz)
+        tokens, since = self._tokens.get(key, (CATCH_UP_AT_START, now))
+        tokens = min(CATCH_UP, tokens + (now - since) * self._hz)
         passing = tokens >= 1.0
         self._tokens[key] = (tokens - 1.0 if passing else tokens, now)
         return passing
 
     def forget(self, key: str) -> None:
-        """Drop what is known of ``key``."""
+        """Start over with ``key``."""
         self._tokens.pop(key, None)
 
 
@@ -75,7 +74,7 @@ class RolloutPump:
         self._dropped = 0
 
     def observe(self, event: RolloutEvent) -> None:
-        """The observer that a robot calls from its control thread: returns at once and never raises."""
+        """Queue an event; the observer that a robot calls from its control thread. Returns at once and never raises."""
         with self._lock:
             if event.kind == "step":
                 if not self._throttle.passes(event.robot):

@@ -22,20 +22,20 @@ ZENOH_PORT = 7447
 
 _DOTTED = re.compile(r"[0-9.]+")
 
-# A peer that is stopped in a debugger costs this much per priority and link, and no more (64 KiB batches).
+# Batches of 64 KiB per priority and link: the memory that a peer costs which is stopped in a debugger.
 QUEUED_BATCHES = 16
 
-# What a receiver puts together from fragments at most, in bytes; Zenoh's own default is 1 GiB.
+# Largest message in bytes that a receiver assembles from fragments; Zenoh's own default is 1 GiB.
 MAX_MESSAGE_BYTES = 64 * 2**20
 
-# What Zenoh does when a peer does not read, in microseconds. An event is dropped after a wait that an event loop can
-# bear, one of many fragments, which goes out on a thread, after a longer one. Calls and replies are not dropped: they
-# have a queue of their own, which only a peer that stopped reading ever fills, and such a peer loses its link.
+# Microseconds that Zenoh waits for a peer that does not read. An event is dropped after a wait that an event loop can
+# bear, an event of many fragments, which goes out on a thread, after a longer one. Calls and replies are not dropped:
+# they have a queue of their own, which only a peer that stopped reading ever fills, and such a peer loses its link.
 WAIT_BEFORE_DROP_US = 500
 WAIT_BEFORE_DROP_FRAGMENTS_US = 1_000_000
 WAIT_BEFORE_CLOSE_US = 1_000_000
 
-# For which a far side that accepted a connection may keep silent; a session does not close while it waits for that.
+# Time in which a peer that accepted a connection has to answer; a session does not close while it waits for that.
 HANDSHAKE_MS = 2000
 
 
@@ -77,7 +77,7 @@ class LinkConfig:
     def __post_init__(self) -> None:
         choice("transport", self.transport, ("zenoh", "nats"))
         choice("mode", self.mode, ("auto", "peer", "client"))
-        # A wildcard here would make one link of every tenant.
+        # A wildcard here would join the links of all tenants.
         device_id("tenant", self.tenant)
         check = _check_nats if self.transport == "nats" else _check_zenoh
         for name, stated in (("connect", self.connect), ("listen", self.listen)):
@@ -106,7 +106,7 @@ class LinkConfig:
 
     @property
     def loopback_only(self) -> bool:
-        """True when nothing outside this machine is reached or let in."""
+        """True when the link reaches no other machine and lets none in."""
         if self.is_peer and (self.uses_multicast or not self.listeners):
             return False
         return all(host_of(endpoint) in (LOOPBACK, "localhost", "::1") for endpoint in self.connect + self.listeners)
@@ -138,7 +138,7 @@ class LinkConfig:
 
     @property
     def fingerprint(self) -> str:
-        """A short name for this link that gives nothing of it away."""
+        """A short name for this link that reveals none of its fields."""
         text = json.dumps([str(getattr(self, each.name)) for each in fields(self)])
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -148,7 +148,7 @@ class LinkConfig:
         credentials: Mapping[str, Any] | None,
         tls: Mapping[str, Any] | None,
     ) -> LinkConfig:
-        """This link, with what it leaves open taken from the framework's ``connect`` arguments."""
+        """Return this link, with what it leaves open taken from the framework's ``connect`` arguments."""
         link = self
         if servers and not (link.connect or link.listen or link.meet_port):
             link = replace(link, connect=endpoints(servers))
@@ -160,7 +160,7 @@ class LinkConfig:
         return link
 
     def zenoh(self, *, meet: bool = False) -> dict[str, Any]:
-        """The configuration that ``zenoh.open`` takes.
+        """Return the configuration that ``zenoh.open`` takes.
 
         Args:
             meet: listen on the meeting port too; opening then fails where another process has it.
@@ -179,7 +179,7 @@ class LinkConfig:
                 "exit_on_failure": not peer,
                 "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
             },
-            # Peers come and go; only a multicast peer gains from waiting for the first of them.
+            # Peers come and go; only a multicast peer gains by waiting for the first one.
             "open": {"return_conditions": {"connect_scouted": self.uses_multicast, "declares": True}},
             "scouting": {
                 "multicast": {"enabled": self.uses_multicast, "autoconnect": {"peer": ["router", "peer"]}},
@@ -209,29 +209,29 @@ class LinkConfig:
             },
         }
         if self.ca:
-            # With certificates at hand a plain link is never what was meant.
+            # A link with certificates must not fall back to plain TCP.
             config["transport"]["link"]["protocols"] = ["tls"]
             config["transport"]["link"]["tls"] = self._zenoh_tls()
         return config
 
     def _session_id(self) -> str:
-        """A fresh Zenoh id: who states no endpoint to listen on may be behind a firewall, and is the greater one.
+        """Return a fresh Zenoh id; a link without a stated endpoint to listen on gets a greater one.
 
-        The last byte counts most.
+        Such a peer may be behind a firewall, and the greater id dials. The last byte counts most.
         """
         return f"51{secrets.token_hex(14)}{'01' if self.listen else 'ff'}"
 
     def _dials_peers(self) -> str:
-        """Of two peers that gossip tells of each other, the greater one dials, and it alone.
+        """Return Zenoh's strategy for two peers that learn of each other by gossip: only the greater id dials.
 
-        Were both to dial, one transport would hold two links, and one that expires on one side before the other is
-        joined again without its subscriptions, for good (eclipse-zenoh/zenoh issue 2806, found open in 1.10). With
-        certificates both dial all the same: gossip tells addresses, of which a certificate may name those of one side.
+        If both dialled, one transport would hold two links. When one of them expires on one side first, the peers
+        meet again without their subscriptions, for good (eclipse-zenoh/zenoh issue 2806, open in 1.10). With
+        certificates both dial all the same, because a certificate may name the addresses of one side only.
         """
         return "always" if self.ca else "greater-zid"
 
     def meeting_host(self) -> dict[str, Any]:
-        """The configuration of a session that does nothing but hold the meeting port."""
+        """Return the configuration of a session that only listens on the meeting port."""
         return replace(self, listen=(self.meeting_point or "",), connect=(), meet_port=None, mode="peer").zenoh()
 
     def _zenoh_tls(self) -> dict[str, Any]:
@@ -246,7 +246,7 @@ class LinkConfig:
 
 
 def loopback_config(meet_port: int | None = None, tenant: str = "default") -> LinkConfig:
-    """A link for any number of processes on this machine, which find each other without configuration.
+    """Return a link for any number of processes on this machine, which find each other without configuration.
 
     The first process listens on ``meet_port`` (default: ``STRANDS_DC_PORT``); the others connect to it and learn of
     each other there. When the process that has the port goes, another takes it over within seconds. A bare agent
@@ -257,7 +257,7 @@ def loopback_config(meet_port: int | None = None, tenant: str = "default") -> Li
 
 
 def link_from_environment(tenant: str = "default", transport: str | None = None) -> LinkConfig:
-    """The link that the framework's own variables describe; a multicast peer when they say nothing.
+    """Return the link that the framework's own variables describe; a multicast peer when none is set.
 
     Raises:
         ValidationError: an unknown backend, or a credentials file that cannot be read.
@@ -393,7 +393,7 @@ def _credentials_file() -> dict[str, Any]:
 
 
 def _armoured(text: str) -> dict[str, str]:
-    """Token and seed of a NATS ``.creds`` file: each is the block between its BEGIN and END line."""
+    """Return token and seed of a NATS ``.creds`` file: each is the block between its BEGIN and END line."""
     blocks: dict[str, str] = {}
     title = ""
     for line in (each.strip() for each in text.splitlines()):
