@@ -1,6 +1,6 @@
-"""Writes the tables of README.md that the code already knows: settings and extras.
+"""Write the tables of settings and extras in docs/reference.md from the code.
 
-``python scripts/tables.py`` rewrites them in place; ``--check`` only says whether they are up to date.
+``python scripts/tables.py`` rewrites them in place; ``--check`` only compares them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from strands_robots import settings
 
 ROOT = Path(__file__).resolve().parent.parent
-README = ROOT / "README.md"
+PAGE = ROOT / "docs" / "reference.md"
 
 EXTRA_MEANINGS = {
     "device-connect": "the Device Connect networks (Zenoh, NATS), drivers and client",
@@ -55,18 +55,18 @@ def rewritten(text: str) -> str:
         pattern = rf"(<!-- table: {name} -->\n).*?(\n<!-- end -->)"
         text, found = re.subn(pattern, lambda m, t=table: m[1] + t + m[2], text, flags=re.DOTALL)
         if not found:
-            raise SystemExit(f"README.md has no table marker for {name}.")
+            raise SystemExit(f"{PAGE.name} has no table marker for {name}.")
     return text
 
 
 def main() -> int:
-    current = README.read_text(encoding="utf-8")
+    current = PAGE.read_text(encoding="utf-8")
     wanted = rewritten(current)
     if "--check" in sys.argv:
         if wanted != current:
-            print("README.md is behind the code: run python scripts/tables.py")
+            print(f"{PAGE.name} is behind the code: run python scripts/tables.py")
         return int(wanted != current)
-    README.write_text(wanted, encoding="utf-8")
+    PAGE.write_text(wanted, encoding="utf-8")
     return 0
 
 
