@@ -48,13 +48,13 @@ KNOWN_CIRCLES: list[set[str]] = [
 SIBLING_NAMES: dict[str, str] = {}
 """Public class names that stand for the same idea in sibling backends."""
 
-KNOWN_TWINS: set[str] = {"Hold", "Lane", "Odometry", "Refused", "Seen"}
+KNOWN_TWINS: set[str] = {"Hold", "Lane", "Odometry", "Refused"}
 """Public class names that still stand for two ideas. The list only ever gets shorter."""
 
 FOREIGN_ROOTS: dict[str, str] = {}
 """Public exceptions that a framework wants under a root of its own, with the reason."""
 
-KNOWN_UNROOTED: set[str] = {"Failure", "LaneFullError", "MotionRefused", "NoAnswerError", "PermitVoidError", "Refused"}
+KNOWN_UNROOTED: set[str] = {"LaneFullError", "MotionRefused", "NoAnswerError", "PermitVoidError", "Refused"}
 """Public exceptions that do not derive from StrandsRobotsError yet. The list only ever gets shorter."""
 
 QUESTION_DOCSTRINGS_MAX = 190

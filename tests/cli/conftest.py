@@ -1,14 +1,20 @@
-"""A runner for commands, away from the user's own settings."""
+"""Runner for commands, and a fleet in the place of Device Connect."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
+from strands_robots.cli.network import Network
+from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.client import Peer
+from strands_robots.envelope import Envelope, success
 
 Run = Callable[..., Result]
 
@@ -17,7 +23,50 @@ Run = Callable[..., Result]
 def run() -> Run:
     """Run a command line, as ``run("doctor", "--json")``."""
 
-    def call(*words: str) -> Result:
-        return CliRunner().invoke(build(), list(words))
+    def call(*arguments: str) -> Result:
+        return CliRunner().invoke(build(), list(arguments))
 
     return call
+
+
+class FakeFleet:
+    """A fleet that answers what the test sets."""
+
+    def __init__(self) -> None:
+        self.link = loopback_config()
+        self.found: list[Peer] = []
+        self.answer: Envelope | Exception = success("done")
+        self.stops: dict[str, Envelope] = {}
+        self.called: list[tuple[Any, ...]] = []
+
+    def peers(self, timeout: float = 2.0) -> list[Peer]:
+        return self.found
+
+    def call(self, *called: Any) -> Envelope:
+        self.called.append(called)
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+    def stop(self, device: str, timeout: float) -> Envelope:
+        return self.stops[device]
+
+    def stop_all(self, timeout: float) -> dict[str, Envelope]:
+        return self.stops
+
+
+def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
+    """Put ``fleet`` in the place of the robots on every network."""
+
+    @contextmanager
+    def connected(network: Network, source: str = "") -> Iterator[Any]:
+        yield fleet
+
+    monkeypatch.setattr(Network, "fleet", connected)
+
+
+@pytest.fixture
+def fleet(monkeypatch: pytest.MonkeyPatch) -> FakeFleet:
+    fake = FakeFleet()
+    connect(monkeypatch, fake)
+    return fake

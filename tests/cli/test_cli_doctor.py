@@ -4,32 +4,30 @@ import json
 import re
 import socket
 import sys
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from click.testing import Result
 from fixtures.certificates import Authority
+from tests.cli.conftest import Run
 
 from strands_robots import __version__
-from strands_robots.cli import checks
-from strands_robots.cli.checks import certificate_error, other_owners
-
-Run = Callable[..., Result]
+from strands_robots.cli import doctor
+from strands_robots.cli.doctor import certificate_error, other_owners
 
 
 @pytest.fixture(autouse=True)
 def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rendering is tried in a process of its own; the integration test does that."""
-    monkeypatch.setattr(checks, "_RENDER", "print('rendered with nothing')")
+    monkeypatch.setattr(doctor, "_RENDER", "print('rendered with nothing')")
 
 
 def checked(result: Result) -> dict[str, dict[str, str]]:
     return {found["name"]: found for found in json.loads(result.stdout)["checks"]}
 
 
-def test_a_working_installation_is_ok(run: Run) -> None:
+def test_working_installation_is_ok(run: Run) -> None:
     result = run("doctor", "--json")
     found = checked(result)
     assert result.exit_code == 0
@@ -37,13 +35,13 @@ def test_a_working_installation_is_ok(run: Run) -> None:
     assert "127.0.0.1" in found["network"]["said"]
 
 
-def test_every_check_that_is_not_well_names_a_remedy(run: Run) -> None:
+def test_every_finding_that_is_not_ok_has_a_remedy(run: Run) -> None:
     for found in checked(run("doctor", "--json")).values():
         assert found["mark"] == "ok" or found["remedy"], found
 
 
-def test_a_missing_required_package_is_broken_and_exits_with_1(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "_version", lambda name: None)
+def test_missing_required_package_is_broken_and_exits_with_1(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_version", lambda name: None)
     result = run("doctor", "--json")
     assert result.exit_code == 1
     assert checked(result)["extra device-connect"]["mark"] == "broken"
@@ -51,20 +49,20 @@ def test_a_missing_required_package_is_broken_and_exits_with_1(run: Run, monkeyp
     assert checked(result)["extra lerobot"]["mark"] == "note"
 
 
-def test_another_release_of_the_framework_is_broken(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "_version", lambda name: "0.3.0")
+def test_other_release_of_the_framework_is_broken(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_version", lambda name: "0.3.0")
     result = run("doctor", "--json")
     assert result.exit_code == 1
     assert "0.2.5" in checked(result)["extra device-connect"]["remedy"]
 
 
-def test_an_unusable_network_is_broken_and_says_the_way_out(run: Run) -> None:
+def test_unusable_network_is_broken_with_a_remedy(run: Run) -> None:
     result = run("doctor", "--json", "--nats", "nats://192.0.2.1:4222")
     assert result.exit_code == 1
     assert "--insecure" in checked(result)["network"]["remedy"]
 
 
-def test_a_taken_port_is_noted_with_its_number(run: Run) -> None:
+def test_taken_port_is_noted_with_its_number(run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         found = checked(run("doctor", "--json", "--port", str(port)))["port"]
@@ -84,7 +82,7 @@ def test_credentials_that_others_can_read_are_a_warning(
     assert "chmod 600" in found["remedy"]
 
 
-def test_certificates_are_checked_against_their_key_and_their_time(tmp_path: Path) -> None:
+def test_certificate_is_checked_against_its_key_and_dates(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
     arm, other = authority.issue("arm"), authority.issue("other")
     assert certificate_error(str(arm.ca), str(arm.cert), str(arm.key))[0] == ""
@@ -95,7 +93,7 @@ def test_certificates_are_checked_against_their_key_and_their_time(tmp_path: Pat
     assert "no usable PEM" in certificate_error(str(arm.key), str(arm.cert), str(arm.key))[0]
 
 
-def test_people_get_a_table_and_a_verdict(run: Run) -> None:
+def test_table_ends_with_a_verdict(run: Run) -> None:
     result = run("doctor")
     assert result.exit_code == 0
     assert "Everything that is required works." in result.stdout
@@ -149,7 +147,7 @@ def test_version_is_printed_with_the_name_of_the_distribution(run: Run) -> None:
 def test_doctor_names_the_distribution_also_where_it_is_not_installed(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checks, "_version", lambda name: None if name == "strands-robots-edge" else "0.2.5")
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "strands-robots-edge" else "0.2.5")
     found = checked(run("doctor", "--json"))["distribution"]
     assert found["mark"] == "ok"
     assert found["said"] == f"strands-robots-edge {__version__}, run from its source tree"

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from strands_robots.cli.network import Network, describe
-from strands_robots.cli.output import Exit, Failure
+from strands_robots.cli.output import CliError, Exit
 from strands_robots.utils import MissingExtraError
 
 
@@ -17,7 +17,7 @@ def test_without_flags_everything_stays_on_this_machine(monkeypatch: pytest.Monk
     assert "127.0.0.1:7555" in describe(link)
 
 
-def test_the_environment_names_a_network_and_a_flag_outranks_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flag_outranks_the_network_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7001")
     assert Network().link().connect == ("tcp/127.0.0.1:7001",)
     assert Network(port=7002).link().meet_port == 7002
@@ -33,15 +33,15 @@ def test_the_environment_names_a_network_and_a_flag_outranks_it(monkeypatch: pyt
         Network(multicast=True),
     ],
 )
-def test_leaving_this_machine_without_proof_is_refused_with_every_way_out(network: Network) -> None:
-    with pytest.raises(Failure) as refused:
+def test_unauthenticated_remote_network_is_refused_with_every_remedy(network: Network) -> None:
+    with pytest.raises(CliError) as refused:
         network.link()
     assert refused.value.code is Exit.USAGE
-    for way in ("--tls-ca", "--credentials", "--insecure"):
-        assert way in refused.value.reason
+    for remedy in ("--tls-ca", "--credentials", "--insecure"):
+        assert remedy in refused.value.reason
 
 
-def test_insecure_and_certificates_are_ways_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_insecure_flag_or_certificates_allow_a_remote_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Network(nats="nats://192.0.2.1:4222", insecure=True).link().transport == "nats"
     for name in ("ca", "cert", "key"):
         (tmp_path / name).write_text("pem")
@@ -51,18 +51,18 @@ def test_insecure_and_certificates_are_ways_out(tmp_path: Path, monkeypatch: pyt
     assert Network(listen=["tcp/0.0.0.0:7447"]).link().is_peer
 
 
-def test_without_the_extra_one_sentence_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_is_named_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("strands_robots.cli.network.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"the \[device-connect\] extra"):
         Network().link()
 
 
-def test_a_broker_on_this_machine_needs_no_proof() -> None:
+def test_broker_on_this_machine_needs_no_authentication() -> None:
     assert Network(nats="nats://127.0.0.1:4222").link().loopback_only
 
 
 def test_contradicting_flags_and_missing_files_are_wrong_usage(tmp_path: Path) -> None:
-    with pytest.raises(Failure, match="--nats names a broker"):
+    with pytest.raises(CliError, match="--nats names a broker"):
         Network(nats="nats://127.0.0.1:4222", connect=["tcp/127.0.0.1:1"]).link()
-    with pytest.raises(Failure, match=r"--tls-ca .* is no file"):
+    with pytest.raises(CliError, match=r"--tls-ca .* is no file"):
         Network(tls_ca=tmp_path / "absent").link()

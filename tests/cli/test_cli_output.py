@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from strands_robots.cli.output import LONGEST, Exit, Failure, Screen, plain, table
+from strands_robots.cli.output import LENGTH_MAX, CliError, Exit, Screen, plain, table
 
 
 def drawn(thing: object) -> str:
@@ -26,37 +26,37 @@ def test_control_and_bidi_characters_become_visible(hostile: str, harmless: str)
 
 
 @given(st.text())
-def test_whatever_a_network_sends_is_one_printable_line(text: str) -> None:
+def test_any_network_text_is_one_printable_line(text: str) -> None:
     assert plain(text).isprintable()
 
 
-def test_markup_from_the_network_is_shown_and_not_obeyed() -> None:
+def test_markup_from_the_network_is_printed_as_text() -> None:
     assert "[bold red]arm[/]" in drawn(table("", ["device"], [["[bold red]arm[/]"]]))
 
 
-def test_a_long_text_is_cut_and_says_how_long_it_was() -> None:
+def test_long_text_is_cut_with_its_length() -> None:
     assert plain("a" * 5000).endswith("... (5000 characters)")
-    assert len(plain("a" * 5000)) < LONGEST + 40
+    assert len(plain("a" * 5000)) < LENGTH_MAX + 40
 
 
-def test_a_value_that_json_cannot_carry_still_shows() -> None:
+def test_value_without_json_form_is_described() -> None:
     loop: list[object] = []
     loop.append(loop)
     assert plain(loop) == "a list"
     assert plain({"speed": 1.5}) == '{"speed": 1.5}'
 
 
-def test_with_json_only_json_reaches_stdout(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_option_prints_only_json_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
     screen = Screen(machine=True)
     screen.say("for people")
     screen.show("for people")
     screen.data({"a": "\x1b"})
-    screen.fail(Failure("no", Exit.SILENT, who="arm"))
+    screen.fail(CliError("no", Exit.SILENT, who="arm"))
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert lines == [{"a": "\x1b"}, {"status": "error", "reason": "no", "exit": 3, "who": "arm"}]
 
 
-def test_what_is_to_be_pasted_is_never_broken_at_the_width_of_the_terminal() -> None:
+def test_copyable_line_is_not_wrapped_at_the_terminal_width() -> None:
     sink = io.StringIO()
     line = f"export NAME={'x' * 100}"
     Screen(console=Console(file=sink, width=40)).copyable(line)

@@ -1,79 +1,74 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import Result
+from tests.cli.conftest import Run, connect
 
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.cli import resume
-from strands_robots.cli.output import Exit, Failure
+from strands_robots.cli.network import Network
+from strands_robots.cli.output import CliError, Exit
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.client import DeviceTimeoutError, Peer
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.safety.approval import Grants
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.lockout import OVERFLOW, Hold, LockoutState
 from strands_robots.safety.persistence import Kept, LockoutStore
 
-Run = Callable[..., Result]
 STRONG = "Plenty of 4 different words"
 A, B = "a" * 32, "b" * 32
 
 
 class FakeFleet:
-    """Robots that hold what the test says and let go of what is signed for."""
+    """Robots with the lockouts that the test sets; a signed resume clears the one it names."""
 
     def __init__(self) -> None:
         self.link = loopback_config()
-        self.held: dict[str, list[str]] = {}
-        self.mute: set[str] = set()
+        self.lockouts: dict[str, list[str]] = {}
+        self.silent: set[str] = set()
         self.refuses: set[str] = set()
         self.presented: list[tuple[str, str, tuple[str, ...]]] = []
 
     def peers(self, timeout: float = 2.0) -> list[Peer]:
-        return [Peer(name, functions=({"name": "resume"},)) for name in self.held] + [Peer("camera")]
+        return [Peer(name, functions=({"name": "resume"},)) for name in self.lockouts] + [Peer("camera")]
 
     def call(self, device: str, function: str, params: dict[str, Any], timeout: float) -> Envelope:
-        if device in self.mute:
+        if device in self.silent:
             raise DeviceTimeoutError(f"{device} is announced and did not answer.")
-        held = self.held[device]
+        epochs = self.lockouts[device]
         if function == "getStatus":
-            holds = [{"epoch": each, "source": "desk", "reason": "a hand", "since": 0.0} for each in held]
-            return success("", locked=bool(held), lockout=holds)
-        slip = params["assertion"]
-        self.presented.append((device, slip["epoch"], tuple(slip["targets"])))
+            rows = [{"epoch": each, "source": "desk", "reason": "a hand", "since": 0.0} for each in epochs]
+            return success("", locked=bool(epochs), lockout=rows)
+        assertion = params["assertion"]
+        self.presented.append((device, assertion["epoch"], tuple(assertion["targets"])))
         if device in self.refuses:
             return error("resume rejected")
-        held.remove(slip["epoch"])
-        return success("free of it", locked=bool(held))
+        epochs.remove(assertion["epoch"])
+        return success("free of it", locked=bool(epochs))
 
 
 @pytest.fixture
 def fleet(monkeypatch: pytest.MonkeyPatch) -> FakeFleet:
-    there = FakeFleet()
+    fake = FakeFleet()
 
-    @contextmanager
-    def reached(network: object, source: str = "") -> Iterator[FakeFleet]:
-        yield there
-
-    monkeypatch.setattr(resume, "reached", reached)
-    return there
+    connect(monkeypatch, fake)
+    return fake
 
 
 @pytest.fixture
 def signed(tmp_path: Path) -> tuple[str, ...]:
-    words = tmp_path / "words"
-    words.write_text(STRONG, encoding="utf-8")
+    passphrase = tmp_path / "passphrase"
+    passphrase.write_text(STRONG, encoding="utf-8")
     keygen(tmp_path / "key.pem", STRONG)
-    return "resume", "--key", str(tmp_path / "key.pem"), "--passphrase-file", str(words)
+    return "resume", "--key", str(tmp_path / "key.pem"), "--passphrase-file", str(passphrase)
 
 
-def test_every_epoch_of_every_robot_is_signed_for(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:
-    fleet.held = {"arm-1": [A, B], "arm-2": [B], "arm-3": []}
+def test_every_lockout_of_every_robot_is_signed_for(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:
+    fleet.lockouts = {"arm-1": [A, B], "arm-2": [B], "arm-3": []}
     result = run(*signed, "--json")
     assert result.exit_code == 0, result.output
     assert sorted(fleet.presented) == [
@@ -84,15 +79,15 @@ def test_every_epoch_of_every_robot_is_signed_for(run: Run, fleet: FakeFleet, si
     assert json.loads(result.stdout)["devices"]["arm-3"] == {"free": True, "said": "was not locked"}
 
 
-def test_targets_are_freed_and_nobody_else(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:
-    fleet.held = {"arm-1": [A], "arm-2": [A], "arm-3": [A]}
+def test_only_the_targets_are_freed(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:
+    fleet.lockouts = {"arm-1": [A], "arm-2": [A], "arm-3": [A]}
     assert run(*signed, "--targets", "arm-1,arm-3").exit_code == 0
-    assert fleet.held == {"arm-1": [], "arm-2": [A], "arm-3": []}
+    assert fleet.lockouts == {"arm-1": [], "arm-2": [A], "arm-3": []}
 
 
-def test_who_is_still_locked_is_named_with_exit_1(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:
-    fleet.held = {"stubborn": [A], "mute": [A], "full": [OVERFLOW], "good": [A]}
-    fleet.mute, fleet.refuses = {"mute"}, {"stubborn"}
+def test_robots_still_locked_are_named_with_exit_1(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:
+    fleet.lockouts = {"stubborn": [A], "mute": [A], "full": [OVERFLOW], "good": [A]}
+    fleet.silent, fleet.refuses = {"mute"}, {"stubborn"}
     result = run(*signed, "--json")
     assert result.exit_code == 1
     devices = json.loads(result.stdout)["devices"]
@@ -107,22 +102,22 @@ def test_who_is_still_locked_is_named_with_exit_1(run: Run, fleet: FakeFleet, si
 
 
 @pytest.mark.parametrize("words", [(), ("--local", "--key", "x"), ("--key", "nowhere"), ("--local", "a.b")])
-def test_wrong_words_are_exit_2(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
+def test_resume_with_wrong_arguments_is_exit_2(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
     assert run("resume", *words).exit_code == 2
 
 
-def test_a_wrong_passphrase_frees_nobody(run: Run, fleet: FakeFleet, signed: tuple[str, ...], tmp_path: Path) -> None:
-    fleet.held = {"arm-1": [A]}
-    (tmp_path / "words").write_text("another", encoding="utf-8")
+def test_wrong_passphrase_frees_no_robot(run: Run, fleet: FakeFleet, signed: tuple[str, ...], tmp_path: Path) -> None:
+    fleet.lockouts = {"arm-1": [A]}
+    (tmp_path / "passphrase").write_text("another", encoding="utf-8")
     assert run(*signed).exit_code == 1
     assert fleet.presented == []
 
 
-def test_a_robot_that_does_not_run_is_cleared_here_and_recorded(run: Run, fleet: FakeFleet) -> None:
+def test_robot_that_is_off_is_cleared_locally_and_audited(run: Run, fleet: FakeFleet) -> None:
     hold = Hold(A, "desk", "a hand", 0.0)
     LockoutStore().save({"hardware:so101:left": Kept(LockoutState((hold,)), name="arm-1")})
     shown = run("lockout", "--local")
-    assert "arm-1 (kept here)" in shown.stdout and "by desk: a hand" in shown.stdout and A in shown.stdout
+    assert "arm-1 (in this machine's file)" in shown.stdout and "by desk: a hand" in shown.stdout and A in shown.stdout
     assert run("resume", "--local").exit_code == 0
     assert flush_audit(20)
     (record,) = [each for each in read_audit_log() if each["event"] == "resume_local"]
@@ -131,27 +126,48 @@ def test_a_robot_that_does_not_run_is_cleared_here_and_recorded(run: Run, fleet:
     assert run("resume", "--local").exit_code == 1
 
 
-def test_a_live_robot_answers_for_itself(run: Run, fleet: FakeFleet) -> None:
+def test_live_robot_outranks_the_lockout_file(run: Run, fleet: FakeFleet) -> None:
     LockoutStore().save({"k": Kept(LockoutState((Hold(A, "desk", "", 0.0),)), name="arm-1")})
-    fleet.held = {"arm-1": [], "arm-2": [B]}
+    fleet.lockouts = {"arm-1": [], "arm-2": [B]}
     told = json.loads(run("lockout", "--json").stdout)
     assert {name: each["locked"] for name, each in told["live"].items()} == {"arm-1": False, "arm-2": True}
     shown = run("lockout").stdout
-    assert "kept here" not in shown and "Free: arm-1." in shown and B in shown
-    fleet.mute = {"arm-1"}
-    assert "arm-1 (kept here)" in run("lockout").stdout
+    assert "this machine's file" not in shown and "Free: arm-1." in shown and B in shown
+    fleet.silent = {"arm-1"}
+    assert "arm-1 (in this machine's file)" in run("lockout").stdout
 
 
-def test_without_a_network_what_is_kept_here_is_still_told(
+def test_lockout_file_is_printed_without_a_network(
     run: Run, monkeypatch: pytest.MonkeyPatch, state_directory: Path
 ) -> None:
-    def nobody(network: object, source: str = "") -> Any:
-        raise Failure("The network is not there.", Exit.SILENT)
+    def unreachable(network: Network, source: str = "") -> Any:
+        raise CliError("The network is not there.", Exit.SILENT)
 
-    monkeypatch.setattr(resume, "reached", nobody)
+    monkeypatch.setattr(Network, "fleet", unreachable)
     LockoutStore().save({"k": Kept(LockoutState((Hold(A, "desk", "", 0.0),)), name="arm-1")})
     result = run("lockout")
     assert result.exit_code == 0
     assert "The network is not there." in result.stdout and "arm-1" in result.stdout
     (state_directory / "lockouts.json").write_text("{", encoding="utf-8")
     assert run("lockout").exit_code == 1
+
+
+def test_grant_can_be_claimed_once(run: Run, state_directory: Path) -> None:
+    result = run("grant", "execute@arm-1", "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["peer"] == "arm-1"
+    grants = Grants(state_directory / "grants")
+    assert grants.claim("execute", "arm-1") is not None
+    assert grants.claim("execute", "arm-1") is None
+
+
+@pytest.mark.parametrize("what", ["execute", "@arm-1", "execute@", "exe cute@arm-1", "execute@arm/1"])
+def test_grant_of_anything_but_verb_at_peer_is_wrong_usage(run: Run, what: str) -> None:
+    result = run("grant", what)
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("seconds", ["0", "-1", "nan", "1e9"])
+def test_grant_outside_the_time_limits_is_refused(run: Run, seconds: str) -> None:
+    assert run("grant", "execute@arm-1", "--for", seconds).exit_code == 2

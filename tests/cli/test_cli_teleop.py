@@ -10,35 +10,35 @@ from tests.cli.conftest import Run
 from strands_robots.teleoperators.recorded import write_csv
 
 
-def test_a_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) -> None:
+def test_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) -> None:
     frames = [(0.02 * step, {"shoulder_pan": 0.004 * step}) for step in range(100)]
     write_csv(tmp_path / "run.csv", frames)
     result = run("teleop", str(tmp_path / "run.csv"), "so100", "--json")
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    assert told["state"] == "completed"
-    assert told["stopped"] is True
-    assert told["frames"] >= 10
+    ended = json.loads(result.stdout)
+    assert ended["state"] == "completed"
+    assert ended["stopped"] is True
+    assert ended["frames"] >= 10
 
 
-def test_what_cannot_lead_is_refused_by_name(run: Run, tmp_path: Path) -> None:
+def test_unusable_leader_is_refused_by_name(run: Run, tmp_path: Path) -> None:
     for leader, words in (("nobody", "recording"), (str(tmp_path / "none.csv"), "cannot be read")):
         result = run("teleop", leader, "so100", "--json")
         assert result.exit_code == 2
         assert words in json.loads(result.stdout)["reason"]
 
 
-def test_without_a_terminal_the_keyboard_is_refused(run: Run) -> None:
+def test_keyboard_is_refused_without_a_terminal(run: Run) -> None:
     result = run("teleop", "keyboard", "so100", "--json")
     assert result.exit_code != 0
 
 
-def test_a_real_follower_without_lerobot_names_the_extra(run: Run) -> None:
+def test_unknown_real_follower_is_refused(run: Run) -> None:
     result = run("teleop", "keyboard", "no-such-arm@/dev/ttyACM0", "--json")
     assert result.exit_code in (1, 2)
 
 
-def test_a_recording_is_replayed_to_no_device_of_device_connect(run: Run, tmp_path: Path) -> None:
+def test_replay_to_a_device_connect_device_is_refused(run: Run, tmp_path: Path) -> None:
     write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
     result = run("replay", str(tmp_path / "run.csv"), "--to", "arm-1", "--json")
     assert result.exit_code == 2
@@ -47,7 +47,7 @@ def test_a_recording_is_replayed_to_no_device_of_device_connect(run: Run, tmp_pa
     assert "mesh:PEER" in reason
 
 
-def test_an_option_that_is_refused_is_not_taken_for_an_unknown_follower(run: Run, tmp_path: Path) -> None:
+def test_refused_option_is_not_reported_as_unknown_follower(run: Run, tmp_path: Path) -> None:
     write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
     result = run("teleop", str(tmp_path / "run.csv"), "so100", "--publish", "safety", "--json")
     assert result.exit_code == 2

@@ -1,14 +1,31 @@
 from __future__ import annotations
 
 import io
+import math
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-from strands_robots.cli.output import Exit, Failure, Screen
-from strands_robots.cli.watch import View, in_lines, task_of, until
+from strands_robots.cli.output import CliError, Exit, Screen
+from strands_robots.cli.watch import (
+    BAR_WIDTH,
+    DeviceView,
+    describe_task,
+    joint_bar,
+    joint_limits,
+    joints_table,
+    motion_progress,
+    print_changes,
+    until,
+)
 from strands_robots.device_connect.client import DeviceEvent
+
+
+def drawn(thing: object) -> str:
+    sink = io.StringIO()
+    Console(file=sink, width=120).print(thing)
+    return sink.getvalue()
 
 
 def event(name: str, **payload: Any) -> DeviceEvent:
@@ -16,7 +33,7 @@ def event(name: str, **payload: Any) -> DeviceEvent:
 
 
 @pytest.mark.parametrize(
-    ("seen", "told"),
+    ("seen", "task"),
     [
         (event("stateUpdate", running_policies={}), "idle"),
         (event("stateUpdate", running_policies={"arm": {"instruction": "wave", "step": 7}}), "arm does 'wave', step 7"),
@@ -28,29 +45,28 @@ def event(name: str, **payload: Any) -> DeviceEvent:
         (event("observationUpdate", joints={}), ""),
     ],
 )
-def test_an_event_says_what_the_device_does(seen: DeviceEvent, told: str) -> None:
-    assert task_of(seen) == told
+def test_event_is_described_as_the_device_task(seen: DeviceEvent, task: str) -> None:
+    assert describe_task(seen) == task
 
 
 def test_the_view_keeps_the_last_joints_and_task() -> None:
-    view = View("arm-1", {"pan": (-1.0, 1.0)})
+    view = DeviceView("arm-1", {"pan": (-1.0, 1.0)})
     view.take(event("stateUpdate", running_policies={"arm": {"instruction": "wave"}}))
     view.take(event("observationUpdate", robot_name="arm", joints={"pan": 0.25}))
     view.take(event("observationUpdate", robot_name="arm", joints="nonsense"))
-    sink = io.StringIO()
-    Console(file=sink, width=100).print(view.draw())
-    assert "+0.250" in sink.getvalue()
-    assert "wave" in sink.getvalue()
+    text = drawn(view.draw())
+    assert "+0.250" in text
+    assert "wave" in text
 
 
-def test_without_a_terminal_each_change_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_change_is_one_line_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     idle = event("stateUpdate", running_policies={})
-    in_lines(Screen(), iter([idle, idle, event("policyStarted", instruction="a", policy_provider="mock"), idle]))
+    print_changes(Screen(), iter([idle, idle, event("policyStarted", instruction="a", policy_provider="mock"), idle]))
     assert capsys.readouterr().out.splitlines() == ["arm-1: idle", "arm-1: started 'a' with mock", "arm-1: idle"]
 
 
-def test_a_device_that_falls_silent_is_exit_3() -> None:
-    with pytest.raises(Failure) as failure:
+def test_silent_device_is_exit_3() -> None:
+    with pytest.raises(CliError) as failure:
         list(until(iter([event("stateUpdate")]), None, "arm-1"))
     assert failure.value.code is Exit.SILENT
 
@@ -58,3 +74,37 @@ def test_a_device_that_falls_silent_is_exit_3() -> None:
 def test_watching_ends_after_its_time() -> None:
     endless = iter(lambda: event("stateUpdate"), None)
     assert list(until(endless, 0.001, "arm-1"))
+
+
+def test_bar_mark_stays_between_the_limits() -> None:
+    assert joint_bar(-1.0, (-1.0, 1.0)).plain.index("●") == 0
+    assert joint_bar(1.0, (-1.0, 1.0)).plain.index("●") == BAR_WIDTH - 1
+    assert joint_bar(99.0, (-1.0, 1.0)).plain.index("●") == BAR_WIDTH - 1
+    assert len(joint_bar(0.0, (-1.0, 1.0)).plain) == BAR_WIDTH
+
+
+def test_joints_without_a_finite_number_are_left_out() -> None:
+    text = drawn(joints_table({"pan": 0.5, "lift": math.nan, "name": "x", "flag": True}, {}))
+    assert "+0.500" in text
+    assert "lift" not in text and "name" not in text and "flag" not in text
+
+
+def test_hostile_joint_name_is_printed_as_text() -> None:
+    assert "[red]" in drawn(joints_table({"[red]\x1b[2J": 1.0}, {}))
+    assert "\x1b[2J" not in drawn(joints_table({"[red]\x1b[2J": 1.0}, {}))
+
+
+def test_joints_beyond_the_maximum_are_counted() -> None:
+    assert "and 976 more" in drawn(joints_table({f"j{i}": 0.0 for i in range(1000)}, {}))
+
+
+def test_joint_limits_are_read_from_simulation_and_robot() -> None:
+    one = {"joints": {"pan": [-1, 1], "lift": None, "odd": [2, 1], "text": ["a", "b"]}}
+    assert joint_limits(one) == {"pan": (-1.0, 1.0)}
+    assert joint_limits({"robots": {"arm": one, "other": {}}}) == {"pan": (-1.0, 1.0)}
+    assert joint_limits({"robots": {"arm": one, "other": {"joints": {"x": [0, 2]}}}}, "other") == {"x": (0.0, 2.0)}
+    assert joint_limits({"robots": "nonsense"}) == {}
+
+
+def test_progress_never_exceeds_its_total() -> None:
+    assert "4.0 / 4.0 s" in drawn(motion_progress("wave", 9.0, 4.0))

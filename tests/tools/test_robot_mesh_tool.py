@@ -15,7 +15,7 @@ from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.tools import networks, robot_mesh
-from strands_robots.tools.networks import DeviceConnect, NativeMesh, verdict_of
+from strands_robots.tools.networks import DeviceConnect, NativeMesh, combined_verdict
 
 
 class FakeNetwork:
@@ -91,7 +91,7 @@ def test_an_argument_out_of_its_domain_is_refused_by_name(fake: FakeNetwork, ask
 
 
 def test_one_silent_robot_makes_a_stop_an_error_that_names_it() -> None:
-    answer = verdict_of({"a": success("ok", stopped=True), "b": error("no answer in 5 s", stopped=None)})
+    answer = combined_verdict({"a": success("ok", stopped=True), "b": error("no answer in 5 s", stopped=None)})
     assert answer["status"] == "error"
     assert answer["silent"] == ["b"]
     assert answer["stopped"] is None
@@ -99,7 +99,7 @@ def test_one_silent_robot_makes_a_stop_an_error_that_names_it() -> None:
 
 
 def test_one_moving_robot_outranks_a_silent_one() -> None:
-    answer = verdict_of(
+    answer = combined_verdict(
         {
             "a": success("ok", stopped=True),
             "b": error("no answer", stopped=None),
@@ -112,12 +112,12 @@ def test_one_moving_robot_outranks_a_silent_one() -> None:
 
 
 def test_a_stop_that_reaches_nobody_is_an_error() -> None:
-    assert verdict_of({})["status"] == "error"
+    assert combined_verdict({})["status"] == "error"
 
 
 def test_only_affirmative_answers_are_a_stop() -> None:
-    assert verdict_of({"a": success("ok"), "b": success("ok", stopped=["arm"])})["status"] == "success"
-    assert verdict_of({"a": {"result": "hm"}})["status"] == "error"
+    assert combined_verdict({"a": success("ok"), "b": success("ok", stopped=["arm"])})["status"] == "success"
+    assert combined_verdict({"a": {"result": "hm"}})["status"] == "error"
 
 
 @pytest.mark.parametrize("word", ["off", "OFF", "0", "false"])

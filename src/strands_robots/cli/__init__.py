@@ -1,6 +1,6 @@
 """``strands-robots``: serve a robot, find robots, drive them, stop them.
 
-Exit codes: 0 done, 1 refused or failed, 2 wrong usage, 3 nobody answered, 130 Ctrl-C.
+Exit codes: 0 done, 1 refused or failed, 2 wrong usage, 3 no answer, 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Entry point of the ``strands-robots`` command."""
-    from strands_robots.cli.app import build  # noqa: PLC0415 - importing the package stays free
+    """Run the ``strands-robots`` command."""
+    from strands_robots.cli.app import build  # noqa: PLC0415 - importing the package loads no command
 
     try:
         build()()
-    except SystemExit as ended:
-        _leave(ended.code)
+    except SystemExit as exit_:
+        _leave(exit_.code)
 
 
 def _leave(code: object) -> NoReturn:
-    """End the process with everything written.
+    """End the process after flushing all output.
 
-    Native network threads may still be letting go of callbacks; where the interpreter is taken down under them, the
-    C library aborts the process, and a script would read -6 in place of the exit code.
+    Native network threads may still release callbacks. If the interpreter shut down under them, the C library would
+    abort the process, and a script would read -6 in place of the exit code.
     """
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):

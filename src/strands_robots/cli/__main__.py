@@ -1,4 +1,4 @@
-"""``python -m strands_robots.cli``, for processes that start one another without a script folder on the path."""
+"""``python -m strands_robots.cli``, for processes that start one another without a script on the path."""
 
 from strands_robots.cli import main
 

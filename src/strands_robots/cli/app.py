@@ -1,4 +1,4 @@
-"""The command line put together."""
+"""Application of the command line, with every command."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from strands_robots.cli import (
     audit,
     demo,
     doctor,
-    estop,
-    fleet,
-    grant,
     keys,
-    mesh,
+    peers,
     record,
     resume,
     safety_controller,
     serve,
+    stop,
     teleop,
     watch,
 )
-from strands_robots.cli.checks import other_owners, owner_remedy
+from strands_robots.cli.doctor import other_owners, owner_remedy
 from strands_robots.utils import DISTRIBUTION
 
-HELP = """Robots on Device Connect: serve one, find them, drive them, and always stop them.
+HELP = """Robots on Device Connect: serve one, find them, drive them, and stop them.
 
 Without network flags everything stays on this machine. Exit codes: 0 done, 1 refused or failed,
-2 wrong usage, 3 nobody answered, 130 Ctrl-C."""
+2 wrong usage, 3 no answer, 130 Ctrl-C."""
 
 
 def _print_version(wanted: bool) -> None:
@@ -51,7 +49,7 @@ def _start(
 
 
 def build() -> typer.Typer:
-    """The application with every command."""
+    """Build the application."""
     app = typer.Typer(
         name="strands-robots",
         help=HELP,
@@ -63,17 +61,15 @@ def build() -> typer.Typer:
     app.callback()(_start)
     for module in (
         serve,
-        fleet,
-        estop,
+        peers,
+        stop,
         safety_controller,
         resume,
         watch,
         teleop,
         record,
-        grant,
         audit,
         keys,
-        mesh,
         doctor,
         demo,
     ):

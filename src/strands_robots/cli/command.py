@@ -1,20 +1,26 @@
-"""How a function becomes a command: ``--json`` and the network flags added, its failures turned into exit codes."""
+"""Functions as commands: ``--json`` and network flags added, ``key=value`` parsed, errors turned into exit codes."""
 
 from __future__ import annotations
 
 import inspect
+import json
 import logging
-from collections.abc import Callable
+import math
+import re
+from collections.abc import Callable, Iterable
 from inspect import Parameter
 from typing import Annotated, Any, TypeVar
 
 import typer
 
 from strands_robots.cli.network import NETWORK_OPTIONS, Network
-from strands_robots.cli.output import Exit, Failure, Screen
-from strands_robots.utils import MissingExtraError, ValidationError
+from strands_robots.cli.output import CliError, Exit, Screen
+from strands_robots.utils import MissingExtraError, ValidationError, shown
 
 Body = TypeVar("Body", bound=Callable[..., None])
+
+WAIT_OPTION = typer.Option("--timeout", help="Seconds to wait for an answer.")
+MESH_OPTION = typer.Option("--mesh", help="On the native mesh instead of Device Connect.")
 
 _JSON = Parameter(
     "machine",
@@ -22,6 +28,8 @@ _JSON = Parameter(
     default=False,
     annotation=Annotated[bool, typer.Option("--json", help="Machine-readable output, on stdout alone.")],
 )
+_SERIAL = re.compile(r"/.|COM\d+\Z", re.IGNORECASE)
+_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 
 def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[Body], Body]:
@@ -34,17 +42,17 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
     """
 
     def register(body: Body) -> Body:
-        asked = inspect.signature(body, eval_str=True).parameters.values()
-        own = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in asked if each.name not in ("screen", "network")]
-        # A command may read a flag of the network in a way of its own.
+        declared = inspect.signature(body, eval_str=True).parameters.values()
+        own = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in declared if each.name not in ("screen", "network")]
+        # A command may define a network flag of its own meaning, as serve does with --port.
         shared = [each for each in NETWORK_OPTIONS if network and each.name not in {mine.name for mine in own}]
         parameters = [*own, *shared, _JSON]
 
-        def run(**given: Any) -> None:
-            screen = Screen(given.pop("machine"))
+        def run(**arguments: Any) -> None:
+            screen = Screen(arguments.pop("machine"))
             if network:
-                given["network"] = Network(**{each.name: given.pop(each.name) for each in shared})
-            raise typer.Exit(int(outcome(screen, lambda: body(screen, **given))))
+                arguments["network"] = Network(**{each.name: arguments.pop(each.name) for each in shared})
+            raise typer.Exit(int(_exit_code(screen, lambda: body(screen, **arguments))))
 
         run.__name__ = body.__name__
         run.__doc__ = body.__doc__
@@ -56,27 +64,81 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
     return register
 
 
-def outcome(screen: Screen, body: Callable[[], None]) -> Exit:
-    """Run ``body`` and tell its end: 0, or the code of what went wrong, said on the screen."""
-    _quiet_libraries()
+def assignments(arguments: Iterable[str]) -> dict[str, Any]:
+    """Parse ``key=value`` arguments; a value that is JSON is read as JSON, everything else is text.
+
+    ``speed=1.5`` is a number, ``name='"1.5"'`` the text 1.5, ``instruction=wave`` the text wave.
+
+    Raises:
+        ValidationError: no ``=``, a key that is no name, a key given twice, or a number that is not finite.
+    """
+    values: dict[str, Any] = {}
+    for argument in arguments:
+        key, equals, text = argument.partition("=")
+        if not equals or not _KEY.match(key):
+            raise ValidationError(f"arguments must be key=value with a name as key, not {shown(argument)}.")
+        if key in values:
+            raise ValidationError(f"{key} is given twice.")
+        values[key] = _value(key, text)
+    return values
+
+
+def parse_ports(ports: Iterable[str]) -> tuple[int | None, str | None]:
+    """Return the TCP port and the serial port among the values of a ``--port`` that may mean either.
+
+    Raises:
+        ValidationError: one that is neither, or two of a kind.
+    """
+    tcp: int | None = None
+    serial: str | None = None
+    for port in ports:
+        if _SERIAL.match(port):
+            if serial is not None:
+                raise ValidationError(f"--port names two serial ports: {serial} and {port}.")
+            serial = port
+        elif port.isdecimal() and 1 <= int(port) <= 65535:
+            if tcp is not None:
+                raise ValidationError(f"--port names two numbers: {tcp} and {port}.")
+            tcp = int(port)
+        else:
+            raise ValidationError(
+                f"--port must be a serial port such as /dev/ttyACM0 or a number from 1 to 65535, not {shown(port)}."
+            )
+    return tcp, serial
+
+
+def _value(key: str, text: str) -> Any:
+    def refuse(constant: str) -> float:
+        raise ValidationError(f"{key} must be finite; JSON has no {constant}.")
+
+    try:
+        value = json.loads(text, parse_constant=refuse)
+    except ValidationError:
+        raise
+    except (ValueError, RecursionError):
+        return text
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValidationError(f"{key} must be finite, not {shown(text)}.")
+    return value
+
+
+def _exit_code(screen: Screen, body: Callable[[], None]) -> Exit:
+    """Run ``body``, report its failure on the screen, and return the exit code."""
+    # Routine events of the libraries stay off the terminal; warnings get through. The framework also warns of
+    # extras that nothing here uses.
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("device_connect_edge").setLevel(logging.ERROR)
     try:
         body()
-    except Failure as failure:
+    except CliError as failure:
         screen.fail(failure)
         return failure.code
     except ValidationError as refused:
-        screen.fail(Failure(str(refused), Exit.USAGE))
+        screen.fail(CliError(str(refused), Exit.USAGE))
         return Exit.USAGE
     except (MissingExtraError, ConnectionError) as missing:
-        screen.fail(Failure(str(missing)))
+        screen.fail(CliError(str(missing)))
         return Exit.REFUSED
     except KeyboardInterrupt:
         return Exit.INTERRUPTED
     return Exit.OK
-
-
-def _quiet_libraries() -> None:
-    """Keep the libraries' reports of routine events off the terminal; warnings still get through."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    # The framework warns of extras that nothing here uses.
-    logging.getLogger("device_connect_edge").setLevel(logging.ERROR)

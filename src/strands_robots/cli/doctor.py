@@ -1,13 +1,90 @@
-"""``doctor``: what is installed, which network would be used, what works here, and the remedy for what does not."""
+"""``doctor``: check what is installed and what works here, and name a remedy for what does not."""
 
 from __future__ import annotations
 
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from enum import Enum
+from importlib import metadata
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
 import typer
 
-from strands_robots.cli.checks import Finding, Mark, examine
+from strands_robots import __version__, settings
 from strands_robots.cli.command import command
-from strands_robots.cli.network import Network
-from strands_robots.cli.output import Failure, Screen, label, table
+from strands_robots.cli.network import Network, describe
+from strands_robots.cli.output import CliError, Screen, label, table
+from strands_robots.safety.approval import state_dir
+from strands_robots.utils import DISTRIBUTION, MissingExtraError, ValidationError, install_line
+
+FRAMEWORK = "0.2.5"
+"""Release of device-connect-edge that the backends are written for."""
+
+_GROUP = "224.0.0.224"
+"""Zenoh's scouting group; any multicast address would show whether the network carries multicast."""
+
+_EXTRAS: dict[str, tuple[str, ...]] = {
+    "device-connect": ("device-connect-edge", "device-connect-agent-tools", "eclipse-zenoh", "nats-py"),
+    "sim": ("mujoco", "numpy", "pillow"),
+    "remote": ("websockets", "msgpack"),
+    "agent": ("strands-agents", "fastmcp"),
+    "record": ("mcap", "pillow"),
+    "dataset": ("pyarrow",),
+    "lerobot": ("lerobot",),
+    "rosbridge": ("websockets",),
+    "ros2": ("cyclonedds",),
+    "reachy": ("httpx", "websockets", "zeroconf"),
+    "mesh": ("eclipse-zenoh", "cryptography"),
+    "iot": ("awsiotsdk",),
+}
+_REQUIRED = ("device-connect",)
+_IMPORT_PACKAGE = "strands_robots"
+_OWNS = re.compile(rf"^(\.\./)*{_IMPORT_PACKAGE}/__init__\.py\b", re.MULTILINE)
+_RENDER_S = 20.0
+
+# Runs in its own process: MuJoCo chooses its OpenGL at import, and a broken driver may end the process.
+_RENDER = """
+from strands_robots.simulation.engine import BACKEND, mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_step(model, data)
+renderer = mujoco.Renderer(model, 32, 32)
+renderer.update_scene(data)
+assert renderer.render().any(), "an empty picture"
+renderer.close()
+print("rendered with", BACKEND or "the default OpenGL")
+"""
+
+
+class Mark(Enum):
+    """Severity of a finding; only ``broken`` is required and does not work."""
+
+    OK = "ok"
+    NOTE = "note"
+    WARN = "warn"
+    BROKEN = "broken"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Result of one check; ``remedy`` is empty where nothing needs to be done."""
+
+    name: str
+    mark: Mark
+    said: str
+    remedy: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the finding for ``--json``."""
+        return {**asdict(self), "mark": self.mark.value}
+
 
 _STYLE = {Mark.OK: "green", Mark.NOTE: "cyan", Mark.WARN: "yellow", Mark.BROKEN: "bold red"}
 
@@ -20,21 +97,232 @@ def register(app: typer.Typer) -> None:
 def doctor(screen: Screen, network: Network) -> None:
     """Check what is installed and what works here; exit 1 when something required is broken."""
     findings = examine(network)
-    broken = [found for found in findings if found.mark is Mark.BROKEN]
-    report = {"status": "error" if broken else "success", "checks": [found.as_dict() for found in findings]}
-    screen.show(table("", ("", "check", "found"), (_row(found) for found in findings)))
-    remedies = [found for found in findings if found.remedy]
+    broken = [finding.name for finding in findings if finding.mark is Mark.BROKEN]
+    rows = ((label(found.mark.value, _STYLE[found.mark]), found.name, found.said) for found in findings)
+    screen.show(table("", ("", "check", "found"), rows))
+    remedies = [finding for finding in findings if finding.remedy]
     if remedies:
         screen.say("Remedies", "bold")
-    for found in remedies:
-        screen.say(f"  {found.name}: {found.remedy}")
+    for finding in remedies:
+        screen.say(f"  {finding.name}: {finding.remedy}")
+    checks = [finding.as_dict() for finding in findings]
     if broken:
-        names = ", ".join(found.name for found in broken)
-        reason = f"Required and broken: {names}."
-        raise Failure(reason, checks=report["checks"])
-    screen.data(report)
+        raise CliError(f"Required and broken: {', '.join(broken)}.", checks=checks)
+    screen.data({"status": "success", "checks": checks})
     screen.say("Everything that is required works.", "green")
 
 
-def _row(found: Finding) -> tuple[object, object, object]:
-    return label(found.mark.value, _STYLE[found.mark]), found.name, found.said
+def examine(network: Network) -> list[Finding]:
+    """Run every check, in the order of the report."""
+    checks: tuple[Callable[[], Iterator[Finding]], ...] = (
+        _python,
+        _distribution,
+        _packages,
+        lambda: _network(network),
+        lambda: _meeting_port(network),
+        _multicast,
+        _certificates,
+        _credentials,
+        _rendering,
+        _state,
+    )
+    return [finding for check in checks for finding in check()]
+
+
+def _python() -> Iterator[Finding]:
+    yield Finding("python", Mark.OK, sys.version.split()[0])
+
+
+def _distribution() -> Iterator[Finding]:
+    others = other_owners()
+    if others:
+        said = f"{', '.join(others)} also installs the import package {_IMPORT_PACKAGE}"
+        yield Finding("distribution", Mark.WARN, said, owner_remedy(others))
+        return
+    installed = _version(DISTRIBUTION)
+    said = f"{DISTRIBUTION} {__version__}"
+    yield Finding("distribution", Mark.OK, said if installed else f"{said}, run from its source tree")
+
+
+def other_owners(path: Sequence[str] | None = None) -> list[str]:
+    """Return name and version of every other distribution on ``path`` that installs our import package.
+
+    The lists of installed files are searched as text, in about 5 ms: ``importlib.metadata.packages_distributions``
+    parses all of them in about 100 ms, which every command would pay.
+    """
+    found = set()
+    for installed in metadata.distributions(path=list(sys.path if path is None else path)):
+        files = installed.read_text("RECORD") or installed.read_text("installed-files.txt") or ""
+        name = installed.metadata["Name"] if _OWNS.search(files) else None
+        if name and name.lower().replace("_", "-") != DISTRIBUTION:
+            found.add(f"{name} {installed.version}")
+    return sorted(found)
+
+
+def owner_remedy(others: Sequence[str]) -> str:
+    """Return the commands that leave this project as the only owner of its import package."""
+    names = " ".join(other.split()[0] for other in others)
+    return f"pip uninstall {names}, then reinstall {DISTRIBUTION} (pip install --force-reinstall --no-deps)"
+
+
+def _packages() -> Iterator[Finding]:
+    for extra, names in _EXTRAS.items():
+        have = {name: _version(name) for name in names}
+        missing = [name for name, version in have.items() if version is None]
+        if missing:
+            absent = Mark.BROKEN if extra in _REQUIRED else Mark.NOTE
+            said = "not installed" if len(missing) == len(names) else f"without {', '.join(missing)}"
+            yield Finding(f"extra {extra}", absent, said, install_line(extra))
+            continue
+        versions = ", ".join(f"{name} {version}" for name, version in have.items())
+        if extra == "device-connect" and have["device-connect-edge"] != FRAMEWORK:
+            remedy = f"pip install device-connect-edge=={FRAMEWORK}; the backends are written for that release"
+            yield Finding(f"extra {extra}", Mark.BROKEN, versions, remedy)
+        else:
+            yield Finding(f"extra {extra}", Mark.OK, versions)
+
+
+def _network(network: Network) -> Iterator[Finding]:
+    try:
+        link = network.link()
+    except (CliError, ValidationError, MissingExtraError) as exc:
+        yield Finding("network", Mark.BROKEN, "no usable network in the flags and the environment", str(exc))
+        return
+    yield Finding("network", Mark.OK if link.authenticated or link.loopback_only else Mark.WARN, describe(link))
+
+
+def _meeting_port(network: Network) -> Iterator[Finding]:
+    port = network.port or settings.integer("STRANDS_DC_PORT")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as exc:
+            remedy = "nothing, if a robot is served there; else choose another with --port or STRANDS_DC_PORT"
+            yield Finding("port", Mark.NOTE, f"127.0.0.1:{port} is taken ({exc.strerror})", remedy)
+            return
+    yield Finding("port", Mark.OK, f"127.0.0.1:{port} is free")
+
+
+def _multicast() -> Iterator[Finding]:
+    failed = multicast_error()
+    if failed is None:
+        yield Finding("multicast", Mark.OK, "a datagram to this machine's own group came back")
+    else:
+        remedy = "only --multicast needs it; where it is missing use the loopback default or --connect and --listen"
+        yield Finding("multicast", Mark.NOTE, f"does not work here: {failed}", remedy)
+
+
+def multicast_error(within: float = 0.5) -> str | None:
+    """Return why a multicast datagram does not come back within ``within`` seconds, or None when it does."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        try:
+            listener.bind(("", 0))
+            listener.settimeout(within)
+            member = socket.inet_aton(_GROUP) + socket.inet_aton("0.0.0.0")
+            listener.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            sender.sendto(b"strands-robots doctor", (_GROUP, listener.getsockname()[1]))
+            listener.recv(64)
+        except TimeoutError:
+            return "the datagram did not come back"
+        except OSError as exc:
+            return exc.strerror or str(exc)
+    return None
+
+
+def _certificates() -> Iterator[Finding]:
+    names = {part: settings.raw(f"MESSAGING_TLS_{part}_FILE") for part in ("CA", "CERT", "KEY")}
+    if not any(names.values()):
+        yield Finding("certificates", Mark.OK, "none configured; this machine alone needs none")
+        return
+    failed, until = certificate_error(names["CA"], names["CERT"], names["KEY"])
+    if failed:
+        remedy = "set MESSAGING_TLS_CA_FILE, MESSAGING_TLS_CERT_FILE and MESSAGING_TLS_KEY_FILE to matching PEM files"
+        yield Finding("certificates", Mark.BROKEN, failed, remedy)
+    else:
+        yield Finding("certificates", Mark.OK, f"the certificate fits its key and is valid until {until}")
+
+
+def certificate_error(ca: str, cert: str, key: str, now: datetime | None = None) -> tuple[str, str]:
+    """Return why the three PEM files cannot be used together, or empty; and the certificate's last day."""
+    try:
+        from cryptography import x509  # noqa: PLC0415 - comes with the [device-connect] extra
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415
+    except ModuleNotFoundError:
+        return "the cryptography package is missing", ""
+    moment = now or datetime.now(UTC)
+    try:
+        x509.load_pem_x509_certificate(Path(ca).read_bytes())
+        certificate = x509.load_pem_x509_certificate(Path(cert).read_bytes())
+        private = load_pem_private_key(Path(key).read_bytes(), None)
+    except OSError as exc:
+        return f"{exc.filename or 'a file without a name'} cannot be read: {exc.strerror}", ""
+    except (ValueError, TypeError) as exc:
+        return f"no usable PEM: {exc}", ""
+    until = certificate.not_valid_after_utc.date().isoformat()
+    if not certificate.not_valid_before_utc <= moment <= certificate.not_valid_after_utc:
+        return f"the certificate is valid from {certificate.not_valid_before_utc.date()} to {until} only", until
+    if certificate.public_key() != private.public_key():
+        return "the key is not the certificate's", until
+    return "", until
+
+
+def _credentials() -> Iterator[Finding]:
+    name = settings.raw("MESSAGING_CREDENTIALS_FILE") or settings.raw("NATS_CREDENTIALS_FILE")
+    if not name:
+        yield Finding("credentials", Mark.OK, "none configured; this machine alone needs none")
+        return
+    path = Path(name)
+    try:
+        path.read_bytes()
+    except OSError as exc:
+        yield Finding("credentials", Mark.BROKEN, f"{name} cannot be read: {exc.strerror}", "name a readable file")
+        return
+    if path.stat().st_mode & 0o077:
+        yield Finding("credentials", Mark.WARN, f"{name} is open to other users", f"chmod 600 {name}")
+    else:
+        yield Finding("credentials", Mark.OK, name)
+
+
+def _rendering() -> Iterator[Finding]:
+    if _version("mujoco") is None:
+        yield Finding("rendering", Mark.NOTE, "needs the [sim] extra", install_line("sim"))
+        return
+    from strands_robots.simulation.gl import remedy  # noqa: PLC0415 - the simulation is not loaded for other commands
+
+    try:
+        tried = subprocess.run(
+            [sys.executable, "-c", _RENDER], capture_output=True, text=True, timeout=_RENDER_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        yield Finding("rendering", Mark.WARN, f"no picture within {_RENDER_S:g} s", remedy())
+        return
+    if tried.returncode == 0:
+        yield Finding("rendering", Mark.OK, tried.stdout.strip().splitlines()[-1])
+    else:
+        last = (tried.stderr.strip() or f"ended with {tried.returncode}").splitlines()[-1]
+        yield Finding("rendering", Mark.WARN, f"OpenGL does not work here: {last}", remedy())
+
+
+def _state() -> Iterator[Finding]:
+    folder = state_dir()
+    probe = folder
+    while not probe.exists():
+        probe = probe.parent
+    try:
+        with TemporaryFile(dir=probe):
+            yield Finding("state", Mark.OK, f"grants and lockouts are stored in {folder}")
+    except OSError as exc:
+        remedy = "set STRANDS_STATE_DIR to a directory that this user can write"
+        yield Finding("state", Mark.BROKEN, f"{probe} cannot be written: {exc.strerror}", remedy)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,26 +1,41 @@
-"""``keys resume|estop FILE``: make the key that frees robots, or the one that signs their stops."""
+"""``keys resume|estop``: keys that free robots or sign their stops. ``mesh keys``: certificates of a mesh."""
 
 from __future__ import annotations
 
+import getpass
+import shlex
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.output import Exit, Failure, Screen
-from strands_robots.cli.passphrase import PASSPHRASE_FILE, asked
-from strands_robots.safety.ed25519 import keygen
+from strands_robots.cli.output import CliError, Exit, Screen
+from strands_robots.safety.ed25519 import keygen, load_signing_key
 
+T = TypeVar("T")
+
+PASSPHRASE_FILE = typer.Option("--passphrase-file", help="Its passphrase, on the first line; else it is asked for.")
+DEFAULT_FOLDER = Path("mesh-keys")
 _FILE = typer.Argument(help="Where the key is written, encrypted; never over a file.")
+_FOLDER = typer.Option("--folder", help="Folder of the authority and the certificates.")
 
 
 def register(app: typer.Typer) -> None:
-    """Add ``keys`` to the application."""
+    """Add ``keys`` and ``mesh keys`` to the application."""
     keys = typer.Typer(no_args_is_help=True, help="Keys that free robots and sign their stops.")
     command(keys, "resume")(resume)
     command(keys, "estop")(estop)
     app.add_typer(keys, name="keys")
+    mesh = typer.Typer(no_args_is_help=True, help="The native mesh: certificates and access rules.")
+    mesh_keys = typer.Typer(no_args_is_help=True, help="Certificates for a mesh that leaves this machine.")
+    command(mesh_keys, "init")(init)
+    command(mesh_keys, "issue")(issue)
+    command(mesh_keys, "acl")(acl)
+    mesh.add_typer(mesh_keys, name="keys")
+    app.add_typer(mesh, name="mesh")
 
 
 def resume(
@@ -29,8 +44,8 @@ def resume(
     file: Annotated[Path, _FILE],
     passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
 ) -> None:
-    """Make an operator's resume key, and say what robots need to know of it."""
-    _make(screen, file, passphrase_file, "STRANDS_MESH_RESUME_PUBLIC_KEY")
+    """Make an operator's resume key, and print the setting that robots need for it."""
+    _make_key(screen, file, passphrase_file, "STRANDS_MESH_RESUME_PUBLIC_KEY")
 
 
 def estop(
@@ -39,18 +54,100 @@ def estop(
     file: Annotated[Path, _FILE],
     passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
 ) -> None:
-    """Make a safety controller's signing key, and say what robots need to know of it."""
-    _make(screen, file, passphrase_file, "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS")
+    """Make a safety controller's signing key, and print the setting that robots need for it."""
+    _make_key(screen, file, passphrase_file, "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS")
 
 
-def _make(screen: Screen, file: Path, passphrase_file: Path | None, setting: str) -> None:
-    passphrase = asked("Passphrase: ", passphrase_file)
-    if passphrase_file is None and asked("Again: ") != passphrase:
-        raise Failure("The two passphrases differ.", Exit.USAGE)
+def init(screen: Screen, folder: Annotated[Path, _FOLDER] = DEFAULT_FOLDER) -> None:
+    """Make the fleet's own certificate authority."""
+    from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used
+
+    path = _refusable(lambda: keys.init(folder))
+    screen.data({"status": "success", "ca": str(path)})
+    screen.say(f"The authority is {path}. Keep {folder / keys.CA_KEY} to yourself; it makes the certificates.", "green")
+
+
+def issue(
+    screen: Screen,
+    *,
+    peer_id: Annotated[str, typer.Argument(help="The peer that the certificate is for.")],
+    hosts: Annotated[list[str] | None, typer.Argument(help="Names or addresses by which others reach it.")] = None,
+    folder: Annotated[Path, _FOLDER] = DEFAULT_FOLDER,
+) -> None:
+    """Make the certificate of one peer, and print its settings."""
+    from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used
+
+    issued = _refusable(lambda: keys.issue(folder.resolve(), peer_id, hosts or [])).settings()
+    screen.data({"status": "success", **issued})
+    for name, value in issued.items():
+        screen.copyable(f"export {name}={shlex.quote(str(value))}")
+
+
+def acl(
+    screen: Screen,
+    *,
+    robots: Annotated[list[str] | None, typer.Option("--robot", help="A peer that sends as itself only.")] = None,
+    operators: Annotated[list[str] | None, typer.Option("--operator", help="A peer that also commands.")] = None,
+    relays: Annotated[
+        list[str] | None, typer.Option("--relay", help="A peer others are connected through; the operators.")
+    ] = None,
+    file: Annotated[Path, typer.Option("--file", help="Where the rules are written.")] = Path("mesh-acl.json5"),
+) -> None:
+    """Write access rules: deny by default, a robot sends as itself, an operator also commands."""
+    from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used
+
+    rules = _refusable(lambda: keys.acl(robots or [], operators or [], relays))
+    file.write_text(rules, encoding="utf-8")
+    screen.data({"status": "success", "STRANDS_MESH_ACL_FILE": str(file.resolve())})
+    screen.copyable(f"export STRANDS_MESH_ACL_FILE={shlex.quote(str(file.resolve()))}")
+
+
+def signing_key(path: Path, passphrase_file: Path | None = None) -> Any:
+    """Return the private key in ``path``.
+
+    Raises:
+        CliError: it cannot be read, or the passphrase does not open it.
+    """
+    if not path.is_file():
+        raise CliError(f"--key {path} is no file.", Exit.USAGE)
+    try:
+        return load_signing_key(path, _passphrase(f"Passphrase of {path}: ", passphrase_file))
+    except (ValueError, OSError) as exc:
+        raise CliError(str(exc)) from exc
+
+
+def _passphrase(prompt: str, file: Path | None = None) -> str:
+    """Read the passphrase from a file, or ask for it on the terminal without showing it.
+
+    Raises:
+        CliError: the file cannot be read, or there is neither a file nor a terminal.
+    """
+    if file is not None:
+        try:
+            lines = file.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as exc:
+            raise CliError(f"--passphrase-file cannot be read: {exc}", Exit.USAGE) from exc
+        return lines[0] if lines else ""
+    if not sys.stdin.isatty():
+        raise CliError("A passphrase is asked for on a terminal only; give --passphrase-file here.", Exit.USAGE)
+    return getpass.getpass(prompt)
+
+
+def _make_key(screen: Screen, file: Path, passphrase_file: Path | None, setting: str) -> None:
+    passphrase = _passphrase("Passphrase: ", passphrase_file)
+    if passphrase_file is None and _passphrase("Again: ") != passphrase:
+        raise CliError("The two passphrases differ.", Exit.USAGE)
     try:
         public = keygen(file, passphrase)
     except OSError as exc:
-        raise Failure(f"{file} was not written: {exc}") from exc
+        raise CliError(f"{file} was not written: {exc}") from exc
     screen.data({"status": "success", "file": str(file), setting: public})
     screen.say(f"The key is {file}. Keep it and its passphrase to yourself; on each robot's machine set:", "green")
     screen.copyable(f"export {setting}={public}")
+
+
+def _refusable(make: Callable[[], T]) -> T:
+    try:
+        return make()
+    except (ValueError, OSError) as exc:
+        raise CliError(str(exc)) from exc

@@ -1,7 +1,9 @@
-"""Which network a command uses: its flags, else the environment, else this machine alone."""
+"""Network of a command: its flags, else the environment, else this machine alone; and how to join it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from inspect import Parameter
@@ -11,11 +13,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
-from strands_robots.cli.output import Exit, Failure
+from strands_robots.cli.output import CliError, Exit, plain
+from strands_robots.envelope import Envelope
+from strands_robots.tools.networks import MeshUnavailableError, joined_mesh
 from strands_robots.utils import missing_extra, port
 
 if TYPE_CHECKING:
+    from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
+    from strands_robots.mesh import Mesh
+
+SOURCE = "strands-robots"
+"""Caller's name that goes with the calls of the command line."""
 
 _NEEDS = (
     "Leaving this machine needs proof of who is who: certificates (--tls-ca, --tls-cert, --tls-key), "
@@ -25,7 +34,7 @@ _NEEDS = (
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """The network flags as they were given."""
+    """Network flags as the user gave them."""
 
     nats: str | None = None
     connect: list[str] | None = None
@@ -45,28 +54,46 @@ class Network:
         return self.insecure or settings.boolean("DEVICE_CONNECT_ALLOW_INSECURE")
 
     def link(self) -> LinkConfig:
-        """The link that the flags describe.
+        """Return the link that the flags describe.
 
         Raises:
-            Failure: the flags contradict one another, or leave this machine without any proof of identity.
+            CliError: the flags contradict one another, or leave this machine without any proof of identity.
             MissingExtraError: Device Connect is not installed.
         """
         if self.nats and (self.connect or self.listen or self.multicast):
-            raise Failure("--nats names a broker; --connect, --listen and --multicast are for Zenoh.", Exit.USAGE)
+            raise CliError("--nats names a broker; --connect, --listen and --multicast are for Zenoh.", Exit.USAGE)
         link = self._secured(self._reached())
         if not link.authenticated and not link.loopback_only and not self.opted_in:
-            raise Failure(_NEEDS, Exit.USAGE)
+            raise CliError(_NEEDS, Exit.USAGE)
         return link
 
-    def on_mesh(self) -> None:
-        """Take the port, which is all that the native mesh has a use for.
+    @contextmanager
+    def fleet(self, source: str = SOURCE) -> Iterator[FleetClient]:
+        """Connect to the robots on this network for the length of the block.
 
         Raises:
-            Failure: another flag was given.
-            ValidationError: the port is none.
+            CliError: the network cannot be reached, or fails in use.
+        """
+        link = self.link()
+        from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
+
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
+
+        try:
+            with FleetClient(link, source) as fleet:
+                yield fleet
+        except MessagingError as exc:
+            raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
+
+    def use_mesh(self) -> None:
+        """Apply the flags to the native mesh, which takes ``--port`` alone.
+
+        Raises:
+            CliError: another flag was given.
+            ValidationError: the port is not one.
         """
         if any(getattr(self, each.name) for each in fields(self) if each.name != "port"):
-            raise Failure("--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE)
+            raise CliError("--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE)
         if self.port is not None:
             settings.put("STRANDS_MESH_PORT", str(port("--port", self.port)))
 
@@ -111,7 +138,7 @@ class Network:
 
 
 def describe(link: LinkConfig) -> str:
-    """One sentence: who can reach what is served over ``link``."""
+    """Describe in one sentence who can reach a robot over ``link``."""
     proof = "both sides prove who they are" if link.authenticated else "nobody proves who they are"
     if link.transport == "nats":
         return f"NATS at {', '.join(link.connect) or 'its default address'}; {proof}."
@@ -123,8 +150,52 @@ def describe(link: LinkConfig) -> str:
     return f"Zenoh: {'; '.join(ways)}; {proof}."
 
 
+def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[str, Any], seconds: float) -> Envelope:
+    """Call a function of a device and return its answer.
+
+    Raises:
+        CliError: no such device or no answer (exit code 3), or the call was refused as such (exit code 1).
+    """
+    from strands_robots.device_connect.client import (  # noqa: PLC0415 - loaded when a network is used
+        CallRefusedError,
+        DeviceTimeoutError,
+        NoSuchDeviceError,
+    )
+
+    try:
+        return fleet.call(device, function, params, seconds)
+    except (NoSuchDeviceError, DeviceTimeoutError) as exc:
+        raise CliError(plain(exc.args[0], 2000), Exit.SILENT) from exc
+    except CallRefusedError as exc:
+        raise CliError(plain(str(exc), 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+
+
+def temporary_mesh_id(name: str) -> str:
+    """Return a fresh mesh id for one command, covered by the certificate where there is one."""
+    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - loaded when a network is used
+    from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
+
+    try:
+        return visitor_id(name)
+    except (TransportError, IdentityError) as exc:
+        raise CliError(str(exc), Exit.USAGE) from exc
+
+
+@contextmanager
+def mesh_peer(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mesh]:
+    """Join the native mesh for the length of the block. Raises :class:`CliError` when that is impossible."""
+    with ExitStack() as stack:
+        try:
+            mesh = stack.enter_context(joined_mesh(robot, peer_id, peer_type))
+        except MeshUnavailableError as exc:
+            raise CliError(str(exc)) from exc
+        except ValueError as exc:
+            raise CliError(str(exc), Exit.USAGE) from exc
+        yield mesh
+
+
 def _backends() -> Any:
-    # Looked for and not imported: a command that refuses its flags need not load the framework for it.
+    # The framework is looked up and not imported: a command that refuses its flags need not load it.
     if find_spec("device_connect_edge") is None:
         raise missing_extra("Device Connect", "device-connect")
     from strands_robots.device_connect import backends  # noqa: PLC0415 - loaded when a network is used
@@ -134,7 +205,7 @@ def _backends() -> Any:
 
 def _pem(flag: str, path: Path | None, otherwise: str) -> str:
     if path is not None and not path.is_file():
-        raise Failure(f"{flag} {path} is no file.", Exit.USAGE)
+        raise CliError(f"{flag} {path} is no file.", Exit.USAGE)
     return str(path) if path is not None else otherwise
 
 
@@ -162,4 +233,4 @@ NETWORK_OPTIONS: tuple[Parameter, ...] = (
     _option("tls_key", Path | None, "--tls-key", "This side's private key (PEM)."),
     _option("credentials", Path | None, "--credentials", "Device Connect credentials file (JSON)."),
 )
-"""The flags that say which network, the same for every command that uses one."""
+"""Flags that choose the network, the same for every command that uses one."""

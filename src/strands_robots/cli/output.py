@@ -1,4 +1,4 @@
-"""What reaches the terminal: exit codes, failures, and a screen that speaks to people or to programs.
+"""Terminal output of the commands: exit codes, errors, and a screen for people or for programs.
 
 Text that came over a network is shown as it is, never as markup and never as a control sequence: it passes
 through :func:`plain` and goes to Rich as :class:`rich.text.Text`.
@@ -7,18 +7,27 @@ through :func:`plain` and goes to Rich as :class:`rich.text.Text`.
 from __future__ import annotations
 
 import json
+import logging
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-    from rich.table import Table
-    from rich.text import Text
+from rich import box
+from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
 
-LONGEST = 400
+from strands_robots.errors import StrandsRobotsError
+
+LENGTH_MAX = 400
 """Characters of one network text that are shown."""
+
+LOG_LINES = 5
+POLL_S = 0.05
 
 
 class Exit(IntEnum):
@@ -31,8 +40,8 @@ class Exit(IntEnum):
     INTERRUPTED = 130
 
 
-class Failure(Exception):  # noqa: N818 - an outcome of a command, told to its user
-    """A command that ends here: one sentence for the user, a code for scripts, fields for ``--json``."""
+class CliError(StrandsRobotsError):
+    """The failure of a command: one sentence for the user, an exit code for scripts, fields for ``--json``."""
 
     def __init__(self, reason: str, code: Exit = Exit.REFUSED, **fields: Any) -> None:
         super().__init__(reason)
@@ -41,22 +50,25 @@ class Failure(Exception):  # noqa: N818 - an outcome of a command, told to its u
         self.fields = fields
 
 
-def plain(value: object, longest: int = LONGEST) -> str:
-    """``value`` as one line of printable text: control, format and bidi characters become visible escapes."""
+def plain(value: object, longest: int = LENGTH_MAX) -> str:
+    """Return ``value`` as one printable line; control, format and bidi characters become visible escapes."""
     text = value if isinstance(value, str) else _compact(value)
-    shown = "".join(_visible(char) for char in text[:longest])
-    return shown if len(text) <= longest else f"{shown}... ({len(text)} characters)"
+    visible = "".join(_visible(char) for char in text[:longest])
+    return visible if len(text) <= longest else f"{visible}... ({len(text)} characters)"
 
 
 def label(value: object, style: str = "") -> Text:
-    """``value`` for Rich, without markup."""
-    from rich.text import Text  # noqa: PLC0415 - Rich is loaded when something is shown
-
+    """Return ``value`` for Rich, without markup."""
     return Text(plain(value), style=style)
 
 
+def first_line(description: object) -> str:
+    """Return the first line of a function's description."""
+    return str(description or "").strip().partition("\n")[0]
+
+
 class Screen:
-    """Where a command speaks: tables and sentences for people, or one JSON value a line for programs.
+    """Output of one command: tables and sentences for people, or one JSON value a line for programs.
 
     Args:
         machine: true with ``--json``; then stdout carries JSON alone.
@@ -64,35 +76,37 @@ class Screen:
     """
 
     def __init__(self, machine: bool = False, console: Console | None = None) -> None:
-        from rich.console import Console  # noqa: PLC0415 - Rich is loaded when something is shown
-
         self.machine = machine
         self.out = console or Console(file=sys.stdout, highlight=False)
         self.err = Console(file=sys.stderr, highlight=False)
 
+    @property
+    def live(self) -> bool:
+        """True when a person looks at a terminal that can be redrawn."""
+        return self.out.is_terminal and not self.machine
+
     def say(self, text: str, style: str = "") -> None:
-        """One sentence for people."""
-        if not self.machine:
-            self.out.print(label(text, style))
+        """Print one sentence for people."""
+        self.show(label(text, style))
 
     def copyable(self, text: str) -> None:
-        """One line for people to paste elsewhere: never broken at the width of the terminal."""
+        """Print one line for people to paste elsewhere: never broken at the width of the terminal."""
         if not self.machine:
             self.out.print(label(text), soft_wrap=True)
 
     def show(self, thing: RenderableType) -> None:
-        """A table or panel for people."""
+        """Print a table or panel for people."""
         if not self.machine:
             self.out.print(thing)
 
     def data(self, value: Any) -> None:
-        """One JSON value on its own line, for programs."""
+        """Print one JSON value on its own line, for programs."""
         if self.machine:
             sys.stdout.write(json.dumps(value, ensure_ascii=True, default=str) + "\n")
             sys.stdout.flush()
 
-    def fail(self, failure: Failure) -> None:
-        """Say why a command ends without success."""
+    def fail(self, failure: CliError) -> None:
+        """Report why a command ends without success."""
         if self.machine:
             self.data({"status": "error", "reason": failure.reason, "exit": int(failure.code), **failure.fields})
         else:
@@ -100,17 +114,70 @@ class Screen:
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:
-    """A table of network text; a cell that is already a Text keeps its style."""
-    from rich import box  # noqa: PLC0415 - Rich is loaded when something is shown
-    from rich.table import Table  # noqa: PLC0415
-    from rich.text import Text  # noqa: PLC0415
-
+    """Return a table of network text; a cell that is already a Text keeps its style."""
     result = Table(title=title or None, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         result.add_column(column, overflow="fold")
     for row in rows:
         result.add_row(*(cell if isinstance(cell, Text) else label(cell) for cell in row))
     return result
+
+
+@contextmanager
+def progress_bar(screen: Screen, seconds: float | None, title: str = "playing") -> Iterator[Callable[[float], None]]:
+    """Yield a function that moves a bar to the seconds that have passed; it does nothing without a terminal."""
+    if seconds is None or not screen.live:
+        yield lambda _: None
+        return
+    from rich.progress import Progress  # noqa: PLC0415 - loaded when a bar is drawn
+
+    with Progress(console=screen.out, transient=True) as progress:
+        task = progress.add_task(title, total=seconds)
+        yield lambda passed: progress.update(task, completed=passed)
+
+
+def wait_until(screen: Screen, over: Callable[[], str], duration: float = 0.0) -> str:
+    """Wait until ``over`` returns a reason, or for Ctrl-C; return the reason.
+
+    Args:
+        screen: where a bar is drawn when the duration is known.
+        over: empty until the wait ends, then why.
+        duration: expected seconds; 0 when unknown.
+    """
+    began = time.monotonic()
+    with progress_bar(screen, duration or None) as moved:
+        try:
+            while not (reason := over()):
+                moved(time.monotonic() - began)
+                time.sleep(POLL_S)
+        except KeyboardInterrupt:
+            return "Ctrl-C."
+    return reason
+
+
+class _LastLines(logging.Handler):
+    """Handler that keeps the last lines of the log."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.lines: deque[str] = deque(maxlen=LOG_LINES)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(f"{record.levelname} {record.getMessage()}")
+
+
+@contextmanager
+def captured_log() -> Iterator[deque[str]]:
+    """Send the log into the yielded deque, newest last, and nowhere else.
+
+    Log lines would tear a screen that is being redrawn, and writing them could block it.
+    """
+    root, handler = logging.getLogger(), _LastLines()
+    before, root.handlers = root.handlers, [handler]
+    try:
+        yield handler.lines
+    finally:
+        root.handlers = before
 
 
 def _visible(char: str) -> str:

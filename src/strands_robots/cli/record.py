@@ -1,10 +1,12 @@
-"""``record DEVICE...``: their events into a file. ``replay FILE --to FOLLOWER``: its actions once more."""
+"""``record DEVICE...``: write their events into a file; and ``--record`` of the commands that move a robot."""
 
 from __future__ import annotations
 
 import base64
 import contextlib
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,26 +14,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.fleet import reached
-from strands_robots.cli.mesh import joined, own_id
-from strands_robots.cli.network import Network
-from strands_robots.cli.output import Exit, Failure, Screen
-from strands_robots.cli.recorded import lossless, told
-from strands_robots.cli.teleop import arm_options, drive, following, recording
-from strands_robots.recording import STEP, Recorder
+from strands_robots.cli.network import Network, mesh_peer, temporary_mesh_id
+from strands_robots.cli.output import CliError, Exit, Screen, progress_bar, table
+from strands_robots.recording import STEP, Recorder, RobotRecording
+from strands_robots.recording.cameras import chosen_frames
 from strands_robots.utils import identifier, number
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
-ANYBODY = "*"
-_LOOK_S = 0.2
+EVERY_DEVICE = "*"
+NO_CAMERAS = "none"
+_POLL_S = 0.2
 
 
 def register(app: typer.Typer) -> None:
-    """Add ``record`` and ``replay`` to the application."""
+    """Add ``record`` to the application."""
     command(app, "record", network=True)(record)
-    command(app, "replay")(replay)
 
 
 def record(
@@ -48,80 +47,112 @@ def record(
     """Write every event of some devices into an MCAP file until Ctrl-C: joints, actions, tasks, stops."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=24 * 3600)
     recorder = Recorder(out)
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         if on_mesh:
-            mesh = stack.enter_context(joined(None, own_id("record"), "tool"))
+            mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id("record"), "tool"))
         else:
-            fleet = stack.enter_context(reached(network))
+            fleet = stack.enter_context(network.fleet())
         stack.enter_context(recorder)
         for device in devices:
             if on_mesh:
-                _hear_peer(mesh, device, recorder)
-                continue
-            heard = fleet.subscription(device, lambda event: recorder.take(event.device, event.name, event.payload))
-            stack.enter_context(heard)
+                _record_peer(mesh, device, recorder)
+            else:
+                stack.enter_context(
+                    fleet.subscription(device, lambda event: recorder.take(event.device, event.name, event.payload))
+                )
         screen.say(f"Recording {', '.join(devices)} into {out}. Ctrl-C ends it.")
         with contextlib.suppress(KeyboardInterrupt):
             _wait(screen, recorder, longest)
     if not recorder.counts:
         out.unlink()
-        who = "anybody" if ANYBODY in devices else ", ".join(devices)
-        raise Failure(f"Nothing was heard of {who}; nothing was recorded.", Exit.SILENT)
-    told(screen, recorder)
-    lossless(recorder)
+        who = "any device" if EVERY_DEVICE in devices else ", ".join(devices)
+        raise CliError(f"No message of {who} arrived; nothing was recorded.", Exit.SILENT)
+    _summarize(screen, recorder)
+    _check_lossless(recorder)
 
 
-def replay(
-    screen: Screen,
-    *,
-    file: Annotated[Path, typer.Argument(help="A recording: .mcap, .csv or .parquet.")],
-    to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, a model, or mesh:PEER.")],
-    device: Annotated[str | None, typer.Option("--device", help="Whose actions, where several are recorded.")] = None,
-    follower_id: Annotated[str | None, typer.Option("--id", help="Whose calibration the follower has.")] = None,
-    calibration: Annotated[Path | None, typer.Option("--calibration", help="A calibration file.")] = None,
-    speed: Annotated[float, typer.Option("--speed", help="Times as fast, at most 10.")] = 1.0,
-) -> None:
-    """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""
-    leader = recording(file, device, speed)
+@contextmanager
+def record_robot(
+    screen: Screen, robot: Any, device: str, file: Path | None, cameras: str | None = None
+) -> Iterator[None]:
+    """Record ``robot`` while the block runs, halts and lockouts included; do nothing without a ``file``.
 
-    def led(robot: Any) -> contextlib.AbstractContextManager[Any]:
-        return contextlib.nullcontext(leader)
+    Args:
+        screen: where the summary is printed.
+        robot: the robot that moves in this process.
+        device: its name in the recording.
+        file: a new ``.mcap`` file.
+        cameras: names with commas between them, ``none``, or None for those of the robot itself.
 
-    drive(screen, file.name, to, led, options=arm_options("", follower_id, calibration))
+    Raises:
+        CliError: messages were lost.
+        ValidationError: the file, or a camera, is refused.
+    """
+    if file is None:
+        yield
+        return
+    names = None if cameras is None else [name for name in cameras.split(",") if name]
+    frames = None if names == [NO_CAMERAS] else chosen_frames(robot, names)
+    recorder = Recorder(file, joints_of_events=False)
+    sampling = RobotRecording(robot, recorder, device, frames=frames)
+    with ExitStack() as stack:
+        # The summary comes after both have ended, also when Ctrl-C leaves the block.
+        stack.callback(lambda: _summarize(screen, recorder))
+        stack.enter_context(recorder)
+        stack.enter_context(sampling)
+        screen.say(f"Recording {device} into {file}.")
+        yield
+    _check_lossless(recorder)
 
 
-def _hear_peer(mesh: Mesh, peer: str, recorder: Recorder) -> None:
-    """Record what a peer of the mesh publishes; ``*`` is everybody."""
-    who = peer if peer == ANYBODY else identifier("DEVICE", peer)
+def _record_peer(mesh: Mesh, peer: str, recorder: Recorder) -> None:
+    """Record what a peer of the mesh publishes; ``*`` is every peer."""
+    who = peer if peer == EVERY_DEVICE else identifier("DEVICE", peer)
 
-    def heard(key: str, body: dict[str, Any]) -> None:
+    def take(key: str, body: dict[str, Any]) -> None:
         _, name, topic, *rest = key.split("/")
         if topic == "camera":
-            # What is no picture is kept as it is.
+            # A message that is no picture is recorded like any other.
             with contextlib.suppress(TypeError, ValueError):
                 recorder.take_picture(name, rest[0], base64.b64decode(body.get("data", ""), validate=True))
                 return
         recorder.take(name, STEP if topic == "stream" else "_".join([topic, *rest]), body)
 
     for part in ("state", "stream", "camera/*", "safety/event"):
-        mesh.subscribe(f"strands/{who}/{part}", heard, name=f"record {who} {part}")
+        mesh.subscribe(f"strands/{who}/{part}", take, name=f"record {who} {part}")
     for part in ("estop", "resume"):
-        mesh.subscribe(f"strands/safety/{part}", partial(_fleet, recorder, part), name=f"record {part}")
+        mesh.subscribe(f"strands/safety/{part}", partial(_take_fleet_message, recorder, part), name=f"record {part}")
 
 
-def _fleet(recorder: Recorder, part: str, key: str, body: dict[str, Any]) -> None:
-    """What concerns every peer, under the name of who said it."""
+def _take_fleet_message(recorder: Recorder, part: str, key: str, body: dict[str, Any]) -> None:
+    """Record a message to every peer under the name of its sender."""
     recorder.take(str(body.get("peer_id") or "mesh"), "emergencyStop" if part == "estop" else part, body)
 
 
 def _wait(screen: Screen, recorder: Recorder, seconds: float | None) -> None:
-    """Until Ctrl-C or the end, with a bar where it is known when that is."""
+    """Wait for the end or for Ctrl-C, with a bar where the end is known and a count where it is not."""
     began = time.monotonic()
-    live = not screen.machine and screen.out.is_terminal
-    status = screen.out.status("Waiting for messages...") if live and seconds is None else contextlib.nullcontext()
-    with following(screen, seconds, "recording") as moved, status as shown:
+    counting = screen.live and seconds is None
+    with (
+        progress_bar(screen, seconds, "recording") as moved,
+        screen.out.status("Waiting for messages...") if counting else contextlib.nullcontext() as status,
+    ):
         while seconds is None or time.monotonic() - began < seconds:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
             moved(time.monotonic() - began)
-            if shown is not None:
-                shown.update(f"{sum(recorder.counts.values())} messages in {time.monotonic() - began:.0f} s")
+            if status is not None:
+                status.update(f"{sum(recorder.counts.values())} messages in {time.monotonic() - began:.0f} s")
+
+
+def _summarize(screen: Screen, recorder: Recorder) -> None:
+    if not recorder.path.exists():
+        return
+    counts, size = dict(recorder.counts), recorder.path.stat().st_size
+    screen.data({"event": "recorded", "file": str(recorder.path), "messages": counts, "lost": recorder.lost})
+    shown_size = f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
+    screen.show(table(f"{recorder.path}, {shown_size}", ("channel", "messages"), sorted(counts.items())))
+
+
+def _check_lossless(recorder: Recorder) -> None:
+    if recorder.lost:
+        raise CliError(f"{recorder.lost} messages were lost: the disk was too slow.")

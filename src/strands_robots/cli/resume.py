@@ -1,37 +1,41 @@
-"""``resume`` and ``lockout``: free robots after an emergency stop, and see who is held, since when and by whom."""
+"""Operator's permissions: ``resume`` and ``lockout`` after an emergency stop, ``grant`` for one motion of hardware."""
 
 from __future__ import annotations
 
 import getpass
 import os
+import time
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli import holds
-from strands_robots.cli.command import command
-from strands_robots.cli.fleet import asked, reached
-from strands_robots.cli.network import Network, describe
-from strands_robots.cli.output import Exit, Failure, Screen, label, plain, table
-from strands_robots.cli.passphrase import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.command import WAIT_OPTION, command
+from strands_robots.cli.keys import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.network import Network, call_device, describe
+from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.envelope import text_of
+from strands_robots.safety.approval import GRANT_S, Grants, state_dir
 from strands_robots.safety.clearance import clear_here
+from strands_robots.safety.lockout import OVERFLOW, Hold, utc
+from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
 from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
-    from strands_robots.cli.holds import Standing
     from strands_robots.device_connect import FleetClient
 
-_WAIT = typer.Option("--timeout", help="Seconds to wait for an answer.")
+PARALLEL_CALLS = 8
 
 
 def register(app: typer.Typer) -> None:
-    """Add both commands to the application."""
+    """Add the three commands to the application."""
     command(app, "resume", network=True)(resume)
     command(app, "lockout", network=True)(lockout)
+    command(app, "grant")(grant)
 
 
 def resume(
@@ -39,67 +43,67 @@ def resume(
     network: Network,
     *,
     devices: Annotated[list[str] | None, typer.Argument(metavar="DEVICE...", help="With --local: which.")] = None,
-    key: Annotated[Path | None, typer.Option("--key", help="The operator's key; signs for all that is held.")] = None,
+    key: Annotated[Path | None, typer.Option("--key", help="The operator's key; signs for every lockout.")] = None,
     targets: Annotated[
         list[str] | None, typer.Option("--targets", help="With --key: which (repeat, or commas).")
     ] = None,
     passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
     local: Annotated[bool, typer.Option("--local", help="Robots of this machine, without a key; audited.")] = False,
-    timeout: Annotated[float, _WAIT] = 5.0,
+    timeout: Annotated[float, WAIT_OPTION] = 5.0,
 ) -> None:
-    """Free locked robots: by the operator's key over the network, or here by --local. Nothing moves by it."""
-    usage = Failure("resume takes --key FILE, or --local at the robot's own machine.", Exit.USAGE)
-    if local and key is not None:
-        raise usage
-    named = [part for each in (*(devices or []), *(targets or [])) for part in each.split(",") if part]
-    wanted = [device_id("DEVICE", each) for each in named]
-    if local:
-        _locally(screen, wanted)
-        return
+    """Free locked robots: by the operator's key over the network, or here by --local. It starts no motion."""
+    if local == (key is not None):
+        raise CliError("resume takes --key FILE, or --local at the robot's own machine.", Exit.USAGE)
+    names = [part for each in (*(devices or []), *(targets or [])) for part in each.split(",") if part]
+    wanted = [device_id("DEVICE", each) for each in names]
     if key is None:
-        raise usage
+        _clear_locally(screen, wanted)
+        return
     seconds = number("--timeout", timeout, above=0, high=60)
     signer = signing_key(key, passphrase_file)
-    with reached(network) as fleet:
-        found = holds.standing(fleet, wanted or holds.robots(fleet), seconds)
+    with network.fleet() as fleet:
+        found = ask_robots(fleet, wanted or lockable_robots(fleet), seconds)
         if not found:
-            raise Failure(f"Nobody answered. {describe(fleet.link)}", Exit.SILENT, devices={})
-        outcome = _resumed(fleet, found, signer, seconds)
-    _report(screen, outcome, "They move again when they are told to, and not before.")
+            raise CliError(f"No robot answered. {describe(fleet.link)}", Exit.SILENT, devices={})
+        outcome = _resume_all(fleet, found, signer, seconds)
+    _report(screen, outcome, "They move again when they get a new command.")
 
 
 def lockout(
     screen: Screen,
     network: Network,
     *,
-    local: Annotated[bool, typer.Option("--local", help="This machine's lockout file alone.")] = False,
-    timeout: Annotated[float, _WAIT] = 2.0,
+    local: Annotated[bool, typer.Option("--local", help="Only this machine's lockout file.")] = False,
+    timeout: Annotated[float, WAIT_OPTION] = 2.0,
 ) -> None:
-    """Who is locked, since when and by whom: live robots, and what this machine keeps for those that are off."""
+    """List locked robots, since when and by whom: live ones, and those in this machine's lockout file."""
     seconds = number("--timeout", timeout, above=0, high=60)
-    kept, live, note = holds.on_disk(), [], ""
+    stored, live, note = _stored_lockouts(), list[LockoutReport](), ""
     if not local:
         try:
-            with reached(network) as fleet:
-                live = holds.standing(fleet, holds.robots(fleet, seconds), seconds)
-            note = "" if live else "Nobody answered on the network. "
-        except Failure as failure:
+            with network.fleet() as fleet:
+                live = ask_robots(fleet, lockable_robots(fleet, seconds), seconds)
+            note = "" if live else "No robot answered on the network. "
+        except CliError as failure:
             if failure.code is Exit.USAGE:
                 raise
             note = f"{failure.reason} "
-    seen = {each.name: each for each in live}
-    cells: list[tuple[Any, ...]] = [row for each in live for row in holds.rows(each.name, each.holds)]
-    # A robot that is on the network answers for itself.
-    away = {name: held for name, held in kept.items() if name not in seen or seen[name].problem}
-    cells += [row for name, held in away.items() for row in holds.rows(f"{name} (kept here)", held)]
+    answered = {each.name for each in live if not each.problem}
+    cells = [row for each in live for row in _lockout_rows(each.name, each.lockouts)]
+    # The answer of a live robot outranks the file.
+    for name, lockouts in stored.items():
+        cells += [] if name in answered else _lockout_rows(f"{name} (in this machine's file)", lockouts)
     screen.data(
         {
             "status": "success",
             "live": {
-                each.name: {"locked": _locked(each), "holds": [holds.fields(hold) for hold in each.holds]}
+                each.name: {
+                    "locked": None if each.problem else bool(each.lockouts),
+                    "holds": [_fields(lockout) for lockout in each.lockouts],
+                }
                 for each in live
             },
-            "kept": {name: [holds.fields(hold) for hold in held] for name, held in kept.items()},
+            "kept": {name: [_fields(lockout) for lockout in lockouts] for name, lockouts in stored.items()},
         }
     )
     if cells:
@@ -107,58 +111,146 @@ def lockout(
     for each in live:
         if each.problem:
             screen.say(f"{each.name}: {each.problem}", "yellow")
-    free = [each.name for each in live if not each.holds and not each.problem]
-    told = f"Free: {', '.join(free)}." if free else "" if cells else "No lockout is known."
-    if note or told:
-        screen.say(f"{note}{told}".strip())
+    free = [each.name for each in live if not each.lockouts and not each.problem]
+    result = f"Free: {', '.join(free)}." if free else "" if cells else "No lockout is known."
+    if note or result:
+        screen.say(f"{note}{result}".strip())
+
+
+def grant(
+    screen: Screen,
+    what: Annotated[str, typer.Argument(metavar="VERB@PEER", help="Such as execute@arm-1.")],
+    seconds: Annotated[float, typer.Option("--for", help="Seconds for which the grant is valid.")] = GRANT_S,
+) -> None:
+    """Approve one motion of real hardware, once; run it on the robot's own machine."""
+    verb, at, peer = what.partition("@")
+    if not (verb and at and peer):
+        raise CliError(f"grant takes VERB@PEER, such as execute@arm-1, not {what!r}.", Exit.USAGE)
+    Grants(state_dir() / "grants").grant(verb, peer, seconds)
+    screen.data({"status": "success", "verb": verb, "peer": peer, "seconds": seconds})
+    screen.say(f"Granted: {verb} on {peer}, once, within {seconds:g} s.", "green")
+
+
+@dataclass(frozen=True, slots=True)
+class LockoutReport:
+    """Lockouts and status of one robot as it reports them; ``problem`` says why it does not, empty otherwise."""
+
+    name: str
+    lockouts: tuple[Hold, ...] = ()
+    problem: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    round_trip_ms: float = 0.0
+
+
+def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
+    """Return the devices on the network that can be locked and resumed."""
+    return [peer.id for peer in fleet.peers(seconds) if any(each.get("name") == "resume" for each in peer.functions)]
+
+
+def ask_robots(fleet: FleetClient, names: Iterable[str], seconds: float) -> list[LockoutReport]:
+    """Ask each robot for its status, in parallel."""
+    wanted = list(dict.fromkeys(names))
+    with ThreadPoolExecutor(PARALLEL_CALLS) as pool:
+        return list(pool.map(lambda name: _ask(fleet, name, seconds), wanted))
 
 
 def operator() -> str:
-    """Who sits at this machine, by its login name."""
+    """Return the login name of the operator at this machine."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):
         return f"uid {os.getuid()}"
 
 
-def _locally(screen: Screen, wanted: list[str]) -> None:
-    names = wanted or sorted(holds.on_disk())
+def _stored_lockouts() -> dict[str, tuple[Hold, ...]]:
+    """Return the lockouts in this machine's file, by robot; by key where a robot has no name.
+
+    Raises:
+        CliError: the file cannot be read.
+    """
+    try:
+        stored = LockoutStore().load_all()
+    except (OSError, ValueError) as exc:
+        raise CliError(f"The lockout file of this machine cannot be read, so its robots come up locked: {exc}") from exc
+    return {each.name or key: each.state.all for key, each in stored.items() if each.state.locked}
+
+
+def _ask(fleet: FleetClient, name: str, seconds: float) -> LockoutReport:
+    began = time.monotonic()
+    try:
+        answer = call_device(fleet, name, "getStatus", {}, seconds)
+    except CliError as failure:
+        return LockoutReport(name, problem=failure.reason)
+    took_ms = (time.monotonic() - began) * 1000
+    if "locked" not in answer:
+        return LockoutReport(name, problem="it does not report lockouts", facts=answer, round_trip_ms=took_ms)
+    rows = answer.get("lockout")
+    lockouts = tuple(_lockout(each) for each in rows if isinstance(each, Mapping)) if isinstance(rows, list) else ()
+    return LockoutReport(name, lockouts, facts=answer, round_trip_ms=took_ms)
+
+
+def _lockout(row: Mapping[str, Any]) -> Hold:
+    since = row.get("since")
+    at = float(since) if isinstance(since, int | float) else 0.0
+    return Hold(str(row.get("epoch", "")), str(row.get("source", "")), str(row.get("reason", "")), at)
+
+
+def _lockout_rows(name: str, lockouts: Iterable[Hold]) -> list[tuple[str, str]]:
+    """Return two cells for each lockout: since when, by whom and why; and its epoch, which other commands take."""
+    cells: list[tuple[str, str]] = []
+    for each in lockouts:
+        why = f": {each.reason}" if each.reason else ""
+        cells += [("" if cells else name, f"since {utc(each.at)} by {each.source}{why}"), ("", f"epoch {each.epoch}")]
+    return cells
+
+
+def _fields(lockout: Hold) -> dict[str, Any]:
+    return {"epoch": lockout.epoch, "source": lockout.source, "reason": lockout.reason, "since": lockout.at}
+
+
+def _clear_locally(screen: Screen, wanted: list[str]) -> None:
+    names = wanted or sorted(_stored_lockouts())
     if not names:
-        raise Failure("This machine keeps no lockout; name the robots whose process runs here.", devices={})
+        raise CliError("This machine's file has no lockout; name the robots whose process runs here.", devices={})
     try:
         cleared = clear_here(operator(), names)
     except (OSError, ValueError) as exc:
-        raise Failure(f"Nothing was cleared: {exc}") from exc
+        raise CliError(f"Nothing was cleared: {exc}") from exc
     outcome = {name: (said.startswith("cleared"), said) for name, said in cleared.items()}
     _report(screen, outcome, f"Recorded in the audit as cleared by {operator()}.")
 
 
-def _resumed(fleet: FleetClient, found: list[Standing], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
-    """Whether each robot is free now, and what there is to say of it."""
-    for_epoch: dict[str, list[str]] = {}
-    for each in found:
-        for epoch in each.resumable:
-            for_epoch.setdefault(epoch, []).append(each.name)
-    slips: dict[str, list[dict[str, Any]]] = {}
-    for epoch, names in for_epoch.items():
+def _resume_all(
+    fleet: FleetClient, found: list[LockoutReport], signer: Any, seconds: float
+) -> dict[str, tuple[bool, str]]:
+    """Sign for every lockout and present the assertions; return whether each robot is free, and its answer."""
+    by_epoch: dict[str, list[str]] = {}
+    for robot in found:
+        for lockout in robot.lockouts:
+            if lockout.epoch != OVERFLOW:
+                by_epoch.setdefault(lockout.epoch, []).append(robot.name)
+    assertions: dict[str, list[dict[str, Any]]] = {}
+    for epoch, names in by_epoch.items():
         for assertion in sign(signer, epoch, names):
             for name in assertion["targets"]:
-                slips.setdefault(name, []).append(assertion)
-    with ThreadPoolExecutor(holds.AT_ONCE) as pool:
-        each_one = pool.map(lambda each: _present(fleet, each, slips.get(each.name, []), seconds), found)
-        return {each.name: told for each, told in zip(found, each_one, strict=True)}
+                assertions.setdefault(name, []).append(assertion)
+    with ThreadPoolExecutor(PARALLEL_CALLS) as pool:
+        outcomes = pool.map(lambda robot: _resume(fleet, robot, assertions.get(robot.name, []), seconds), found)
+        return {robot.name: outcome for robot, outcome in zip(found, outcomes, strict=True)}
 
 
-def _present(fleet: FleetClient, robot: Standing, slips: list[dict[str, Any]], seconds: float) -> tuple[bool, str]:
+def _resume(
+    fleet: FleetClient, robot: LockoutReport, assertions: list[dict[str, Any]], seconds: float
+) -> tuple[bool, str]:
     if robot.problem:
         return False, robot.problem
-    if not robot.holds:
+    if not robot.lockouts:
         return True, "was not locked"
-    locked, said = True, "more stops than can be told apart; resume --local at its own machine"
-    for slip in slips:
+    locked, said = True, "more stops than it can keep apart; resume --local at its own machine"
+    for assertion in assertions:
         try:
-            answer = asked(fleet, robot.name, "resume", {"assertion": slip}, seconds)
-        except Failure as failure:
+            answer = call_device(fleet, robot.name, "resume", {"assertion": assertion}, seconds)
+        except CliError as failure:
             return False, failure.reason
         if answer.get("status") != "success":
             return False, f"{text_of(answer)}: its own audit says why"
@@ -166,16 +258,12 @@ def _present(fleet: FleetClient, robot: Standing, slips: list[dict[str, Any]], s
     return not locked, said
 
 
-def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], end: str) -> None:
+def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], then: str) -> None:
     marks = {True: label("free", "green"), False: label("LOCKED", "bold red")}
     screen.show(table("", ("robot", "", "what it said"), ((n, marks[ok], said) for n, (ok, said) in outcome.items())))
     devices = {name: {"free": ok, "said": said} for name, (ok, said) in outcome.items()}
-    held = [name for name, (ok, _) in outcome.items() if not ok]
-    if held:
-        raise Failure(plain(f"Not resumed: {', '.join(held)}.", 2000), Exit.REFUSED, devices=devices)
+    locked = [name for name, (ok, _) in outcome.items() if not ok]
+    if locked:
+        raise CliError(plain(f"Not resumed: {', '.join(locked)}.", 2000), Exit.REFUSED, devices=devices)
     screen.data({"status": "success", "devices": devices})
-    screen.say(end)
-
-
-def _locked(each: Standing) -> bool | None:
-    return None if each.problem else bool(each.holds)
+    screen.say(then)

@@ -1,29 +1,46 @@
-"""``safety-controller``: a full-screen terminal whose space bar stops everything."""
+"""``safety-controller``: a full-screen terminal whose space bar stops every robot."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
+import termios
 import threading
+import time
+import tty
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Group, RenderableType
+from rich.text import Text
 
-from strands_robots.cli.button import Button
 from strands_robots.cli.command import command
-from strands_robots.cli.console import Board
-from strands_robots.cli.keyboard import keys
+from strands_robots.cli.keys import PASSPHRASE_FILE, signing_key
 from strands_robots.cli.network import Network
-from strands_robots.cli.output import Exit, Failure, Screen
-from strands_robots.cli.passphrase import PASSPHRASE_FILE, signing_key
-from strands_robots.cli.quiet import kept_log
+from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
+from strands_robots.cli.resume import LockoutReport, ask_robots, lockable_robots
+from strands_robots.cli.stop import SLOW_MS, exit_code, summary
+from strands_robots.safety.controller import Answer, Progress, SafetyController, StopReport
+from strands_robots.safety.lockout import utc
+from strands_robots.safety.orders import new_epoch
 from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
-    from strands_robots.safety.controller import SafetyController
+    from strands_robots.device_connect.backends import LinkConfig
 
 DRAW_S = 0.1
+LOOK_S = 1.0
+ASK_S = 1.0
+GONE_S = 5.0
+"""A robot that was silent for this long is shown as gone; it must still answer a stop."""
+
+KEY_REPEAT_S = 1.0
+"""Presses closer than this are one stop: a key held down repeats, and a robot distinguishes at most 64 stops."""
 
 
 def register(app: typer.Typer) -> None:
@@ -39,13 +56,15 @@ def safety_controller(
     check_in: Annotated[
         float | None, typer.Option("--check-in", help="Seconds between check-ins; robots may need them to move.")
     ] = None,
-    reason: Annotated[str, typer.Option("--reason", help="Told to the robots and their audit.")] = "space bar",
+    reason: Annotated[
+        str, typer.Option("--reason", help="Sent to the robots and written to their audit.")
+    ] = "space bar",
     key: Annotated[Path | None, typer.Option("--key", help="Sign stops and check-ins with it.")] = None,
     passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
 ) -> None:
-    """The SPACE bar stops every robot at once; shows each one, its lockout, its answers and its check-in."""
-    if screen.machine or not (sys.stdin.isatty() and screen.out.is_terminal):
-        raise Failure(
+    """Stop every robot at once with the SPACE bar; show each robot, its lockout, answers and check-in."""
+    if not (screen.live and sys.stdin.isatty()):
+        raise CliError(
             "safety-controller needs a terminal, for its keys and its screen; in a script use strands-robots estop.",
             Exit.USAGE,
         )
@@ -59,16 +78,15 @@ def safety_controller(
     with contextlib.closing(controller):
         if every is not None:
             controller.check_in_every(every)
-        board = Board(controller, link, every)
-        _run(screen, controller, board, reason)
-    screen.say(f"{source} is off. What it stopped stays locked.")
+        _run(screen, controller, FleetScreen(controller, link, every), reason)
+    screen.say(f"{source} is off. The robots it stopped stay locked.")
 
 
-def _run(screen: Screen, controller: SafetyController, board: Board, reason: str) -> None:
-    from rich.live import Live  # noqa: PLC0415 - Rich is loaded when something is shown
+def _run(screen: Screen, controller: SafetyController, fleet: FleetScreen, reason: str) -> None:
+    from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     done = threading.Event()
-    button = Button(controller, board.expected, reason)
+    button = StopButton(controller, fleet.expected, reason)
 
     def pressed(key: str) -> None:
         if key == " ":
@@ -76,12 +94,234 @@ def _run(screen: Screen, controller: SafetyController, board: Board, reason: str
         elif key in "qQ":
             done.set()
         elif key in "fF":
-            board.forget()
+            fleet.forget()
 
-    with kept_log() as lines, board.looking(), keys(pressed, done.set):
+    with captured_log() as lines, fleet.polling(), _keys(pressed, done.set):
         try:
-            with Live(board.draw(button, lines), console=screen.out, screen=True, auto_refresh=False) as live:
+            with Live(fleet.draw(button, lines), console=screen.out, screen=True, auto_refresh=False) as live:
                 while not done.wait(DRAW_S):
-                    live.update(board.draw(button, lines), refresh=True)
+                    live.update(fleet.draw(button, lines), refresh=True)
         finally:
             button.close()
+
+
+@contextmanager
+def _keys(pressed: Callable[[str], None], closed: Callable[[], None]) -> Iterator[None]:
+    """Call ``pressed`` with each key from standard input, a terminal, on a thread of its own; ``closed`` at its end.
+
+    Ctrl-C stays a signal. The terminal's modes are restored when the block is left.
+    """
+    terminal = sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+
+    def read() -> None:
+        # A terminal that hangs up answers with an error, or with nothing.
+        with contextlib.suppress(OSError):
+            while data := os.read(terminal, 64):
+                for key in data.decode("utf-8", "replace"):
+                    pressed(key)
+        closed()
+
+    tty.setcbreak(terminal, termios.TCSANOW)
+    threading.Thread(target=read, name="keys", daemon=True).start()
+    try:
+        yield
+    finally:
+        # A terminal that is gone has no modes to restore.
+        with contextlib.suppress(termios.error):
+            termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+class StopButton:
+    """Emergency stop at each press, sent before anything else is done, with the latest progress and report.
+
+    A press during a running stop is part of it. A stop runs until it has left and every expected robot has answered:
+    a link that swallows everything looks as if it were up for seconds.
+
+    Args:
+        controller: sends.
+        expected: returns the robots that must answer; called at each press.
+        reason: sent to the robots.
+    """
+
+    def __init__(self, controller: SafetyController, expected: Callable[[], Collection[str]], reason: str) -> None:
+        self.progress: Progress | None = None
+        self.report: StopReport | None = None
+        self.presses = 0
+        self._controller, self._expected, self._reason = controller, expected, reason
+        self._guard = threading.Lock()
+        self._id, self._running, self._last = "", False, float("-inf")
+        self._closing = threading.Event()
+
+    @property
+    def running(self) -> bool:
+        """True while a stop waits for answers."""
+        return self._running
+
+    def press(self) -> None:
+        """Stop everything; returns at once."""
+        now = time.monotonic()
+        with self._guard:
+            self.presses += 1
+            repeated, self._last = now - self._last < KEY_REPEAT_S, now
+            if repeated and self._running:
+                return
+            if not (repeated and self._id):
+                self._id = new_epoch()
+            self._running = True
+            threading.Thread(target=self._stop, args=(self._id,), name="space bar", daemon=True).start()
+
+    def close(self) -> None:
+        """Give up a stop that waits for the link."""
+        self._closing.set()
+
+    def _stop(self, estop_id: str) -> None:
+        def note(progress: Progress) -> None:
+            if estop_id == self._id:
+                self.progress = progress
+
+        while True:
+            report = self._controller.stop(self._expected(), self._reason, estop_id=estop_id, on_progress=note)
+            unfinished = not report.link or bool(report.silent)
+            with self._guard:
+                if estop_id != self._id:
+                    return
+                self.report, self._running = report, unfinished and not self._closing.is_set()
+                if not self._running:
+                    # A robot that was resumed meanwhile acts only on a stop with a new id.
+                    self._id = "" if report.refused else self._id
+                    return
+
+
+@dataclass(frozen=True, slots=True)
+class LastReport:
+    """Last report of a robot, and when it came (monotonic seconds)."""
+
+    report: LockoutReport
+    at: float
+
+
+class FleetScreen:
+    """Table of every robot with its lockout, last answer and check-in, polled on a thread and connection of its own.
+
+    Args:
+        controller: whose link and id are shown.
+        link: the network that is polled.
+        check_in_s: seconds between the controller's check-ins, or None.
+    """
+
+    def __init__(self, controller: SafetyController, link: LinkConfig, check_in_s: float | None) -> None:
+        self._controller, self._link, self._check_in_s = controller, link, check_in_s
+        self._robots: dict[str, LastReport] = {}
+        self._problem = "Looking for robots..."
+        self._closed = threading.Event()
+
+    def expected(self) -> Collection[str]:
+        """Return the robots that must answer a stop: every one that was seen and not forgotten."""
+        return tuple(self._robots)
+
+    def forget(self) -> None:
+        """Expect no answer any more from robots that are gone."""
+        now = time.monotonic()
+        self._robots = {name: last for name, last in self._robots.items() if now - last.at < GONE_S}
+
+    @contextmanager
+    def polling(self) -> Iterator[None]:
+        """Poll the robots for the length of the block."""
+        thread = threading.Thread(target=self._poll, name="fleet screen", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self._closed.set()
+            thread.join(2 * ASK_S + 1.0)
+
+    def _poll(self) -> None:
+        from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - the network is loaded when it is used
+
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415
+
+        while not self._closed.is_set():
+            try:
+                with FleetClient(self._link, self._controller.controller_id) as fleet:
+                    while not self._closed.wait(LOOK_S):
+                        names = {*lockable_robots(fleet, ASK_S), *self._robots}
+                        self.update(ask_robots(fleet, sorted(names), ASK_S))
+            except (MessagingError, TimeoutError) as exc:
+                self._problem = f"The robots cannot be polled: {exc}. The space bar has a connection of its own."
+                self._closed.wait(LOOK_S)
+
+    def update(self, reports: Sequence[LockoutReport]) -> None:
+        """Take the robots' reports; a robot that did not answer keeps its last one."""
+        now, robots = time.monotonic(), dict(self._robots)
+        for each in reports:
+            known = robots.get(each.name)
+            if not each.problem:
+                robots[each.name] = LastReport(each, now)
+            elif known is not None:
+                robots[each.name] = replace(known, report=replace(known.report, problem=each.problem))
+        # The screen and the space bar may be reading the old dictionary, so it is replaced and not changed.
+        self._robots = robots
+        self._problem = "" if robots else "No robot is on this network yet."
+
+    def draw(self, button: StopButton, log: Collection[str]) -> RenderableType:
+        """Return the whole screen."""
+        up = self._controller.link_up
+        head = f"{self._controller.controller_id}: the stop link is {'up' if up else 'DOWN'}"
+        if self._check_in_s is not None:
+            head += f"; checks in every {self._check_in_s:g} s"
+        answers = button.progress.answered if button.progress is not None else {}
+        columns = ("robot", "lockout", "since, by whom", "last stop", "status", "heard", "check-in")
+        rows = (_row(name, last, answers.get(name)) for name, last in sorted(self._robots.items()))
+        return Group(
+            label(head, "bold green" if up else "bold white on red"),
+            label("SPACE stops everything    f forgets robots that are gone    q quits", "bold"),
+            table("", columns, rows),
+            *([label(self._problem, "yellow")] if self._problem else []),
+            _outcome(button),
+            *(label(line, "red") for line in log),
+        )
+
+
+def _row(name: str, last: LastReport, answer: Answer | None) -> tuple[Any, ...]:
+    age, lockouts, trip_ms = time.monotonic() - last.at, last.report.lockouts, last.report.round_trip_ms
+    locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
+    return (
+        name,
+        label(locked, "bold red") if lockouts else label("free"),
+        f"{utc(lockouts[0].at)} {lockouts[0].source} {lockouts[0].reason}" if lockouts else "",
+        _stop_cell(answer),
+        label(f"{trip_ms:.1f} ms", "red" if trip_ms > SLOW_MS else ""),
+        label(f"{age:.0f} s ago" if age < GONE_S else f"GONE, {age:.0f} s", "" if age < GONE_S else "bold red"),
+        _check_in_cell(last.report.facts.get("check_in")),
+    )
+
+
+def _stop_cell(answer: Answer | None) -> Text | str:
+    if answer is None:
+        return ""
+    if answer.stopped:
+        slow = answer.latency_ms > SLOW_MS
+        return label(f"stopped in {answer.latency_ms:.1f} ms", "bold red" if slow else "green")
+    return label("DID NOT STOP" if answer.stopped is False else "UNKNOWN", "bold red")
+
+
+def _check_in_cell(state: object) -> Text | str:
+    if not isinstance(state, Mapping) or state.get("required") is not True:
+        return "not needed"
+    left = state.get("time_left_s")
+    seconds = float(left) if isinstance(left, int | float) else 0.0
+    return label(f"{seconds:.1f} s left", "" if seconds > 0 else "bold red")
+
+
+def _outcome(button: StopButton) -> Text:
+    if button.running and button.progress is not None:
+        silent = button.progress.unconfirmed
+        waiting = f"; unconfirmed: {', '.join(silent)}" if silent else ""
+        link = "" if button.progress.link_up else "; THE LINK IS DOWN, the stop leaves when it is back"
+        return label(f"STOPPING: {len(button.progress.answered)} answered{waiting}{link}", "bold red")
+    if button.report is None:
+        return label("")
+    report = button.report
+    silent_names = f" No answer: {', '.join(report.silent)}." if report.silent else ""
+    return label(f"{summary(report)}{silent_names}", "green" if exit_code(report) is Exit.OK else "bold red")

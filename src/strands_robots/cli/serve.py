@@ -7,20 +7,22 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Group
+from rich.panel import Panel
 
 from strands_robots import settings
-from strands_robots.cli.command import command
-from strands_robots.cli.mesh import serve_on_mesh
-from strands_robots.cli.network import Network, describe
-from strands_robots.cli.output import Failure, Screen, label, plain, table
-from strands_robots.cli.recorded import recorded
-from strands_robots.cli.words import assignments, told_apart
+from strands_robots.cli.command import MESH_OPTION, assignments, command, parse_ports
+from strands_robots.cli.network import Network, describe, mesh_peer
+from strands_robots.cli.output import CliError, Screen, first_line, label, plain, table
+from strands_robots.cli.record import record_robot
+from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import text_of
 from strands_robots.utils import ValidationError, device_id, number
 
@@ -28,8 +30,9 @@ if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
 
     from strands_robots.device_connect.backends import LinkConfig
+    from strands_robots.device_connect.shutdown import StopSignal
 
-_WATCH_S = 0.2
+_POLL_S = 0.2
 
 
 def register(app: typer.Typer) -> None:
@@ -59,7 +62,7 @@ def serve(
         ),
     ] = None,
     host: Annotated[
-        str | None, typer.Option("--host", help="Of a Reachy Mini's daemon; without it one is looked for.")
+        str | None, typer.Option("--host", help="Of a Reachy Mini's daemon; searched for by default.")
     ] = None,
     options: Annotated[
         list[str] | None,
@@ -78,7 +81,7 @@ def serve(
     record_cameras: Annotated[
         str | None, typer.Option("--record-cameras", help="Which cameras: names with commas, or none.", metavar="LIST")
     ] = None,
-    on_mesh: Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")] = False,
+    on_mesh: Annotated[bool, MESH_OPTION] = False,
     until_stdin_closes: Annotated[bool, typer.Option("--until-stdin-closes", hidden=True)] = False,
 ) -> None:
     """Put a robot on the network. Ctrl-C or SIGTERM stops the robot first, then departs."""
@@ -92,60 +95,84 @@ def serve(
     for name, value in flags.items():
         if value is not None:
             settings.put(name, value)
-    wanted = None if peer_id is None else device_id("--peer-id", peer_id)
-    meeting, serial = told_apart(port or [])
-    network = replace(network, port=meeting)
+    peer_id = None if peer_id is None else device_id("--peer-id", peer_id)
+    tcp_port, serial_port = parse_ports(port or [])
+    network = replace(network, port=tcp_port)
     if on_mesh:
-        network.on_mesh()
+        network.use_mesh()
     link = None if on_mesh else network.link()
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
 
     chosen = assignments(options or []) | ({} if host is None else {"host": host})
-    if serial is not None:
-        chosen["port"] = serial
-    kind = mode or ("real" if serial is not None or robot == "reachy_mini" else "sim")
-    if serial is not None and kind == "sim":
-        raise ValidationError(f"--mode must be real with the serial port {serial}, not sim.")
-    body = Robot(robot, mode="real" if robot == "reachy_mini" else kind, **chosen)
+    if serial_port is not None:
+        chosen["port"] = serial_port
+    mode = mode or ("real" if serial_port is not None or robot == "reachy_mini" else "sim")
+    if serial_port is not None and mode == "sim":
+        raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")
+    body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
     try:
-        with recorded(screen, body, wanted or str(body.tool_name_str), record, record_cameras):
+        with record_robot(screen, body, peer_id or str(body.tool_name_str), record, record_cameras):
             if link is None:
-                serve_on_mesh(screen, body, wanted, kind)
+                served = _on_mesh(screen, body, peer_id, mode)
             else:
-                _serve(screen, network, link, body, wanted=wanted, piped=until_stdin_closes)
+                served = _on_device_connect(screen, network, link, body, peer_id)
+            _serve(screen, body, served, piped=until_stdin_closes)
     finally:
         cleanup = getattr(body, "cleanup", None)
         if callable(cleanup):
             cleanup()
 
 
-def _serve(screen: Screen, network: Network, link: LinkConfig, body: Any, *, wanted: str | None, piped: bool) -> None:
-    from strands_robots import device_connect  # noqa: PLC0415 - as above
-    from strands_robots.device_connect.bringup import default_id, driver_for  # noqa: PLC0415
+def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, piped: bool) -> None:
+    """Serve until a signal comes, stop the robot, and leave the network."""
+    from strands_robots.device_connect.shutdown import StopSignal  # noqa: PLC0415 - loads nothing of the framework
+
+    with StopSignal() as signals:
+        with served as peer_id:
+            try:
+                # Objects left by the imports are exempt from collection: scanning them would stall a control loop
+                # for 10 ms or more.
+                gc.collect()
+                gc.freeze()
+                received = _wait(signals, piped)
+            finally:
+                stopped = _halt(screen, body)
+        screen.say("Off the network.")
+        screen.data({"event": "departed", "peer_id": peer_id, "signal": received})
+    if not stopped:
+        raise CliError("The robot was left moving: it did not confirm its stop.")
+    if received == signal.SIGINT:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> Iterator[str]:
+    with mesh_peer(body, peer_id, mode) as mesh:
+        screen.data({"event": "serving", "peer_id": mesh.peer_id, "network": "mesh", "pid": os.getpid()})
+        screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: strands-robots peers --mesh", "green")
+        screen.say("Ctrl-C stops the robot, then takes it off the mesh.")
+        yield mesh.peer_id
+
+
+@contextmanager
+def _on_device_connect(
+    screen: Screen, network: Network, link: LinkConfig, body: Any, peer_id: str | None
+) -> Iterator[str]:
+    from strands_robots import device_connect  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.device_connect.bringup import default_id, driver_for  # noqa: PLC0415 - as above
 
     driver = driver_for(body, "robot")
-    with device_connect.StopSignal() as asked:
-        try:
-            runtime = device_connect.init_device_connect_sync(
-                driver, peer_id=wanted or default_id(body), link=link, allow_insecure=True if network.opted_in else None
-            )
-        except (device_connect.DuplicateDeviceError, TimeoutError, OSError) as exc:
-            raise Failure(f"The robot is not on the network: {exc}") from exc
-        try:
-            _announce(screen, str(runtime.device_id), link, driver, network)
-            # What importing left behind stays: looking through it again would hold a control loop up for 10 ms or more.
-            gc.collect()
-            gc.freeze()
-            heard = _wait(asked, piped)
-        finally:
-            still = _halt(screen, body)
-            device_connect.stop_device_connect(runtime)
-    screen.say("Off the network.")
-    screen.data({"event": "departed", "peer_id": str(runtime.device_id), "signal": heard})
-    if not still:
-        raise Failure("The robot was left moving: it did not confirm its stop.")
-    if heard == signal.SIGINT:
-        raise KeyboardInterrupt
+    try:
+        runtime = device_connect.init_device_connect_sync(
+            driver, peer_id=peer_id or default_id(body), link=link, allow_insecure=True if network.opted_in else None
+        )
+    except (device_connect.DuplicateDeviceError, TimeoutError, OSError) as exc:
+        raise CliError(f"The robot is not on the network: {exc}") from exc
+    try:
+        _announce(screen, str(runtime.device_id), link, driver, network)
+        yield str(runtime.device_id)
+    finally:
+        device_connect.stop_device_connect(runtime)
 
 
 def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriver, network: Network) -> None:
@@ -162,65 +189,56 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
     )
     if screen.machine:
         return
-    from rich.console import Group  # noqa: PLC0415 - Rich is loaded when something is shown
-    from rich.panel import Panel  # noqa: PLC0415
-
-    where = _where(link, network)
+    flags = _network_flags(link, network)
     lines: list[Any] = [
         label(describe(link)),
         *([label(f"Tenant {link.tenant}.")] if link.tenant != "default" else []),
-        table("", ("function", "what it does"), ((name, _first(text)) for name, text in functions.items())),
+        table("", ("function", "what it does"), ((name, first_line(text)) for name, text in functions.items())),
         label("From another terminal:", "bold"),
-        label(f"  strands-robots peers{where}"),
-        label(f"  strands-robots call {peer_id} {_example(functions)}{where}"),
-        label(f"  strands-robots stop {peer_id}{where}"),
-        label(f"  strands-robots estop{where}"),
+        label(f"  strands-robots peers{flags}"),
+        label(f"  strands-robots call {peer_id} {_example(functions)}{flags}"),
+        label(f"  strands-robots stop {peer_id}{flags}"),
+        label(f"  strands-robots estop{flags}"),
         label(""),
         label("Ctrl-C stops the robot, then takes it off the network."),
     ]
     screen.show(Panel(Group(*lines), title=label(peer_id, "bold"), title_align="left", border_style="green"))
 
 
-def _where(link: LinkConfig, network: Network) -> str:
-    """The flags with which another terminal reaches the same network; secrets are files and stay on this side."""
-    words = []
+def _network_flags(link: LinkConfig, network: Network) -> str:
+    """Return the flags with which another terminal reaches the same network; none names a secret."""
+    flags = []
     if network.nats:
-        words += ["--nats", network.nats]
+        flags += ["--nats", network.nats]
     for endpoint in network.connect or network.listen or []:
-        words += ["--connect", endpoint.replace("0.0.0.0", "HOST").replace("[::]", "HOST")]
-    words += ["--multicast"] if network.multicast else []
-    words += ["--port", str(link.meet_port)] if network.port else []
-    words += ["--tenant", link.tenant] if network.tenant else []
-    words += ["--insecure"] if network.insecure else []
-    return "".join(f" {plain(word)}" for word in words)
+        flags += ["--connect", endpoint.replace("0.0.0.0", "HOST").replace("[::]", "HOST")]
+    flags += ["--multicast"] if network.multicast else []
+    flags += ["--port", str(link.meet_port)] if network.port else []
+    flags += ["--tenant", link.tenant] if network.tenant else []
+    flags += ["--insecure"] if network.insecure else []
+    return "".join(f" {plain(flag)}" for flag in flags)
 
 
 def _example(functions: Mapping[str, str]) -> str:
     return "execute instruction='wave' duration=5" if "execute" in functions else next(iter(functions), "FUNCTION")
 
 
-def _first(description: str) -> str:
-    return description.partition("\n")[0]
-
-
 def _halt(screen: Screen, body: Any) -> bool:
-    """Stop the robot and say so; True when it is known to stand still."""
-    from strands_robots.contract import adapt, put_away  # noqa: PLC0415 - loaded when it is used
-
+    """Stop the robot and report it; True when it is known to stand still."""
     screen.say("Stopping the robot...")
-    # The device is still on the network: what is asked for after this halt would outlive the process.
+    # The robot is still on the network: a motion that started after this halt would outlive the process.
     put_away(getattr(body, "robot", body))
     halt = getattr(body, "halt", None)
     if not callable(halt):
         halt = adapt(body).halt
-    told = halt("the operator ended serve").envelope()
-    screen.data({"event": "stopped", **{key: told[key] for key in ("status", "stopped", "halted") if key in told}})
-    screen.say(text_of(told), "green" if told["status"] == "success" else "bold red")
-    return told.get("stopped") is True
+    answer = halt("the operator ended serve").envelope()
+    screen.data({"event": "stopped", **{key: answer[key] for key in ("status", "stopped", "halted") if key in answer}})
+    screen.say(text_of(answer), "green" if answer["status"] == "success" else "bold red")
+    return answer.get("stopped") is True
 
 
-def _wait(asked: Any, piped: bool) -> int | None:
-    """Until a signal comes, or standard input closes where ``piped``."""
+def _wait(signals: StopSignal, piped: bool) -> int | None:
+    """Wait for a signal, or for the end of standard input where ``piped``; return the signal's number."""
     closed = threading.Event()
 
     def read() -> None:
@@ -231,7 +249,7 @@ def _wait(asked: Any, piped: bool) -> int | None:
     if piped:
         threading.Thread(target=read, name="stdin", daemon=True).start()
     while not closed.is_set():
-        heard: int | None = asked.wait(_WATCH_S)
-        if heard is not None:
-            return heard
+        received = signals.wait(_POLL_S)
+        if received is not None:
+            return received
     return None

@@ -1,4 +1,4 @@
-"""``teleop LEADER FOLLOWER``: one leads, the other follows, on this machine. ``calibrate``: an arm's ends, by hand."""
+"""``teleop`` and ``replay``: a leader or a recording drives a follower. ``calibrate``: measure an arm by hand."""
 
 from __future__ import annotations
 
@@ -6,19 +6,27 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from functools import partial
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.control import Control
 
 from strands_robots.cli.command import command
-from strands_robots.cli.far import MESH, known_to, lead_far, leads
-from strands_robots.cli.mesh import own_id
-from strands_robots.cli.output import Failure, Screen, table
-from strands_robots.cli.published import NOBODY, NoBody, follow_far, publish_far
-from strands_robots.cli.recorded import recorded
+from strands_robots.cli.network import temporary_mesh_id
+from strands_robots.cli.output import POLL_S, CliError, Screen, table, wait_until
+from strands_robots.cli.record import record_robot
+from strands_robots.cli.teleop_mesh import (
+    MESH_PREFIX,
+    NO_FOLLOWER,
+    NoFollower,
+    announce,
+    check_keys,
+    follow_peer,
+    lead_peer,
+    publish_leader,
+)
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleoperators.leader import FULL_RANGES_PER_S
@@ -28,15 +36,16 @@ if TYPE_CHECKING:
     from strands_robots.hardware import LeaderArm
     from strands_robots.hardware.calibrating import Reach
 
-_LOOK_S = 0.05
 _NAME = "leader"
-_METHODS = {"keyboard": "keyboard", "gamepad": "gamepad"}
+_MANUAL = ("keyboard", "gamepad")
+_FOLLOWER_ID = typer.Option("--id", help="Calibration id of the follower.")
 
 
 def register(app: typer.Typer) -> None:
-    """Add ``teleop`` and ``calibrate`` to the application."""
+    """Add the three commands to the application."""
     command(app, "teleop")(teleop)
     command(app, "calibrate")(calibrate)
+    command(app, "replay")(replay)
 
 
 def teleop(
@@ -49,12 +58,12 @@ def teleop(
     follower: Annotated[
         str, typer.Argument(help="TYPE@PORT of a real arm, a model in simulation, mesh:PEER, or none to --publish.")
     ],
-    leader_id: Annotated[str | None, typer.Option("--leader-id", help="Whose calibration the leader has.")] = None,
-    follower_id: Annotated[str | None, typer.Option("--id", help="Whose calibration the follower has.")] = None,
+    leader_id: Annotated[str | None, typer.Option("--leader-id", help="Calibration id of the leader.")] = None,
+    follower_id: Annotated[str | None, _FOLLOWER_ID] = None,
     leader_calibration: Annotated[
-        Path | None, typer.Option("--leader-calibration", help="A calibration file of the leader.")
+        Path | None, typer.Option("--leader-calibration", help="Calibration file of the leader.")
     ] = None,
-    calibration: Annotated[Path | None, typer.Option("--calibration", help="The same of the follower.")] = None,
+    calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file of the follower.")] = None,
     seconds: Annotated[float | None, typer.Option("--for", help="End after that many seconds.")] = None,
     hz: Annotated[float, typer.Option("--hz", help="Frames a second, 1 to 1000.")] = 50.0,
     max_speed: Annotated[
@@ -66,20 +75,20 @@ def teleop(
     record: Annotated[Path | None, typer.Option("--record", help="Also record the follower: a new .mcap.")] = None,
 ) -> None:
     """Let a leader drive a follower until it ends or Ctrl-C, which stops the follower first."""
-    if leader.startswith(MESH):
-        if follower.startswith(MESH) or publish is not None:
+    options = _arm_options("", follower_id, calibration)
+    if leader.startswith(MESH_PREFIX):
+        if follower.startswith(MESH_PREFIX) or publish is not None:
             raise ValidationError("a leader of the mesh leads a follower of this machine, and publishes itself.")
-        peer = identifier("leader", leader.removeprefix(MESH))
-        options = arm_options("", follower_id, calibration)
+        peer = identifier("leader", leader.removeprefix(MESH_PREFIX))
         _follow(screen, peer, follower, options=options, seconds=seconds, max_speed=max_speed, record=record)
         return
-    drive(
+    _drive(
         screen,
         leader,
         follower,
-        lambda robot: _led(leader, robot, arm_options("", leader_id, leader_calibration)),
-        options=arm_options("", follower_id, calibration),
-        method=_METHODS.get(leader, "arm"),
+        lambda robot: _connected_leader(leader, robot, _arm_options("", leader_id, leader_calibration)),
+        options=options,
+        method=leader if leader in _MANUAL else "arm",
         seconds=seconds,
         hz=hz,
         max_speed=max_speed,
@@ -88,11 +97,55 @@ def teleop(
     )
 
 
-def drive(
+def replay(
+    screen: Screen,
+    *,
+    file: Annotated[Path, typer.Argument(help="A recording: .mcap, .csv or .parquet.")],
+    to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, a model, or mesh:PEER.")],
+    device: Annotated[str | None, typer.Option("--device", help="Device in a recording of several.")] = None,
+    follower_id: Annotated[str | None, _FOLLOWER_ID] = None,
+    calibration: Annotated[Path | None, typer.Option("--calibration", help="A calibration file.")] = None,
+    speed: Annotated[float, typer.Option("--speed", help="Times as fast, at most 10.")] = 1.0,
+) -> None:
+    """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""
+    leader = _recorded_leader(file, device, speed)
+    _drive(screen, file.name, to, lambda _: nullcontext(leader), options=_arm_options("", follower_id, calibration))
+
+
+def calibrate(
+    screen: Screen,
+    *,
+    arm: Annotated[str, typer.Argument(help="Such as so101.")],
+    port: Annotated[str, typer.Option("--port", help="Its serial port, such as /dev/ttyACM0.")],
+    device: Annotated[str | None, typer.Option("--id", help="Id under which the calibration is stored.")] = None,
+    leader: Annotated[bool, typer.Option("--leader", help="It is a leader arm.")] = False,
+) -> None:
+    """Measure an arm's middle and the ends of its joints, moved by hand. Its torque goes off: hold it."""
+    from strands_robots.hardware.calibrating import Calibrating  # noqa: PLC0415 - real arms only
+    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
+
+    made = make_device(arm, _arm_options(port, device, None), "leader" if leader else "follower", calibrated=False)
+    steps = Calibrating(made)
+    try:
+        steps.begin()
+        screen.say("The torque is off. Move every joint to the middle of its motion, then press Enter.")
+        if not sys.stdin.readline():
+            raise ValidationError("calibrate needs a person at the keyboard; standard input has ended.")
+        steps.centre()
+        screen.say("Now move every joint from one end to the other, then press Enter.")
+        steps.watch(_enter_pressed().is_set, lambda reaches: _draw_reaches(screen, reaches))
+        path = steps.finish()
+    finally:
+        steps.close()
+    screen.data({"status": "success", "file": str(path)})
+    screen.say(f"Calibrated; stored in {path}.", "green")
+
+
+def _drive(
     screen: Screen,
     leader: str,
     follower: str,
-    led: Callable[[Any], AbstractContextManager[Any]],
+    connected: Callable[[Any], AbstractContextManager[Any]],
     *,
     options: dict[str, Any],
     method: str = "arm",
@@ -102,49 +155,53 @@ def drive(
     publish: str | None = None,
     record: Path | None = None,
 ) -> None:
-    """Make the follower, let the leader that ``led`` gives for it drive it to the end, and stop it whatever happens.
+    """Make the follower, let the leader that ``connected`` returns for it drive it, and stop it in every case.
 
     Raises:
-        Failure: it was refused, it failed, or the follower did not confirm its stop.
+        CliError: it was refused, it failed, or the follower did not confirm its stop.
     """
-    if follower.startswith(MESH):
+    if follower.startswith(MESH_PREFIX):
         if publish is not None or record is not None:
             raise ValidationError("--publish and --record are for a follower of this machine, not of the mesh.")
-        peer = identifier("follower", follower.removeprefix(MESH))
-        waits = partial(_until, screen)
-        lead_far(screen, leader, peer, led, waits, method=method, seconds=seconds, hz=hz, max_speed=max_speed)
+        peer = identifier("follower", follower.removeprefix(MESH_PREFIX))
+        lead_peer(screen, leader, peer, connected, method=method, seconds=seconds, hz=hz, max_speed=max_speed)
         return
-    if follower == NOBODY:
+    if follower == NO_FOLLOWER:
         if publish is None or record is not None:
-            raise ValidationError(f"the follower {NOBODY} goes with --publish PEER, and has nothing to --record.")
-        peer, waits = identifier("--publish", publish), partial(_until, screen)
-        with led(NoBody()) as source:
-            publish_far(screen, leader, peer, source, waits, method=method, seconds=seconds, hz=hz)
+            raise ValidationError(f"the follower {NO_FOLLOWER} goes with --publish PEER, and has nothing to --record.")
+        peer = identifier("--publish", publish)
+        with connected(NoFollower()) as source:
+            publish_leader(screen, leader, peer, source, method=method, seconds=seconds, hz=hz)
         return
-    place = {} if publish is None else {"peer_id": identifier("--publish", publish), "mesh": True}
-    robot = _made(follower, options, **place)
+    on_mesh = {} if publish is None else {"peer_id": identifier("--publish", publish), "mesh": True}
+    robot = _make_follower(follower, options, **on_mesh)
     try:
-        with recorded(screen, robot, publish or robot.tool_name_str, record), led(robot) as source:
-            known_to(follower, source, robot.body().bounds)
+        with record_robot(screen, robot, publish or robot.tool_name_str, record), connected(robot) as source:
+            check_keys(follower, source, robot.body().bounds)
             for answer in (
                 robot.attach_teleop(source, _NAME, method=method, max_speed=max_speed),
                 robot.teleoperate(_NAME, duration=seconds, hz=hz, publish=publish is not None),
             ):
                 if is_error(answer):
-                    raise Failure(text_of(answer))
-            leads(screen, leader, follower, source)
+                    raise CliError(text_of(answer))
+            announce(screen, leader, follower, source)
             if publish is not None:
                 screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
-            row, verdict = _followed(screen, robot, source)
+            wait_until(
+                screen,
+                lambda: "" if _NAME in robot.teleoperating() else "It has ended.",
+                getattr(source, "duration", None) or 0.0,
+            )
+            verdict = _stop(screen, robot)
+            row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
     finally:
         robot.halt("teleop ended")
         robot.cleanup()
     screen.data({"event": "ended", **row, "stopped": verdict.stopped})
     if row["state"] == "error":
-        raise Failure(f"The teleoperation failed: {row['error']}", **row)
+        raise CliError(f"The teleoperation failed: {row['error']}", **row)
     screen.say(f"{row['state'].capitalize()} after {row['step']} frames, {row['errors']} of them unusable.", "green")
-    if not verdict.stopped:
-        raise Failure(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
+    _check_stopped(verdict)
 
 
 def _follow(
@@ -158,24 +215,23 @@ def _follow(
     record: Path | None,
 ) -> None:
     """Let a leader that a peer of the mesh publishes drive a follower of this machine."""
-    robot = _made(follower, options, mesh=True, peer_id=own_id("follow"))
+    robot = _make_follower(follower, options, mesh=True, peer_id=temporary_mesh_id("follow"))
     try:
-        with recorded(screen, robot, robot.tool_name_str, record):
-            why, stats = follow_far(screen, peer, robot, partial(_until, screen), seconds=seconds, max_speed=max_speed)
-            verdict = _stopped(screen, robot)
+        with record_robot(screen, robot, robot.tool_name_str, record):
+            why, stats = follow_peer(screen, peer, robot, seconds=seconds, max_speed=max_speed)
+            verdict = _stop(screen, robot)
     finally:
         robot.halt("teleop ended")
         robot.cleanup()
     row = {key: stats[key] for key in ("frames_received", "errors", "rejected", "slew_rejected", "rate_dropped")}
     screen.data({"event": "ended", **row, "why": why, "stopped": verdict.stopped})
-    if not verdict.stopped:
-        raise Failure(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
+    _check_stopped(verdict)
     left_out = row["errors"] + row["rejected"] + row["slew_rejected"] + row["rate_dropped"]
-    screen.say(f"{why} {row['frames_received']} frames came, {left_out} of them were not applied.", "green")
+    screen.say(f"{why} {row['frames_received']} frames arrived, {left_out} of them were not applied.", "green")
 
 
-def _made(follower: str, options: dict[str, Any], **more: Any) -> Any:
-    """The follower of this machine: ``TYPE@PORT``, or a model in simulation."""
+def _make_follower(follower: str, options: dict[str, Any], **more: Any) -> Any:
+    """Make the follower of this machine: ``TYPE@PORT``, or a model in simulation."""
     from strands_robots.robot import NO_SUCH_MODEL, Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
@@ -184,11 +240,11 @@ def _made(follower: str, options: dict[str, Any], **more: Any) -> Any:
     except ValidationError as exc:
         if exc.code != NO_SUCH_MODEL or "/" in kind or "." in kind:
             raise
-        far = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
-        raise ValidationError(f"{exc} {far}") from exc
+        hint = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
+        raise ValidationError(f"{exc} {hint}") from exc
 
 
-def _stopped(screen: Screen, robot: Any) -> StopVerdict:
+def _stop(screen: Screen, robot: Any) -> StopVerdict:
     screen.say("Stopping the follower...")
     verdict: StopVerdict = robot.halt("teleop ended")
     if verdict.stopped:
@@ -196,61 +252,38 @@ def _stopped(screen: Screen, robot: Any) -> StopVerdict:
     return verdict
 
 
-def calibrate(
-    screen: Screen,
-    *,
-    arm: Annotated[str, typer.Argument(help="Such as so101.")],
-    port: Annotated[str, typer.Option("--port", help="Its serial port, such as /dev/ttyACM0.")],
-    device: Annotated[str | None, typer.Option("--id", help="Under which the calibration is kept.")] = None,
-    leader: Annotated[bool, typer.Option("--leader", help="It is a leader arm.")] = False,
-) -> None:
-    """Measure an arm's middle and the ends of its joints, moved by hand. Its torque goes off: hold it."""
-    from strands_robots.hardware.calibrating import Calibrating  # noqa: PLC0415 - real arms only
-    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
-
-    made = make_device(arm, arm_options(port, device, None), "leader" if leader else "follower", calibrated=False)
-    steps = Calibrating(made)
-    try:
-        steps.begin()
-        screen.say("The torque is off. Move every joint to the middle of its motion, then press Enter.")
-        _line()
-        steps.centre()
-        screen.say("Now move every joint from one end to the other, then press Enter.")
-        steps.watch(_enter().is_set, lambda reaches: _show(screen, reaches))
-        path = steps.finish()
-    finally:
-        steps.close()
-    screen.data({"status": "success", "file": str(path)})
-    screen.say(f"Calibrated; kept in {path}.", "green")
+def _check_stopped(verdict: StopVerdict) -> None:
+    if not verdict.stopped:
+        raise CliError(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
 
 
 @contextmanager
-def _led(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
-    """The leader of that name, ready to lead ``robot``."""
-    if leader in _METHODS:
+def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
+    """Yield the leader of that name, ready to lead ``robot``."""
+    if leader in _MANUAL:
         from strands_robots.teleoperators.manual import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
 
         body = robot.body()
         present = body.get_joints()
         start = {key: present[key] for key in body.bounds if key in present}
         made = KeyboardLeader if leader == "keyboard" else GamepadLeader
-        with made(start, body.bounds) as led:
-            yield led
+        with made(start, body.bounds) as source:
+            yield source
         return
     kind, at, port = leader.partition("@")
     if not at:
-        yield recording(Path(leader))
+        yield _recorded_leader(Path(leader))
         return
     from strands_robots.hardware import LeaderArm  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
 
-    with arm_connected(leader, LeaderArm(make_device(kind, {**options, "port": port}, "leader"))) as arm:
+    with _connected_arm(leader, LeaderArm(make_device(kind, {**options, "port": port}, "leader"))) as arm:
         yield arm
 
 
 @contextmanager
-def arm_connected(name: str, arm: LeaderArm) -> Iterator[LeaderArm]:
-    """The leader arm while it is connected; one sentence where it cannot be."""
+def _connected_arm(name: str, arm: LeaderArm) -> Iterator[LeaderArm]:
+    """Yield the leader arm while it is connected. Raises ``ConnectionError`` with one sentence where it cannot be."""
     with ExitStack() as stack:
         try:
             stack.enter_context(arm)
@@ -259,20 +292,20 @@ def arm_connected(name: str, arm: LeaderArm) -> Iterator[LeaderArm]:
         yield arm
 
 
-def recording(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
-    """A recording as a leader: ``.csv``, a LeRobot ``.parquet``, or ``.mcap`` of one device.
+def _recorded_leader(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
+    """Return a recording as a leader: ``.csv``, a LeRobot ``.parquet``, or ``.mcap`` of one device.
 
     Args:
         path: the file.
-        device: whose actions, where an ``.mcap`` has those of several; the episode of a ``.parquet``.
+        device: the device in an ``.mcap`` of several; the episode of a ``.parquet``.
         speed: times as fast.
 
     Raises:
         ValidationError: it cannot be read, or it has no actions of that device.
-        MissingExtraError: what reads it is not installed.
+        MissingExtraError: the package that reads it is not installed.
     """
-    from strands_robots.recording import recorded_actions  # noqa: PLC0415
-    from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames  # noqa: PLC0415 - as above
+    from strands_robots.recording import recorded_actions  # noqa: PLC0415 - as above
+    from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames  # noqa: PLC0415
 
     if path.suffix == ".mcap":
         frames = recorded_actions(path, device)
@@ -281,57 +314,14 @@ def recording(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
     return RecordedLeader(frames, speed)
 
 
-def _followed(screen: Screen, robot: Any, source: Any) -> tuple[dict[str, Any], StopVerdict]:
-    """Wait for the end, with a bar where the leader knows how long it leads, and stop: its row, the verdict."""
-
-    def over() -> str:
-        return "" if _NAME in robot.teleoperating() else "It has ended."
-
-    _until(screen, over, getattr(source, "duration", None) or 0.0)
-    verdict = _stopped(screen, robot)
-    row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
-    return row, verdict
+def _arm_options(port: str, device: str | None, calibration: Path | None) -> dict[str, Any]:
+    """Return the options of a real arm that were given."""
+    options = {"port": port or None, "id": device, "calibration": calibration}
+    return {key: value for key, value in options.items() if value is not None}
 
 
-def _until(screen: Screen, over: Callable[[], str], duration: float) -> str:
-    """Wait until ``over`` says why, with a bar where the leader knows how long it leads."""
-    began = time.monotonic()
-    with following(screen, duration or None) as moved:
-        try:
-            while not (why := over()):
-                moved(time.monotonic() - began)
-                time.sleep(_LOOK_S)
-        except KeyboardInterrupt:
-            return "Ctrl-C."
-    return why
-
-
-@contextmanager
-def following(screen: Screen, seconds: float | None, what: str = "playing") -> Iterator[Callable[[float], None]]:
-    """A bar over so many seconds, where somebody looks; moved by the seconds that are over."""
-    if seconds is None or screen.machine or not screen.out.is_terminal:
-        yield lambda _: None
-        return
-    from rich.progress import Progress  # noqa: PLC0415 - Rich is loaded when something is shown
-
-    with Progress(console=screen.out, transient=True) as progress:
-        task = progress.add_task(what, total=seconds)
-        yield lambda done: progress.update(task, completed=done)
-
-
-def arm_options(port: str, device: str | None, calibration: Path | None) -> dict[str, Any]:
-    """What was given of a real arm's options."""
-    given = {"port": port or None, "id": device, "calibration": calibration}
-    return {key: value for key, value in given.items() if value is not None}
-
-
-def _line() -> None:
-    if not sys.stdin.readline():
-        raise ValidationError("calibrate needs somebody at the keyboard; standard input has ended.")
-
-
-def _enter() -> threading.Event:
-    """Set when Enter is pressed."""
+def _enter_pressed() -> threading.Event:
+    """Return an event that is set when Enter is pressed."""
     pressed = threading.Event()
 
     def read() -> None:
@@ -342,15 +332,9 @@ def _enter() -> threading.Event:
     return pressed
 
 
-def _show(screen: Screen, reaches: dict[str, Reach]) -> None:
-    if screen.out.is_terminal and not screen.machine:
+def _draw_reaches(screen: Screen, reaches: dict[str, Reach]) -> None:
+    if screen.live:
         rows = [(motor, each.low, each.present, each.high) for motor, each in reaches.items()]
-        screen.out.control(_home(len(rows)))
+        screen.out.control(Control.move(0, -(len(rows) + 3)) if rows else Control())
         screen.show(table("", ("joint", "lowest", "now", "highest"), rows))
-    time.sleep(_LOOK_S)
-
-
-def _home(rows: int) -> Any:
-    from rich.control import Control  # noqa: PLC0415 - Rich is loaded when something is shown
-
-    return Control.move(0, -(rows + 3)) if rows else Control()
+    time.sleep(POLL_S)

@@ -1,29 +1,41 @@
-"""``watch DEVICE``: its joints and its task, live."""
+"""``watch DEVICE``: its joints as bars between their limits, and its task, live."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
 
 import typer
+from rich.console import Group, RenderableType
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
 
 from strands_robots.cli.command import command
-from strands_robots.cli.fleet import asked, reached
-from strands_robots.cli.network import Network
-from strands_robots.cli.output import Exit, Failure, Screen, label
+from strands_robots.cli.network import Network, call_device
+from strands_robots.cli.output import CliError, Exit, Screen, label, plain
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
-    from strands_robots.cli.bars import Range
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.client import DeviceEvent
 
 SILENCE_S = 5.0
-"""Without an event for this long a device counts as silent; it tells its state once a second."""
+"""Seconds without an event after which a device counts as silent; it reports its state every second."""
+
+BAR_WIDTH = 32
+NAME_WIDTH = 18
+"""Characters of one bar, and of a joint's name."""
+
+JOINTS_MAX = 24
+"""Joints that are drawn; the rest is counted."""
+
+Range = tuple[float, float]
+FULL_TURN: Range = (-math.pi, math.pi)
+"""Range of the bar of a joint without limits, in radians."""
 
 
 def register(app: typer.Typer) -> None:
@@ -39,23 +51,23 @@ def watch(
 ) -> None:
     """Show a device's joints and task as they change, until Ctrl-C. With --json: one event a line."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=7 * 24 * 3600)
-    with reached(network) as fleet:
+    with network.fleet() as fleet:
         limits: dict[str, Range] = {}
-        with contextlib.suppress(Failure):  # a device without getFeatures is drawn without its limits
-            limits = _limits(asked(fleet, device, "getFeatures", {}, 3.0))
-        with contextlib.closing(fleet.events(device, timeout=SILENCE_S)) as heard:
-            events = until(heard, longest, device)
+        with contextlib.suppress(CliError):  # a device without getFeatures is drawn without its limits
+            limits = joint_limits(call_device(fleet, device, "getFeatures", {}, 3.0))
+        with contextlib.closing(fleet.events(device, timeout=SILENCE_S)) as arriving:
+            events = until(arriving, longest, device)
             if screen.machine:
                 for event in events:
                     screen.data({"device": event.device, "event": event.name, "payload": dict(event.payload)})
-            elif screen.out.is_terminal:
-                _live(screen, _first_view(fleet, device, limits), events)
+            elif screen.live:
+                _draw_live(screen, _present_state(fleet, device, limits), events)
             else:
-                in_lines(screen, events)
+                print_changes(screen, events)
 
 
-class View:
-    """What is known of one device, from its events."""
+class DeviceView:
+    """Last known joints and task of one device."""
 
     def __init__(self, device: str, limits: Mapping[str, Range]) -> None:
         self.device = device
@@ -63,8 +75,8 @@ class View:
         self._joints: dict[str, Mapping[str, Any]] = {}
         self.task = "idle"
 
-    def look(self, state: Mapping[str, Any]) -> None:
-        """Learn from an answer to getState or getStatus."""
+    def take_state(self, state: Mapping[str, Any]) -> None:
+        """Update from an answer to getState or getStatus."""
         robots = state.get("robots")
         if isinstance(state.get("joints"), Mapping):
             self._joints[""] = state["joints"]
@@ -73,19 +85,15 @@ class View:
                 self._joints[str(name)] = joints
 
     def take(self, event: DeviceEvent) -> None:
-        """Learn from one event."""
+        """Update from one event."""
         robot = str(event.payload.get("robot_name", ""))
         joints = event.payload.get("joints" if event.name == "observationUpdate" else "observation")
         if event.name in ("observationUpdate", "streamStep") and isinstance(joints, Mapping):
             self._joints[robot] = joints
-        self.task = task_of(event) or self.task
+        self.task = describe_task(event) or self.task
 
     def draw(self) -> RenderableType:
-        """The device, its task and its joints."""
-        from rich.console import Group  # noqa: PLC0415 - Rich is loaded when something is shown
-
-        from strands_robots.cli.bars import joints_table  # noqa: PLC0415
-
+        """Return the device, its task and its joints."""
         parts: list[Any] = [label(f"{self.device}: {self.task}", "bold")]
         for robot, joints in self._joints.items():
             if len(self._joints) > 1:
@@ -94,68 +102,133 @@ class View:
         return Group(*parts)
 
 
-def task_of(event: DeviceEvent) -> str:
-    """What an event says of the device's task in a few words; empty where it says nothing."""
-    said = event.payload
+def describe_task(event: DeviceEvent) -> str:
+    """Return what an event reports of the device's task; empty where it reports nothing."""
+    facts = event.payload
     if event.name in ("taskStarted", "policyStarted"):
-        return f"started {said.get('instruction', '')!r} with {said.get('policy_provider', '')}"
+        return f"started {facts.get('instruction', '')!r} with {facts.get('policy_provider', '')}"
     if event.name in ("taskComplete", "policyComplete"):
-        return f"{said.get('state', 'completed')}: {said.get('instruction', '')!r} after {said.get('steps', '?')} steps"
+        state, steps = facts.get("state", "completed"), facts.get("steps", "?")
+        return f"{state}: {facts.get('instruction', '')!r} after {steps} steps"
     if event.name == "emergencyStop":
-        return f"EMERGENCY STOP: {said.get('reason', '')}"
+        return f"EMERGENCY STOP: {facts.get('reason', '')}"
     if event.name != "stateUpdate":
         return ""
-    running = said.get("running_policies")
+    running = facts.get("running_policies")
     if isinstance(running, Mapping):
-        rows = [_running(str(name), row) for name, row in running.items() if isinstance(row, Mapping)]
-        return "; ".join(rows) or "idle"
-    status = str(said.get("task_status", ""))
-    return f"{status}: {said.get('instruction', '')!r}, step {said.get('step_count', 0)}" if status else ""
-
-
-def _running(name: str, row: Mapping[str, Any]) -> str:
-    return f"{name} does {row.get('instruction', '')!r}, step {row.get('step', '?')}"
-
-
-def _limits(features: Mapping[str, Any]) -> dict[str, Range]:
-    from strands_robots.cli.bars import ranges  # noqa: PLC0415 - Rich is loaded when something is shown
-
-    return ranges(features)
+        tasks = [
+            f"{name} does {row.get('instruction', '')!r}, step {row.get('step', '?')}"
+            for name, row in running.items()
+            if isinstance(row, Mapping)
+        ]
+        return "; ".join(tasks) or "idle"
+    status = str(facts.get("task_status", ""))
+    return f"{status}: {facts.get('instruction', '')!r}, step {facts.get('step_count', 0)}" if status else ""
 
 
 def until(events: Iterator[DeviceEvent], longest: float | None, device: str) -> Iterator[DeviceEvent]:
-    """Events until ``longest`` seconds are over. Raises :class:`Failure` when the device falls silent."""
+    """Yield events for ``longest`` seconds. Raises :class:`CliError` when the device falls silent."""
     ends = None if longest is None else time.monotonic() + longest
     for event in events:
         yield event
         if ends is not None and time.monotonic() >= ends:
             return
     if ends is None or time.monotonic() < ends:
-        raise Failure(f"{device} told nothing for {SILENCE_S:g} s.", Exit.SILENT)
+        raise CliError(f"{device} was silent for {SILENCE_S:g} s.", Exit.SILENT)
 
 
-def _first_view(fleet: FleetClient, device: str, limits: Mapping[str, Range]) -> View:
-    """The device as it is now: an idle robot may tell no joints by itself."""
-    view = View(device, limits)
-    for question in ("getState", "getStatus"):
-        with contextlib.suppress(Failure):  # a device answers one of the two
-            view.look(asked(fleet, device, question, {}, 3.0))
+def print_changes(screen: Screen, events: Iterator[DeviceEvent]) -> None:
+    """Print one line for each change of the task."""
+    last = ""
+    for event in events:
+        task = describe_task(event)
+        if task and task != last:
+            screen.say(f"{event.device}: {task}")
+            last = task
+
+
+def joint_limits(features: Mapping[str, Any], robot: str = "") -> dict[str, Range]:
+    """Return the joint limits in a device's answer to getFeatures, by joint; empty where it has none.
+
+    Args:
+        features: the answer.
+        robot: which robot of a simulated world; empty for its first one.
+    """
+    robots = features.get("robots")
+    chosen: Any = features
+    if isinstance(robots, Mapping) and robots:
+        chosen = robots.get(robot) or next(iter(robots.values()))
+    found: dict[str, Range] = {}
+    for key in ("joints", "ranges"):
+        joints = chosen.get(key) if isinstance(chosen, Mapping) else None
+        for name, limits in joints.items() if isinstance(joints, Mapping) else ():
+            pair = [value for value in limits if _finite(value)] if isinstance(limits, list | tuple) else []
+            if len(pair) == 2 and pair[0] < pair[1]:
+                # A real robot names the range of an action, such as pan.pos, and the position of the joint, pan.
+                found[str(name)] = found[str(name).removesuffix(".pos")] = (float(pair[0]), float(pair[1]))
+    return found
+
+
+def joint_bar(value: float, limits: Range = FULL_TURN, width: int = BAR_WIDTH) -> Text:
+    """Return a line from a joint's lower to its upper limit with a mark at its value."""
+    low, high = limits
+    share = min(1.0, max(0.0, (value - low) / (high - low)))
+    at = round(share * (width - 1))
+    line = Text("─" * at, style="bright_black")
+    line.append("●", style="bold cyan")
+    line.append("─" * (width - 1 - at), style="bright_black")
+    return line
+
+
+def joints_table(joints: Mapping[str, object], limits: Mapping[str, Range]) -> Table:
+    """Return every joint with its bar and its value; values that are no finite number are left out."""
+    grid = _grid()
+    grid.add_column(no_wrap=True)
+    grid.add_column(justify="right", no_wrap=True)
+    drawn = {str(name): float(value) for name, value in joints.items() if _finite(value)}
+    for name, value in list(drawn.items())[:JOINTS_MAX]:
+        around = limits.get(name) or (min(FULL_TURN[0], value), max(FULL_TURN[1], value))
+        grid.add_row(label(name), joint_bar(value, around), Text(f"{value:+.3f}"))
+    if len(drawn) > JOINTS_MAX:
+        grid.add_row(Text(f"and {len(drawn) - JOINTS_MAX} more", style="bright_black"), "", "")
+    return grid
+
+
+def motion_progress(title: str, done: float, total: float) -> Table:
+    """Return a titled progress bar in seconds."""
+    passed = min(max(done, 0.0), total)
+    grid = _grid()
+    grid.add_row(
+        Text(plain(title, 60), style="bold"),
+        ProgressBar(total=max(total, 1e-9), completed=passed, width=BAR_WIDTH),
+        Text(f"{passed:.1f} / {total:.1f} s"),
+    )
+    return grid
+
+
+def _grid() -> Table:
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(width=NAME_WIDTH, no_wrap=True, overflow="ellipsis")
+    return grid
+
+
+def _finite(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _present_state(fleet: FleetClient, device: str, limits: Mapping[str, Range]) -> DeviceView:
+    """Return a view of the device as it is now: an idle robot may send no joints by itself."""
+    view = DeviceView(device, limits)
+    for function in ("getState", "getStatus"):
+        with contextlib.suppress(CliError):  # a device answers one of the two
+            view.take_state(call_device(fleet, device, function, {}, 3.0))
     return view
 
 
-def _live(screen: Screen, view: View, events: Iterator[DeviceEvent]) -> None:
-    from rich.live import Live  # noqa: PLC0415 - Rich is loaded when something is shown
+def _draw_live(screen: Screen, view: DeviceView, events: Iterator[DeviceEvent]) -> None:
+    from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     with Live(view.draw(), console=screen.out, refresh_per_second=15) as live:
         for event in events:
             view.take(event)
             live.update(view.draw())
-
-
-def in_lines(screen: Screen, events: Iterator[DeviceEvent]) -> None:
-    last = ""
-    for event in events:
-        told = task_of(event)
-        if told and told != last:
-            screen.say(f"{event.device}: {told}")
-            last = told

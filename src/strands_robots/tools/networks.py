@@ -1,4 +1,4 @@
-"""The networks behind the ``robot_mesh`` tool: one protocol, two of them."""
+"""Networks of the ``robot_mesh`` tool: Device Connect and the native mesh behind one protocol."""
 
 from __future__ import annotations
 
@@ -12,36 +12,40 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success, text_of
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import MissingExtraError, ValidationError
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
-    from strands_robots.device_connect.client import Peer
     from strands_robots.mesh import Mesh
 
 SOURCE = "robot-mesh-tool"
-"""The name that the tool's calls carry; what a robot's allowlist has to hold."""
+"""Caller's name in the tool's calls; an allowlist of a robot must include it."""
 
 ANSWER_S = 10.0
 STOP_S = 5.0
 ESTOP_S = 1.5
-"""Seconds in which robots answer an emergency stop; it is sent again and again until then."""
+"""Seconds in which robots answer an emergency stop; it is repeated until then."""
 
 AGAIN_S, LOOK_S = 1.0, 0.05
 
 
+class MeshUnavailableError(StrandsRobotsError, RuntimeError):
+    """The native mesh is switched off, or has no session."""
+
+
 class RobotNetwork(Protocol):
-    """What the tool asks of a network. Every verb answers with an envelope and raises nothing."""
+    """Verbs of the tool on one network. Each answers with an envelope and never raises."""
 
     def peers(self) -> Envelope:
-        """Who is there."""
+        """List the robots that answer."""
 
     def tell(self, target: str, instruction: str, policy_provider: str, duration: float) -> Envelope:
-        """Have ``target`` follow an instruction; returns once it has begun."""
+        """Have ``target`` follow an instruction; returns once the motion has started."""
 
     def status(self, target: str) -> Envelope:
-        """What ``target`` is doing."""
+        """Return what ``target`` is doing."""
 
     def stop(self, target: str) -> Envelope:
         """Stop ``target``; with an empty one, every robot."""
@@ -51,95 +55,148 @@ class RobotNetwork(Protocol):
 
 
 def network() -> RobotNetwork:
-    """The network that is in use: Device Connect, unless it is absent or ``STRANDS_ROBOT_MESH_DC`` says off."""
+    """Return Device Connect, or the mesh where it is absent or ``STRANDS_ROBOT_MESH_DC`` says off."""
     absent = importlib.util.find_spec("device_connect_edge") is None
     if absent or settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_SPELLINGS:
         return NativeMesh()
     return DeviceConnect()
 
 
+def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
+    """Return whether a robot stopped, None when unknown, and the text of its answer."""
+    stopped = grade(answer).stopped
+    return stopped, text_of(answer) or ("" if stopped else explain(answer))
+
+
+def combined_verdict(answers: Mapping[str, Envelope]) -> Envelope:
+    """Return one answer for the stop of several robots: success only when each of them confirmed it."""
+    if not answers:
+        return error("No robot that can be stopped answered.", stopped=None, robots={})
+    outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
+    moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
+    silent = [name for name, (stopped, _) in outcomes.items() if stopped is None]
+    fields: dict[str, Any] = {
+        "stopped": False if moving else None if silent else True,
+        "not_stopped": moving,
+        "silent": silent,
+        "robots": {name: said for name, (_, said) in outcomes.items()},
+    }
+    if fields["stopped"]:
+        return success(f"Stopped: {', '.join(answers)}.", **fields)
+    problems = [f"DID NOT STOP: {', '.join(moving)}"] if moving else []
+    problems += [f"no answer, state unknown: {', '.join(silent)}"] if silent else []
+    return error("; ".join(problems) + ".", **fields)
+
+
+@contextmanager
+def joined_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mesh]:
+    """Join the native mesh for the length of the block.
+
+    Raises:
+        MeshUnavailableError: the mesh is off, or no session could be opened.
+        ValueError: ``peer_id`` is refused.
+    """
+    from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the network is loaded when it is used
+
+    mesh = init_mesh(robot, peer_id, peer_type)
+    if mesh is None:
+        raise MeshUnavailableError("The native mesh is off: STRANDS_MESH switches it off.")
+    try:
+        if not mesh.alive:
+            raise MeshUnavailableError("The native mesh has no session; the log says why.")
+        yield mesh
+    finally:
+        mesh.close()
+
+
 class NativeMesh:
-    """Robots on the native mesh, asked by a peer of this process that has no robot. Its silence is an error too."""
+    """Robots on the native mesh, called by a peer of this process without a robot. Silence is an error."""
 
     def peers(self) -> Envelope:
-        """Every peer in reach, with its type and state."""
+        """List every peer in reach, with its type and state."""
 
-        def listed(console: Mesh) -> Envelope:
-            _hear(console)
-            rows = [
-                {"id": row["peer_id"], "type": row["type"], "status": row.get("task_status", "")}
-                for row in console.peers
-                if row["reachable"]
-            ]
-            if not rows:
-                return error("No robot answered.", peers=[])
-            return success(f"{len(rows)} robots: {', '.join(row['id'] for row in rows)}.", peers=rows)
+        def listed(mesh: Mesh) -> Envelope:
+            _discover(mesh)
+            return _peer_list(
+                [
+                    {"id": row["peer_id"], "type": row["type"], "status": row.get("task_status", "")}
+                    for row in mesh.peers
+                    if row["reachable"]
+                ]
+            )
 
-        return _with_console(listed)
+        return _on_mesh(listed)
 
     def tell(self, target: str, instruction: str, policy_provider: str, duration: float) -> Envelope:
-        """The peer's ``start``."""
-        command = {
-            "action": "start",
-            "instruction": instruction,
-            "policy_provider": policy_provider,
-            "duration": duration,
-        }
-        return _with_console(lambda console: _answer_of(target, _asked(console, target, command, ANSWER_S)))
+        """Send the peer a ``start``."""
+        return self._request(
+            target, action="start", instruction=instruction, policy_provider=policy_provider, duration=duration
+        )
 
     def status(self, target: str) -> Envelope:
-        """The peer's ``status``."""
-        command = {"action": "status"}
-        return _with_console(lambda console: _answer_of(target, _asked(console, target, command, ANSWER_S)))
+        """Ask the peer for its ``status``."""
+        return self._request(target, action="status")
 
     def stop(self, target: str) -> Envelope:
-        """The peer's ``stop``, or that of every peer in reach at once; answers by name."""
+        """Stop one peer, or every peer in reach at once; answers by name."""
 
-        def stopped(console: Mesh) -> Envelope:
+        def stopped(mesh: Mesh) -> Envelope:
             command = {"action": "stop"}
             if target:
-                return verdict_of({target: _stop_answer(target, _asked(console, target, command, STOP_S))})
-            return _stop_all(console, lambda: console.broadcast(command, ESTOP_S))
+                return combined_verdict({target: _stop_answer(target, _reply(mesh, target, command, STOP_S))})
+            return _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S))
 
-        return _with_console(stopped, stopped=None)
+        return _on_mesh(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
-        """The mesh's emergency stop, sent at once; and again for who is seen since and has not confirmed it.
+        """Send the mesh's emergency stop at once, and again while a peer has not confirmed it.
 
-        Who was seen and gave no answer is named. Each of them holds the robots; a resume of the operator's frees them
-        of all. ``estop_id`` names the first.
+        A peer that was seen and did not answer is named. Each repetition is an epoch of its own; one signed resume
+        clears all of them. ``estop_id`` names the first.
         """
 
-        def stopped(console: Mesh) -> Envelope:
-            return {**_stop_all(console, console.emergency_stop), "estop_id": console.lockout_epoch}
+        def stopped(mesh: Mesh) -> Envelope:
+            return {**_stop_all(mesh, mesh.emergency_stop), "estop_id": mesh.lockout_epoch}
 
-        return _with_console(stopped, stopped=None)
+        return _on_mesh(stopped, stopped=None)
+
+    def _request(self, target: str, **command: Any) -> Envelope:
+        def requested(mesh: Mesh) -> Envelope:
+            reply = _reply(mesh, target, command, ANSWER_S)
+            if reply.get("status") == "timeout":
+                return error(f"{target} did not answer.")
+            if reply.get("type") != "response":
+                return error(f"{target}: {reply.get('error', 'refused')}")
+            result = reply.get("result")
+            return result if isinstance(result, dict) else error(f"{target} answered with an unknown result shape.")
+
+        return _on_mesh(requested)
 
 
-def _stop_all(console: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
-    """Send a stop now, and again, at most once in :data:`AGAIN_S`, while somebody in reach has not confirmed it."""
+def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
+    """Send a stop now, and at most every :data:`AGAIN_S` while a peer in reach has not confirmed it."""
     seen: set[str] = set()
     answers: dict[str, Envelope] = {}
-    asked = time.monotonic()
+    sent = time.monotonic()
 
-    def ask() -> None:
-        nonlocal asked
-        asked = time.monotonic()
+    def send() -> None:
+        nonlocal sent
+        sent = time.monotonic()
         for reply in stop():
             name = reply["responder_id"]
-            if name != console.peer_id:
+            if name != mesh.peer_id:
                 answers[name] = _stop_answer(name, reply)
 
     def unconfirmed() -> bool:
-        seen.update(_in_reach(console))
+        seen.update(_in_reach(mesh))
         return any(not answers.get(name, {}).get("stopped") for name in seen)
 
-    ask()
-    _hear(console, lambda: ask() if unconfirmed() and time.monotonic() - asked >= AGAIN_S else None)
+    send()
+    _discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
     if unconfirmed():
-        ask()
+        send()
     silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in seen}
-    return verdict_of(silent | answers)
+    return combined_verdict(silent | answers)
 
 
 def _stop_answer(target: str, reply: dict[str, Any]) -> Envelope:
@@ -151,30 +208,21 @@ def _stop_answer(target: str, reply: dict[str, Any]) -> Envelope:
     return error(explain(result) if result is not None else str(reply.get("error", "")), stopped=False)
 
 
-def _answer_of(target: str, reply: dict[str, Any]) -> Envelope:
-    if reply.get("status") == "timeout":
-        return error(f"{target} did not answer.")
-    if reply.get("type") != "response":
-        return error(f"{target}: {reply.get('error', 'refused')}")
-    result = reply.get("result")
-    return result if isinstance(result, dict) else error(f"{target} answered nothing known.")
+def _in_reach(mesh: Mesh) -> list[str]:
+    return [row["peer_id"] for row in mesh.peers if row["reachable"]]
 
 
-def _in_reach(console: Mesh) -> list[str]:
-    return [row["peer_id"] for row in console.peers if row["reachable"]]
+def _discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None:
+    """Wait until the peers in reach are known, calling ``meanwhile`` repeatedly.
 
-
-def _hear(console: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None:
-    """Return when it is known who is there; ``meanwhile`` is called again and again.
-
-    Who connects here, or to what this process connects to and found nobody at, may pause between two tries.
+    A link to a stated endpoint that failed is retried with back-off, so such a peer may be silent for up to 8 s.
     """
     from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, LINK_DISCOVERY_S  # noqa: PLC0415 - loaded when it is used
 
     began, found = time.monotonic(), math.inf
     listens, connects = settings.items("ZENOH_LISTEN"), settings.items("ZENOH_CONNECT")
     while (now := time.monotonic()) < began + LINK_DISCOVERY_S:
-        if _in_reach(console):
+        if _in_reach(mesh):
             found = min(found, now)
         known = now >= found + DISCOVERY_S if connects else now >= began + DISCOVERY_S
         if known and not listens:
@@ -183,77 +231,71 @@ def _hear(console: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None
         time.sleep(LOOK_S)
 
 
-def _asked(console: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
-    """What ``target`` replies, asked when it is in reach or when it is known who is."""
+def _reply(mesh: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """Send a command once ``target`` is in reach, or once it is known that it is not; return its reply."""
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when it is used
     from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
 
     time.sleep(DISCOVERY_S)
-    wait_for_peer(console, target, discovery_timeout(DISCOVERY_S) - DISCOVERY_S)
-    return console.send(target, command, seconds)
+    wait_for_peer(mesh, target, discovery_timeout(DISCOVERY_S) - DISCOVERY_S)
+    return mesh.send(target, command, seconds)
 
 
-def _with_console(work: Callable[[Mesh], Envelope], **fields: Any) -> Envelope:
-    from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
-    from strands_robots.mesh.wire_identity import visitor_id  # noqa: PLC0415
+def _on_mesh(work: Callable[[Mesh], Envelope], **fields: Any) -> Envelope:
+    """Return what ``work`` answers on a connection of its own, or an error envelope."""
+    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.mesh.wire_identity import visitor_id  # noqa: PLC0415 - as above
 
     try:
-        console = init_mesh(None, visitor_id(SOURCE), "tool")
-    except (TransportError, ValueError) as exc:
+        with joined_mesh(None, visitor_id(SOURCE), "tool") as mesh:
+            return work(mesh)
+    except (MeshUnavailableError, TransportError, ValueError) as exc:
         return error(str(exc), **fields)
-    if console is None or not console.alive:
-        return error("The native mesh is off or has no session; see the log.", **fields)
-    try:
-        return work(console)
-    finally:
-        console.close()
 
 
 class DeviceConnect:
     """Robots on Device Connect. A robot that does not answer is an error, never an empty success."""
 
     def peers(self) -> Envelope:
-        """Every device that answers, with its type, state and functions."""
+        """List every device that answers, with its type, state and functions."""
 
         def listed(fleet: FleetClient) -> Envelope:
-            found = fleet.peers()
-            rows = [
-                {
-                    "id": peer.id,
-                    "type": peer.type,
-                    "status": peer.status.get("availability", ""),
-                    "functions": [str(each.get("name", "")) for each in peer.functions],
-                }
-                for peer in found
-            ]
-            if not rows:
-                return error("No robot answered.", peers=[])
-            return success(f"{len(rows)} robots: {', '.join(peer.id for peer in found)}.", peers=rows)
+            return _peer_list(
+                [
+                    {
+                        "id": peer.id,
+                        "type": peer.type,
+                        "status": peer.status.get("availability", ""),
+                        "functions": [str(each.get("name", "")) for each in peer.functions],
+                    }
+                    for peer in fleet.peers()
+                ]
+            )
 
-        return _with_fleet(listed)
+        return _on_fleet(listed)
 
     def tell(self, target: str, instruction: str, policy_provider: str, duration: float) -> Envelope:
-        """The device's ``execute``."""
+        """Call the device's ``execute``."""
         params = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
-        return _with_fleet(lambda fleet: fleet.call(target, "execute", params, ANSWER_S))
+        return _on_fleet(lambda fleet: fleet.call(target, "execute", params, ANSWER_S))
 
     def status(self, target: str) -> Envelope:
-        """The device's ``getStatus``."""
-        return _with_fleet(lambda fleet: fleet.call(target, "getStatus", {}, ANSWER_S))
+        """Call the device's ``getStatus``."""
+        return _on_fleet(lambda fleet: fleet.call(target, "getStatus", {}, ANSWER_S))
 
     def stop(self, target: str) -> Envelope:
-        """The device's ``stop``, or that of every device at once; answers by name."""
+        """Stop one device, or every device at once; answers by name."""
 
         def stopped(fleet: FleetClient) -> Envelope:
-            answers = {target: fleet.stop(target, STOP_S)} if target else fleet.stop_all(STOP_S)
-            return verdict_of(answers)
+            return combined_verdict({target: fleet.stop(target, STOP_S)} if target else fleet.stop_all(STOP_S))
 
-        return _with_fleet(stopped, stopped=None)
+        return _on_fleet(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
-        """An emergency stop on a connection of its own; who can be seen and gave no answer to it is asked to stop
-        besides. Answers by name."""
+        """Send an emergency stop on a connection of its own; answers by name.
+
+        A device that is in reach and did not answer it gets a plain ``stop`` as well.
+        """
         from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415
 
         def stopped(fleet: FleetClient) -> Envelope:
@@ -264,72 +306,44 @@ class DeviceConnect:
                     report = controller.stop((), reason, deadline_s=ESTOP_S)
                 finally:
                     controller.close()
-            answered = {*report.stopped, *report.not_stopped, *report.refused}
-            rest = [peer.id for peer in seen.result() if peer.id not in answered and _can_stop(peer)]
+            failed = {**report.not_stopped, **report.refused}
+            rest = [
+                peer.id
+                for peer in seen.result()
+                if peer.stop_verb and peer.id not in failed and peer.id not in report.stopped
+            ]
             if not rest:
                 return envelope(report)
             answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
-            for name, answer in {**report.not_stopped, **report.refused}.items():
-                answers[name] = error(answer.why, stopped=False)
-            asked = {name: fleet.stop(name, STOP_S) for name in rest}
-            return {**verdict_of(answers | asked), "not_locked": rest}
+            answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
+            answers |= {name: fleet.stop(name, STOP_S) for name in rest}
+            return {**combined_verdict(answers), "not_locked": rest}
 
-        return _with_fleet(stopped, stopped=None)
-
-
-def _can_stop(peer: Peer) -> bool:
-    return any(each.get("name") in ("stop", "stopMotion") for each in peer.functions)
+        return _on_fleet(stopped, stopped=None)
 
 
-def verdict_of(answers: Mapping[str, Envelope]) -> Envelope:
-    """One answer for the stop of several robots: success only when every one of them confirmed it."""
-    if not answers:
-        return error("No robot that can be stopped answered.", stopped=None, robots={})
-    outcomes = {name: grade(answer) for name, answer in answers.items()}
-    # The client says "stopped: null" of a robot that did not answer.
-    silent = [name for name, answer in answers.items() if answer.get("stopped", False) is None]
-    moving = [name for name, outcome in outcomes.items() if outcome.stopped is False and name not in silent]
-    unknown = [name for name, outcome in outcomes.items() if outcome.stopped is None and name not in silent]
-    fields: dict[str, Any] = {
-        "stopped": not moving if not (silent or unknown) or moving else None,
-        "not_stopped": moving,
-        "silent": silent + unknown,
-        "robots": {name: text_of(answer) or explain(answer) for name, answer in answers.items()},
-    }
-    if fields["stopped"]:
-        return success(f"Stopped: {', '.join(answers)}.", **fields)
-    said = [f"DID NOT STOP: {', '.join(moving)}"] if moving else []
-    said += [f"silent, so nobody knows: {', '.join(silent + unknown)}"] if silent or unknown else []
-    return error("; ".join(said) + ".", **fields)
+def _peer_list(rows: list[dict[str, Any]]) -> Envelope:
+    if not rows:
+        return error("No robot answered.", peers=[])
+    return success(f"{len(rows)} robots: {', '.join(row['id'] for row in rows)}.", peers=rows)
 
 
-def _with_fleet(work: Callable[[FleetClient], Envelope], **fields: Any) -> Envelope:
-    """``work`` on a connection of its own; whatever stands in its way becomes an error envelope."""
+def _on_fleet(work: Callable[[FleetClient], Envelope], **fields: Any) -> Envelope:
+    """Return what ``work`` answers on a connection of its own, or an error envelope."""
+    from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - the network is loaded when it is used
+
+    from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.links import insecure_opt_in, usual_link  # noqa: PLC0415
+
     try:
-        with _reached() as fleet:
+        link = usual_link()
+        if not link.loopback_only:
+            insecure_opt_in(None, link, stated=True)
+        with FleetClient(link, SOURCE) as fleet:
             return work(fleet)
     except (MissingExtraError, ValidationError) as exc:
         return error(str(exc), **fields)
     except (LookupError, TimeoutError, RuntimeError) as exc:
         return error(str(exc.args[0]) if exc.args else type(exc).__name__, **fields)
-    except _messaging_error() as exc:
+    except MessagingError as exc:
         return error(f"The network does not carry this: {exc}", **fields)
-
-
-@contextmanager
-def _reached() -> Iterator[FleetClient]:
-    from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.device_connect.links import insecure_opt_in, usual_link  # noqa: PLC0415
-
-    link = usual_link()
-    if not link.loopback_only:
-        insecure_opt_in(None, link, stated=True)
-    with FleetClient(link, SOURCE) as fleet:
-        yield fleet
-
-
-def _messaging_error() -> type[Exception]:
-    from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - as above
-
-    error_type: type[Exception] = MessagingError
-    return error_type

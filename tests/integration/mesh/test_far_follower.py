@@ -83,7 +83,7 @@ def test_an_emergency_stop_ends_the_replay_and_nothing_follows(join: Join, repla
     count = len(arm.ask("actions"))
     code, lines = ended(replaying)
     assert code == 1
-    assert "follows no more: it was halted or locked" in lines[-1]["reason"]
+    assert "stopped following: it was halted or locked" in lines[-1]["reason"]
     assert lines[0]["stopped"] is True
     assert len(arm.ask("actions")) == count
 

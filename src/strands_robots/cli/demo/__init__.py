@@ -1,4 +1,4 @@
-"""``demo``: two processes on loopback, an arm that an agent finds, drives and stops, and that a stop holds."""
+"""``demo``: two processes on loopback, an arm that an agent finds, drives and stops, and that a stop locks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from strands_robots.cli.command import command
-from strands_robots.cli.output import Failure, Screen
+from strands_robots.cli.output import CliError, Screen
 
 if TYPE_CHECKING:
-    from strands_robots.cli.demo.show import Show
-    from strands_robots.cli.demo.story import Report
+    from strands_robots.cli.demo.output import DemoScreen
+    from strands_robots.cli.demo.steps import DemoReport
 
 ROBOT, PEER = "so100", "demo-arm"
 
@@ -32,27 +32,27 @@ def demo(
     screen: Screen,
     *,
     output: Annotated[Path, typer.Option("--output", help="Folder for the pictures.")] = Path("demo-output"),
-    record: Annotated[Path | None, typer.Option("--record", help="Write what was shown as SVG.")] = None,
+    record: Annotated[Path | None, typer.Option("--record", help="Write the terminal output as SVG.")] = None,
 ) -> None:
     """A simulated arm, found, driven and stopped by an agent in another process, then locked by an emergency stop
     until an operator's key frees it; nothing leaves this machine.
 
     Exits with 1 when any step did not happen.
     """
-    from strands_robots.cli.demo.show import Show  # noqa: PLC0415 - what the demo draws with is loaded by it alone
-    from strands_robots.cli.demo.story import Report  # noqa: PLC0415
+    from strands_robots.cli.demo.output import DemoScreen  # noqa: PLC0415 - the demo's modules are loaded by it alone
+    from strands_robots.cli.demo.steps import DemoReport  # noqa: PLC0415 - as above
 
-    show, report = Show(screen, record is not None), Report()
+    shown, report = DemoScreen(screen, record is not None), DemoReport()
     started = time.monotonic()
     try:
-        with _ended_in_order():
-            _tell(show, report, output)
+        with _interrupted_by_sigterm():
+            _run(shown, report, output)
             seconds = time.monotonic() - started
-            show.say("")
-            show.say(f"Every step happened, in {seconds:.1f} s.", "green")
+            shown.say("")
+            shown.say(f"Every step happened, in {seconds:.1f} s.", "green")
             if record is not None:
-                show.save(record)
-    except Failure as failure:
+                shown.save(record)
+    except CliError as failure:
         failure.fields.update(_facts(report))
         raise
     screen.data({"status": "success", "seconds": round(seconds, 2), **_facts(report)})
@@ -60,43 +60,40 @@ def demo(
         screen.say(f"Recorded in {record}.")
 
 
-def _tell(show: Show, report: Report, output: Path) -> None:
-    from strands_robots.cli.demo.agent import TENANT, connected  # noqa: PLC0415 - as above
-    from strands_robots.cli.demo.child import serving  # noqa: PLC0415
-    from strands_robots.cli.demo.ending import CONTROLLER, Ending, operator  # noqa: PLC0415
-    from strands_robots.cli.demo.story import Story  # noqa: PLC0415
+def _run(screen: DemoScreen, report: DemoReport, output: Path) -> None:
+    from strands_robots.cli.demo.output import draw_path  # noqa: PLC0415 - as above
+    from strands_robots.cli.demo.processes import TENANT, connected_agent, served_robot  # noqa: PLC0415
+    from strands_robots.cli.demo.steps import CONTROLLER, DriveSteps, SafetySteps, demo_operator  # noqa: PLC0415
     from strands_robots.device_connect.backends import loopback_config  # noqa: PLC0415
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415
 
-    port = free_port()
-    show.head(f"Another process serves a simulated {ROBOT}; this one is the agent")
+    port = _free_port()
+    screen.head(f"Another process serves a simulated {ROBOT}; this one is the agent")
     with ExitStack() as stack:
-        key = stack.enter_context(operator())
+        key = stack.enter_context(demo_operator())
         with report.step("serve"):
-            child = stack.enter_context(serving(ROBOT, PEER, port, TENANT))
-        show.done(f"{PEER} is on the network at 127.0.0.1:{port}, in process {child.process.pid}")
+            robot = stack.enter_context(served_robot(ROBOT, PEER, port, TENANT))
+        screen.done(f"{PEER} is on the network at 127.0.0.1:{port}, in process {robot.process.pid}")
         controller = stack.enter_context(closing(safety_controller(CONTROLLER, loopback_config(port, TENANT))))
-        with connected(port) as agent:
-            story = Story(show, agent, child, PEER, report)
-            ending = Ending(show, agent, story, peer_id=PEER, controller=controller, key=key)
-            for step in (story.discover, story.drive, story.stop, *ending.steps):
+        with connected_agent(port) as agent:
+            drive = DriveSteps(screen, agent, robot, PEER, report)
+            safety = SafetySteps(screen, agent, drive, peer_id=PEER, controller=controller, key=key)
+            for step in (drive.discover, drive.drive, drive.stop, *safety.steps):
                 step()
-        show.head("The robot leaves")
+        screen.head("The robot leaves")
         with report.step("leave"):
-            child.leave()
-        show.done("its process stopped it, left the network and ended")
-    show.head("What the agent saw")
+            robot.leave()
+        screen.done("its process stopped it, left the network and ended")
+    screen.head("What the agent saw")
     with report.step("pictures") as row:
-        from strands_robots.cli.demo.pictures import draw  # noqa: PLC0415 - MuJoCo is loaded after the live part
-
-        files, row["how"] = draw(ROBOT, report.path, output)
+        files, row["how"] = draw_path(ROBOT, report.path, output)
         report.files = [str(file) for file in files]
     how = "rendered with OpenGL" if row["how"] == "opengl" else "projected without OpenGL"
-    show.done(f"the arm's path and an animation, {how}: {', '.join(report.files)}")
+    screen.done(f"the arm's path and an animation, {how}: {', '.join(report.files)}")
 
 
-def free_port() -> int:
-    """A TCP port of 127.0.0.1 that nobody has at this moment."""
+def _free_port() -> int:
+    """Return a TCP port of 127.0.0.1 that is free at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -104,8 +101,8 @@ def free_port() -> int:
 
 
 @contextmanager
-def _ended_in_order() -> Iterator[None]:
-    """SIGTERM unwinds like Ctrl-C, so that the robot's process is ended."""
+def _interrupted_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM unwind like Ctrl-C, so that the robot's process ends too."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -117,5 +114,5 @@ def _ended_in_order() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _facts(report: Report) -> dict[str, object]:
+def _facts(report: DemoReport) -> dict[str, object]:
     return {"steps": report.steps, "stop_ms": report.stop_ms, "files": report.files}

@@ -1,4 +1,4 @@
-"""A follower of this machine that is led from elsewhere does not jump to where its leader is."""
+"""A follower of this machine with a leader on the mesh."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 from fixtures.devices import RecordingDevice
 
-from strands_robots.cli.far import found
-from strands_robots.cli.published import Glide
+from strands_robots.cli.teleop_mesh import LimitedFollower, peer_in_reach
 from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
@@ -16,7 +15,7 @@ from strands_robots.utils import ValidationError
 
 
 @pytest.mark.parametrize("stated", ["ZENOH_LISTEN", "ZENOH_CONNECT"])
-def test_a_peer_is_waited_for_as_long_as_its_link_may_pause(monkeypatch: pytest.MonkeyPatch, stated: str) -> None:
+def test_peer_is_awaited_longer_than_its_link_may_pause(monkeypatch: pytest.MonkeyPatch, stated: str) -> None:
     waited: list[float] = []
 
     def wait(mesh: object, peer: str, timeout: float) -> bool:
@@ -24,26 +23,26 @@ def test_a_peer_is_waited_for_as_long_as_its_link_may_pause(monkeypatch: pytest.
         return True
 
     monkeypatch.setattr("strands_robots.mesh.core.wait_for_peer", wait)
-    console: Any = None
-    assert found(console, "arm-1")
+    mesh: Any = None
+    assert peer_in_reach(mesh, "arm-1")
     monkeypatch.setenv(stated, "tcp/127.0.0.1:7447")
-    assert found(console, "arm-1")
+    assert peer_in_reach(mesh, "arm-1")
     retry = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]
     assert waited[0] < retry["period_max_ms"] / 1000 < waited[1]
 
 
-def test_the_first_frames_glide_and_a_pause_is_not_saved_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_frames_and_a_pause_do_not_make_the_follower_jump(monkeypatch: pytest.MonkeyPatch) -> None:
     device = RecordingDevice()
     robot = HardwareRobot(device, "arm")
     robot.connect()
     clock = iter([0.0, 0.02, 0.04, 60.0])
-    glide = Glide(robot.body(), 1.0, now=lambda: next(clock))
+    follow = LimitedFollower(robot.body(), 1.0, now=lambda: next(clock))
     applied: list[float] = []
     monkeypatch.setattr(robot, "send_action", lambda action: applied.append(action["pan.pos"]))
     for _ in range(3):
-        glide(robot, {"pan.pos": 90.0})
+        follow(robot, {"pan.pos": 90.0})
     # From 10, at one range of 200 a second: 4 in each 20 ms, and 8 after a minute's pause.
     assert applied == pytest.approx([14.0, 18.0, 26.0])
     with pytest.raises(ValidationError, match="elbow"):
-        glide(robot, {"elbow": 1.0})
+        follow(robot, {"elbow": 1.0})
     robot.cleanup()

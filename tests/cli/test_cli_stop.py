@@ -1,25 +1,18 @@
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any
 
 import pytest
-from click.testing import Result
-from rich.console import Console
+from tests.cli.conftest import FakeFleet, Run
 
-from strands_robots.cli import console, estop
-from strands_robots.cli.button import Button
-from strands_robots.cli.console import Board
-from strands_robots.cli.holds import Standing
 from strands_robots.cli.output import Exit
+from strands_robots.cli.stop import exit_code, progress_rows, report_rows
 from strands_robots.device_connect import safety_controller
-from strands_robots.device_connect.backends import loopback_config
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.controller import Answer, Progress, StopReport
-from strands_robots.safety.lockout import Hold
-
-Run = Callable[..., Result]
+from strands_robots.tools.networks import stop_outcome
 
 
 def answer(name: str, stopped: bool | None = True, ms: float = 3.0, why: str = "") -> Answer:
@@ -57,14 +50,14 @@ class FakeController:
     [
         (report(answer("a")), 0, "stopped"),
         (report(answer("a"), answer("b", False, why="bus: no answer in 1 s")), 1, "DID NOT STOP"),
-        (report(answer("a"), answer("b", None, why="b: nobody can tell")), 1, "NOBODY KNOWS"),
+        (report(answer("a"), answer("b", None, why="b: nobody can tell")), 1, "UNKNOWN"),
         (report(answer("a", None, why="a: this stop was resumed before it came again")), 1, "resumed before"),
         (report(answer("a"), silent=("b",)), 3, "NO ANSWER"),
         (report(), 3, "0 stopped"),
         (report(link=False, silent=("b",)), 3, "NO ANSWER"),
     ],
 )
-def test_each_robot_is_named_and_the_worst_answer_is_the_exit_code(
+def test_estop_names_each_robot_and_exits_with_the_worst(
     run: Run, monkeypatch: pytest.MonkeyPatch, ends: StopReport, code: int, shown: str
 ) -> None:
     fake = FakeController(ends)
@@ -79,43 +72,53 @@ def test_each_robot_is_named_and_the_worst_answer_is_the_exit_code(
 
 
 @pytest.mark.parametrize("words", [("a", "--all"), ("a.b",), ("--deadline", "0"), ("--as", ""), ("--key", "nowhere")])
-def test_wrong_words_are_exit_2(run: Run, words: tuple[str, ...]) -> None:
+def test_estop_with_wrong_arguments_is_exit_2(run: Run, words: tuple[str, ...]) -> None:
     assert run("estop", *words).exit_code == 2
 
 
 def test_slow_and_silent_robots_are_red() -> None:
     progress = Progress("e" * 32, {"quick": answer("quick"), "slow": answer("slow", ms=170.0)}, ("mute",), True, 200.0)
-    styles = {row[0]: str(row[1].style) for row in estop.running_rows(progress)}
+    styles = {row[0]: str(row[1].style) for row in progress_rows(progress)}
     assert styles == {"quick": "green", "slow": "bold red", "mute": "bold red"}
-    assert estop.rows(report(answer("a"), silent=("b",)))[0][0] == "b"
+    assert report_rows(report(answer("a"), silent=("b",)))[0][0] == "b"
 
 
-def drawn(board: Board, bar: Button) -> str:
-    out = Console(file=io.StringIO(), width=160, height=40)
-    out.print(board.draw(bar, ["ERROR something"]))
-    shown: str = out.file.getvalue()  # type: ignore[attr-defined]  # it is a StringIO
-    return shown
+def test_exit_code_is_that_of_the_worst_answer() -> None:
+    assert exit_code(report(answer("a", False), silent=("b",))) is Exit.REFUSED
+    assert exit_code(report(answer("a"))) is Exit.OK
 
 
-def test_the_board_shows_lockouts_check_ins_and_who_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake: Any = FakeController(report())
-    board, bar = Board(fake, loopback_config(), 0.5), Button(fake, lambda: (), "")
-    hold = Hold("e" * 32, "desk-1", "a hand", 0.0)
-    checked = {"check_in": {"required": True, "timeout_s": 2.0, "time_left_s": 1.25}}
-    board.learn([Standing("arm-1", (hold,)), Standing("arm-2", facts=checked), Standing("arm-9", problem="no answer")])
-    shown = drawn(board, bar)
-    assert "LOCKED" in shown and "desk-1 a hand" in shown
-    assert "1.2 s left" in shown
-    assert "arm-9" not in shown
-    assert "SPACE stops everything" in shown and "ERROR something" in shown
-    monkeypatch.setattr(console, "GONE_S", 0.0)
-    board.learn([Standing("arm-1", problem="no answer")])
-    assert "GONE" in drawn(board, bar)
-    assert set(board.expected()) == {"arm-1", "arm-2"}
-    board.forget()
-    assert board.expected() == ()
+def test_stop_prints_each_verdict_and_exits_with_the_worst(run: Run, fleet: FakeFleet) -> None:
+    fleet.stops = {"a": success("Stopped.", stopped=True)}
+    assert run("stop", "a").exit_code == 0
+    fleet.stops["b"] = error("no answer in 5 s", stopped=None)
+    result = run("stop", "--all")
+    assert result.exit_code == 3
+    assert "silent" in result.stdout
+    assert "b" in result.stderr
+    fleet.stops["c"] = error("the bus is wedged", stopped=False)
+    result = run("stop", "--all", "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["devices"]["c"] == {"stopped": False, "said": "the bus is wedged"}
+    assert "DID NOT STOP" in run("stop", "--all").stdout
 
 
-def test_the_exit_code_of_a_stop_names_its_worst() -> None:
-    assert estop.verdict(report(answer("a", False), silent=("b",))) is Exit.REFUSED
-    assert estop.verdict(report(answer("a"))) is Exit.OK
+@pytest.mark.parametrize("words", [("stop",), ("stop", "a", "--all")])
+def test_stop_takes_a_device_or_all(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
+    assert run(*words).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("answer", "stopped"),
+    [
+        (success("ok", stopped=True), True),
+        (success("ok", stopped=["so100"], not_stopped=[]), True),
+        (success("ok", stopped=False), False),
+        (error("no"), False),
+        (error("no", stopped=None), None),
+        ({"result": 3}, None),
+        (success("ok", not_stopped=["teleop"]), False),
+    ],
+)
+def test_only_an_affirmative_answer_is_a_stop(answer: Envelope, stopped: bool | None) -> None:
+    assert stop_outcome(answer)[0] is stopped

@@ -1,0 +1,291 @@
+"""``stop``: stop one robot, or all. ``estop``: stop and lock every robot, with each robot's answer by name."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from strands_robots.cli.command import MESH_OPTION, WAIT_OPTION, command
+from strands_robots.cli.keys import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.network import SOURCE, Network, describe
+from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
+from strands_robots.envelope import Envelope, text_of
+from strands_robots.safety.controller import DEADLINE_S, Answer, Progress, SafetyController, StopReport
+from strands_robots.safety.orders import new_epoch
+from strands_robots.tools.networks import NativeMesh, stop_outcome
+from strands_robots.utils import device_id, number
+
+if TYPE_CHECKING:
+    from strands_robots.device_connect.backends import LinkConfig
+
+SLOW_MS = 100.0
+"""An answer that took longer is shown in red."""
+
+LOCKED = "They are locked until they are resumed: strands-robots resume."
+LINK_WAIT_S = 2.0
+
+
+def register(app: typer.Typer) -> None:
+    """Add both commands to the application."""
+    command(app, "stop", network=True)(stop)
+    command(app, "estop", network=True)(estop)
+
+
+def stop(
+    screen: Screen,
+    network: Network,
+    *,
+    device: Annotated[str | None, typer.Argument(help="The device's id.")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Stop every device that answers.")] = False,
+    timeout: Annotated[float, WAIT_OPTION] = 5.0,
+    on_mesh: Annotated[bool, MESH_OPTION] = False,
+) -> None:
+    """Stop one robot, or all. Exits with 1 when one did not stop, with 3 when one is silent."""
+    if (device is None) != everything:
+        raise CliError("stop takes a DEVICE or --all.", Exit.USAGE)
+    if on_mesh:
+        network.use_mesh()
+        _report_mesh_stop(screen, NativeMesh().stop(device or ""))
+        return
+    seconds = number("--timeout", timeout, above=0, high=60)
+    with network.fleet() as fleet:
+        answers = fleet.stop_all(seconds) if device is None else {device: fleet.stop(device, seconds)}
+    if not answers:
+        raise CliError(f"No robot that can be stopped answered. {describe(fleet.link)}", Exit.SILENT, devices={})
+    outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
+    marks = {True: label("stopped", "green"), False: label("DID NOT STOP", "bold red"), None: label("silent", "yellow")}
+    rows = ((name, marks[stopped], said) for name, (stopped, said) in outcomes.items())
+    screen.show(table("", ("device", "stopped", "what it said"), rows))
+    devices = {name: {"stopped": stopped, "said": said} for name, (stopped, said) in outcomes.items()}
+    moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
+    silent = [name for name, (stopped, _) in outcomes.items() if stopped is None]
+    if moving:
+        raise CliError(f"DID NOT STOP: {', '.join(moving)}.", Exit.REFUSED, devices=devices)
+    if silent:
+        raise CliError(f"It is unknown whether these stopped: {', '.join(silent)}.", Exit.SILENT, devices=devices)
+    screen.data({"status": "success", "devices": devices})
+
+
+def estop(
+    screen: Screen,
+    network: Network,
+    *,
+    devices: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="DEVICE...", help="Those that must answer. Every robot of the tenant stops."),
+    ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Every robot that can be found must answer; the default.")
+    ] = False,
+    reason: Annotated[str, typer.Option("--reason", help="Sent to the robots and written to their audit.")] = "",
+    source: Annotated[str, typer.Option("--as", help="The source that robots see.")] = SOURCE,
+    deadline: Annotated[
+        float, typer.Option("--deadline", help="Seconds until a robot without an answer counts as silent.")
+    ] = DEADLINE_S,
+    key: Annotated[Path | None, typer.Option("--key", help="Sign it, where robots ask for signed stops.")] = None,
+    passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
+    on_mesh: Annotated[bool, MESH_OPTION] = False,
+) -> None:
+    """Stop every robot of the tenant and lock it. Exits with 1 when one did not stop, with 3 when one is silent."""
+    if devices and everything:
+        raise CliError("estop takes DEVICE... or --all.", Exit.USAGE)
+    if on_mesh:
+        if devices or key is not None:
+            raise CliError("estop --mesh stops every robot, and takes neither DEVICE nor --key.", Exit.USAGE)
+        network.use_mesh()
+        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason), f" {LOCKED}")
+        return
+    expected = [device_id("DEVICE", each) for each in devices or []]
+    seconds = number("--deadline", deadline, above=0, high=600)
+    source = device_id("--as", source)
+    link = network.link()
+    signer = None if key is None else signing_key(key, passphrase_file)
+    from strands_robots.device_connect.safety_controller import (  # noqa: PLC0415 - the network is loaded when it is used
+        envelope,
+        safety_controller,
+    )
+
+    controller = safety_controller(source, link, signing_key=signer)
+    try:
+        running = RunningStop(controller, expected, reason, seconds, link)
+        if screen.live:
+            report = _watch(screen, running)
+        else:
+            report = running.wait()
+            screen.show(_table(report_rows(report)))
+    finally:
+        controller.close()
+    answer = envelope(report)
+    facts = _facts(answer)
+    screen.say(summary(report), "green" if report.ok else "bold red")
+    code = exit_code(report)
+    if code is not Exit.OK:
+        where = "" if report.link else f" {describe(link)}"
+        raise CliError(plain(f"{answer['reason']}{where}", 2000), code, **facts)
+    screen.data({"status": "success", **facts})
+    screen.say(LOCKED)
+
+
+class RunningStop:
+    """An emergency stop on a thread of its own, which never waits for drawing.
+
+    Without ``expected``, every robot that can be found and stopped must answer; they are looked up once the stop has
+    left.
+    """
+
+    def __init__(
+        self, controller: SafetyController, expected: list[str], reason: str, deadline_s: float, link: LinkConfig
+    ) -> None:
+        self.latest: Progress | None = None
+        self.report: StopReport | None = None
+        self._controller, self._expected, self._reason = controller, expected, reason
+        self._deadline_s, self._link = deadline_s, link
+        self._id = new_epoch()
+        self._lookup: threading.Thread | None = None
+        self._failed: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="estop", daemon=True)
+        self._thread.start()
+
+    def finished(self, within_s: float) -> bool:
+        """Return whether the stop has ended, after at most ``within_s`` seconds."""
+        self._thread.join(within_s)
+        return not self._thread.is_alive()
+
+    def wait(self) -> StopReport:
+        """Return the report once the stop has ended."""
+        while not self.finished(1.0):
+            continue
+        if self.report is None:
+            raise self._failed or RuntimeError("The stop ended without a report.")
+        return self.report
+
+    def _run(self) -> None:
+        try:
+            # Nothing can leave before the link is up; then the milliseconds are the robots' and not the handshake's.
+            self._controller.wait_link(LINK_WAIT_S)
+            self.report = self._controller.stop(
+                self._expected,
+                self._reason,
+                deadline_s=self._deadline_s,
+                estop_id=self._id,
+                on_progress=self._progress,
+            )
+        except BaseException as exc:  # noqa: BLE001 - raised again by wait()
+            self._failed = exc
+
+    def _progress(self, progress: Progress) -> None:
+        self.latest = progress
+        if not self._expected and self._lookup is None:
+            self._lookup = threading.Thread(target=self._expect_all, name="estop lookup", daemon=True)
+            self._lookup.start()
+
+    def _expect_all(self) -> None:
+        from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - the network is loaded when it is used
+
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415
+
+        try:
+            with FleetClient(self._link) as fleet:
+                found = [peer.id for peer in fleet.peers(min(2.0, self._deadline_s)) if peer.stop_verb]
+        except (MessagingError, TimeoutError):
+            # The report still names every robot that answers before the deadline.
+            return
+        answered = self.latest.answered if self.latest else {}
+        self._controller.expect(self._id, {*found, *answered})
+
+
+def exit_code(report: StopReport) -> Exit:
+    """Return 0 when all stopped, 1 when one did not or refused, 3 when one or all are silent."""
+    if report.not_stopped or report.refused:
+        return Exit.REFUSED
+    return Exit.OK if report.ok else Exit.SILENT
+
+
+def summary(report: StopReport) -> str:
+    """Return the result in one line of counts."""
+    parts = [f"{len(report.stopped)} stopped"]
+    for robots, outcome in (
+        (report.not_stopped, "DID NOT STOP"),
+        (report.refused, "did not act on it"),
+        (report.silent, "silent"),
+    ):
+        parts += [f"{len(robots)} {outcome}"] if robots else []
+    return f"{', '.join(parts)}, in {report.elapsed_ms:.0f} ms. Emergency stop {report.estop_id}."
+
+
+def report_rows(report: StopReport) -> list[tuple[Any, ...]]:
+    """Return one row for each robot of a finished stop, the worst first."""
+    worst = [_row(name, each) for name, each in sorted({**report.not_stopped, **report.refused}.items())]
+    worst += [_silent_row(name, "NO ANSWER") for name in report.silent]
+    slowest = sorted(report.stopped.items(), key=lambda each: -each[1].latency_ms)
+    return [*worst, *(_row(*each) for each in slowest)]
+
+
+def progress_rows(progress: Progress) -> list[tuple[Any, ...]]:
+    """Return one row for each robot of a stop in progress."""
+    answered = [_row(*each) for each in sorted(progress.answered.items())]
+    return [*(_silent_row(name, "unconfirmed") for name in progress.unconfirmed), *answered]
+
+
+def _table(rows: list[tuple[Any, ...]], title: str = "") -> Table:
+    return table(title, ("robot", "answer", "ms", "what it said"), rows)
+
+
+def _watch(screen: Screen, running: RunningStop) -> StopReport:
+    """Draw the answers as they come, and return the report."""
+    from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
+
+    # The table already names what the log would report.
+    with captured_log(), Live(_table([], "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
+        while not running.finished(POLL_S):
+            if running.latest is not None:
+                link = "" if running.latest.link_up else ": THE LINK IS DOWN"
+                live.update(_table(progress_rows(running.latest), f"EMERGENCY STOP{link}"), refresh=True)
+        report = running.wait()
+        live.update(_table(report_rows(report), "EMERGENCY STOP"), refresh=True)
+    return report
+
+
+def _row(name: str, answer: Answer) -> tuple[Any, ...]:
+    slow = "bold red" if answer.latency_ms > SLOW_MS else ""
+    mark = label("stopped", slow or "green") if answer.stopped else label("DID NOT STOP", "bold red")
+    if answer.stopped is None:
+        mark = label("UNKNOWN", "bold red")
+    return name, mark, label(f"{answer.latency_ms:.1f}", slow), answer.why or _halted(answer.facts)
+
+
+def _silent_row(name: str, mark: str) -> tuple[Any, ...]:
+    return name, label(mark, "bold red"), "", ""
+
+
+def _halted(facts: Mapping[str, Any]) -> str:
+    halted = facts.get("halted")
+    names = ", ".join(str(each) for each in halted) if isinstance(halted, list | tuple) else ""
+    return f"halted {names}" if names else "locked; nothing was moving"
+
+
+def _report_mesh_stop(screen: Screen, answer: Envelope, then: str = "") -> None:
+    """Print the answers to a stop on the mesh. Raises :class:`CliError` unless every robot confirmed it."""
+    moving, silent = answer.get("not_stopped", []), answer.get("silent", [])
+
+    def row(name: str, said: str) -> tuple[Any, ...]:
+        if name in moving:
+            return name, label("DID NOT STOP", "bold red"), said
+        return name, label("NO ANSWER", "bold red") if name in silent else label("stopped", "green"), said
+
+    rows = (row(*each) for each in answer.get("robots", {}).items())
+    screen.show(table("", ("robot", "answer", "what it said"), rows))
+    facts = _facts(answer)
+    if answer["status"] != "success":
+        raise CliError(plain(text_of(answer), 2000), Exit.REFUSED if moving else Exit.SILENT, **facts)
+    screen.data({"status": "success", **facts})
+    screen.say(f"{text_of(answer)}{then}", "green")
+
+
+def _facts(answer: Envelope) -> dict[str, Any]:
+    return {name: value for name, value in answer.items() if name not in ("status", "content", "reason")}

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+from tests.cli.conftest import FakeFleet, Run
+
+from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError, Peer
+from strands_robots.envelope import Envelope, error
+
+
+def arm(name: str = "arm-1") -> Peer:
+    execute = {
+        "name": "execute",
+        "description": "Start a policy.\nAnd more.",
+        "parameters": {"properties": {"instruction": {"type": "string"}}},
+    }
+    return Peer(name, "strands_sim", "so100", {"availability": "idle"}, (execute, {"name": "stop"}), ("stateUpdate",))
+
+
+def test_peers_are_listed_as_table_and_as_json(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [arm()]
+    assert "arm-1" in run("peers").stdout
+    assert json.loads(run("peers", "--json").stdout)["peers"][0]["id"] == "arm-1"
+    shown = run("peers", "arm-1").stdout
+    assert "instruction: string" in shown
+    assert "Start a policy." in shown
+    assert "And more" not in shown
+
+
+def test_peer_text_cannot_control_the_terminal(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [Peer("arm-1", "[bold]\x1b]0;owned\x07", "\u202emodel", {"availability": "[red]x"})]
+    shown = run("peers").stdout
+    assert "\x1b" not in shown and "\x07" not in shown and "\u202e" not in shown
+    assert "[bold]" in shown
+
+
+@pytest.mark.parametrize("words", [("peers",), ("peers", "arm-2"), ("stop", "--all")])
+def test_no_answer_is_exit_3(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
+    assert run(*words).exit_code == 3
+    assert json.loads(run(*words, "--json").stdout)["exit"] == 3
+
+
+def test_call_sends_typed_values(run: Run, fleet: FakeFleet) -> None:
+    result = run("call", "arm-1", "execute", "instruction=wave", "duration=2", "--timeout", "4")
+    assert result.exit_code == 0
+    assert fleet.called == [("arm-1", "execute", {"instruction": "wave", "duration": 2}, 4.0)]
+
+
+@pytest.mark.parametrize(
+    ("answer", "code"),
+    [
+        (error("not allowed"), 1),
+        (CallRefusedError("Unknown method: x", -32601), 1),
+        (NoSuchDeviceError("No device 'arm-1' in tenant 'default'."), 3),
+        (DeviceTimeoutError("arm-1 is announced and did not answer within 4 s."), 3),
+    ],
+)
+def test_failed_call_prints_the_reason_and_its_exit_code(
+    run: Run, fleet: FakeFleet, answer: Envelope | Exception, code: int
+) -> None:
+    fleet.answer = answer
+    result = run("call", "arm-1", "execute", "--json")
+    assert result.exit_code == code
+    said = json.loads(result.stdout)
+    assert said["status"] == "error"
+    assert said["reason"]
+    assert run("call", "arm-1", "execute").stdout == ""
+
+
+@pytest.mark.parametrize("words", [("a=1", "a=2"), ("nothing",), ("x=NaN",), ("--timeout", "0"), ("--timeout", "nan")])
+def test_malformed_call_is_exit_2_and_sends_nothing(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
+    assert run("call", "arm-1", "execute", *words).exit_code == 2
+    assert fleet.called == []

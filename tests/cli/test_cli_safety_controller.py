@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Collection
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+from rich.console import Console
+
+from strands_robots.cli import safety_controller
+from strands_robots.cli.resume import LockoutReport
+from strands_robots.cli.safety_controller import FleetScreen, StopButton
+from strands_robots.device_connect.backends import loopback_config
+from strands_robots.safety.controller import Answer, StopReport
+from strands_robots.safety.lockout import Hold
+
+
+class FakeController:
+    """Records each stop and answers when the test allows it."""
+
+    def __init__(self) -> None:
+        self.ids: list[str] = []
+        self.expected: list[Collection[str]] = []
+        self.answer = threading.Event()
+        self.answer.set()
+        self.links: list[bool] = []
+        self.refused: dict[str, Answer] = {}
+        self.silent: list[tuple[str, ...]] = []
+
+    def stop(self, expected: Collection[str], reason: str, *, estop_id: str, on_progress: Any) -> StopReport:
+        self.ids.append(estop_id)
+        self.expected.append(expected)
+        assert self.answer.wait(60.0)
+        link = self.links.pop(0) if self.links else True
+        return StopReport(estop_id, {}, {}, self.refused, self.silent.pop(0) if self.silent else (), link, 1.0)
+
+
+@pytest.fixture
+def controller() -> FakeController:
+    return FakeController()
+
+
+def made(controller: FakeController) -> StopButton:
+    return StopButton(controller, lambda: ("arm-1",), "test")  # type: ignore[arg-type]
+
+
+def test_press_stops_the_robots_known_at_that_moment(controller: FakeController) -> None:
+    button = made(controller)
+    button.press()
+    eventually(lambda: button.report is not None and not button.running)
+    assert controller.expected == [("arm-1",)]
+
+
+def test_key_held_down_is_one_stop(controller: FakeController, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(safety_controller, "KEY_REPEAT_S", 60.0)
+    button = made(controller)
+    controller.answer.clear()
+    for _ in range(50):
+        button.press()
+    controller.answer.set()
+    eventually(lambda: button.report is not None)
+    button.press()
+    eventually(lambda: not button.running)
+    assert len(set(controller.ids)) == 1
+    assert len(controller.ids) <= 2
+    assert button.presses == 51
+
+
+def test_later_press_is_a_stop_of_its_own(controller: FakeController, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(safety_controller, "KEY_REPEAT_S", 0.0)
+    button = made(controller)
+    controller.answer.clear()
+    button.press()
+    button.press()
+    eventually(lambda: len(set(controller.ids)) == 2)
+    controller.answer.set()
+    eventually(lambda: not button.running)
+
+
+def test_robot_resumed_meanwhile_is_stopped_with_a_new_id(controller: FakeController) -> None:
+    button = made(controller)
+    controller.refused = {"arm-1": Answer("arm-1", None, 1.0, "this stop was resumed before it came again")}
+    for presses in (1, 2):
+        button.press()
+        eventually(lambda: not button.running)
+        assert len(set(controller.ids)) == presses
+
+
+def test_stop_that_never_left_is_repeated_with_its_id(controller: FakeController) -> None:
+    controller.links = [False, False, True]
+    button = made(controller)
+    button.press()
+    eventually(lambda: button.report is not None and not button.running)
+    assert len(controller.ids) == 3
+    assert len(set(controller.ids)) == 1
+
+
+def test_stop_is_repeated_until_no_robot_is_silent(controller: FakeController) -> None:
+    controller.silent = [("arm-1",), ("arm-1",), ()]
+    button = made(controller)
+    button.press()
+    eventually(lambda: not button.running)
+    assert len(controller.ids) == 3
+    assert len(set(controller.ids)) == 1
+    assert button.report is not None
+    assert button.report.silent == ()
+
+
+class LinkedController:
+    """The part of a controller that the screen reads."""
+
+    controller_id = "safety-1"
+    link_up = True
+
+
+def drawn(fleet: FleetScreen, button: StopButton) -> str:
+    out = Console(file=io.StringIO(), width=160, height=40)
+    out.print(fleet.draw(button, ["ERROR something"]))
+    shown: str = out.file.getvalue()  # type: ignore[attr-defined]  # it is a StringIO
+    return shown
+
+
+def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake: Any = LinkedController()
+    fleet, button = FleetScreen(fake, loopback_config(), 0.5), StopButton(fake, lambda: (), "")
+    hold = Hold("e" * 32, "desk-1", "a hand", 0.0)
+    checked = {"check_in": {"required": True, "timeout_s": 2.0, "time_left_s": 1.25}}
+    fleet.update(
+        [
+            LockoutReport("arm-1", (hold,)),
+            LockoutReport("arm-2", facts=checked),
+            LockoutReport("arm-9", problem="no answer"),
+        ]
+    )
+    shown = drawn(fleet, button)
+    assert "LOCKED" in shown and "desk-1 a hand" in shown
+    assert "1.2 s left" in shown
+    assert "arm-9" not in shown
+    assert "SPACE stops everything" in shown and "ERROR something" in shown
+    monkeypatch.setattr(safety_controller, "GONE_S", 0.0)
+    fleet.update([LockoutReport("arm-1", problem="no answer")])
+    assert "GONE" in drawn(fleet, button)
+    assert set(fleet.expected()) == {"arm-1", "arm-2"}
+    fleet.forget()
+    assert fleet.expected() == ()
