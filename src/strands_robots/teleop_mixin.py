@@ -1,4 +1,4 @@
-"""Teleoperation for any robot: a leader drives a body through the control loop, permits and write path of rollouts."""
+"""Teleoperation for any robot: a leader drives a body through a rollout, with its permits and its write path."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -19,39 +18,27 @@ from strands_robots.utils import ValidationError, choice, flag, identifier, numb
 METHODS = ("arm", "gamepad", "keyboard", "phone")
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
-    """A leader and the body it is to drive."""
-
-    leader: Any
-    name: str
-    robot: str
-    method: str
-    keys: Mapping[str, str]
-    max_speed: float
-
-
 class TeleopMixin:
-    """``attach_teleop``, ``teleoperate`` and ``stop_teleoperate`` for a host that has the members declared here.
+    """Verbs of teleoperation for a host that has the members declared here.
 
-    One source drives a body at a time. The host's ``halt`` asks :meth:`teleop_stops`, and its ``starting`` is the
-    re-entrant lock under which it looks whether a body is free and starts a motion.
+    One source drives a body at a time. The host's ``halt`` calls :meth:`teleop_stops`, and its ``starting`` is the
+    re-entrant lock under which it checks that a body is free and starts a motion.
     """
 
     gate: MotionGate
     starting: AbstractContextManager[Any]
     observers: RolloutObservers
-    """Who is told of teleoperations, as of tasks."""
+    """Observers of teleoperations and of tasks."""
     input_sink: InputSink | None = None
-    """Where frames go when ``publish`` is asked for; a network that carries input streams sets it."""
+    """Receiver of published frames; a network that carries input streams sets it."""
 
     @abstractmethod
     def body(self, robot_name: str | None = None) -> Body:
-        """The body of that name, or the host's first. Raises :class:`ValidationError` where there is none."""
+        """Return the body of that name, or the host's first. Raises :class:`ValidationError` where there is none."""
 
     @abstractmethod
     def occupied(self, robot: str) -> str:
-        """What task drives the body of that name now, for a refusal; empty when none does."""
+        """Return the task that drives the body of that name, for a refusal; empty when none does."""
 
     def attach_teleop(
         self,
@@ -67,7 +54,7 @@ class TeleopMixin:
 
         Args:
             leader: an object with ``get_action()``, connected.
-            name: what it is called here and on the network.
+            name: the leader's name here and on the network.
             robot_name: body to drive; the first where the host has several and none is named.
             keys: follower's action key for each leader's key that differs.
             method: arm, gamepad, keyboard or phone.
@@ -77,10 +64,11 @@ class TeleopMixin:
         if reason is not None:
             return error(reason)
         try:
-            attachment = Attachment(
-                leader=leader,
-                name=identifier("name", name),
-                robot=self.body(robot_name).name,
+            robot = self.body(robot_name).name
+            policy = partial(
+                LeaderPolicy,
+                leader,
+                device=identifier("name", name),
                 method=choice("method", method, METHODS),
                 keys=dict(keys or {}),
                 max_speed=number("max_speed", max_speed, above=0, high=20),
@@ -92,8 +80,8 @@ class TeleopMixin:
                 return error(
                     f"{name} teleoperates {self._teleop_sessions[name][0].robot} now; stop_teleoperate it first."
                 )
-            self._teleop_leaders[name] = attachment
-        return success(f"{name} will lead {attachment.robot}.", name=name, robot=attachment.robot)
+            self._teleop_leaders[name] = (robot, policy)
+        return success(f"{name} will lead {robot}.", name=name, robot=robot)
 
     def teleoperate(
         self,
@@ -128,48 +116,48 @@ class TeleopMixin:
         """Stop one leader, or all. ``stopped`` is false when a loop outlived the ``timeout`` in seconds."""
         self._teleop_waiting.void(name)
         running = self.teleoperating()
-        asked = running if name is None else {key: each for key, each in running.items() if key == name}
-        if not asked:
-            return success("Nobody teleoperates.", stopped=True, was_running=False)
+        stopping = running if name is None else {key: each for key, each in running.items() if key == name}
+        if not stopping:
+            return success("No leader is running.", stopped=True, was_running=False)
         deadline = time.monotonic() + timeout
-        for session in asked.values():
+        for session in stopping.values():
             session.request_stop()
-        late = [key for key, each in asked.items() if not each.join(max(0.0, deadline - time.monotonic()))]
-        fields = {"stopped": not late, "was_running": True, "leaders": self._teleop_rows(asked)}
+        late = [key for key, each in stopping.items() if not each.join(max(0.0, deadline - time.monotonic()))]
+        fields = {"stopped": not late, "was_running": True, "leaders": self._teleop_rows(stopping)}
         if late:
             return error(
                 f"{', '.join(late)}: the loop still waits for its leader; it sends no action any more.", **fields
             )
-        return success(f"Stopped {', '.join(asked)}.", **fields)
+        return success(f"Stopped {', '.join(stopping)}.", **fields)
 
     def teleop_status(self) -> Envelope:
-        """One row for each leader that leads or has led: robot, frames, its counted errors, state, steps and rate."""
+        """Answer with one row for each leader that leads or has led: robot, frames, errors, state, steps and rate."""
         rows = self._teleop_rows({name: rollout for name, (rollout, _) in self._teleop_sessions.items()})
         return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
 
     def teleoperating(self) -> dict[str, Rollout]:
-        """The running sessions by leader."""
+        """Return the running sessions by leader."""
         return {name: rollout for name, (rollout, _) in list(self._teleop_sessions.items()) if rollout.running}
 
     def teleoperated_by(self, robot: str) -> str:
-        """The leader that drives the body of that name now; empty when none does."""
+        """Return the leader that drives the body of that name; empty when none does."""
         return next((name for name, each in self.teleoperating().items() if each.robot == robot), "")
 
     def void_leaders(self, robot: str) -> None:
-        """Keep leaders of the body of that name from beginning that have not begun yet."""
-        for name, attachment in list(self._teleop_leaders.items()):
-            if attachment.robot == robot:
+        """Void the waiting starts of all leaders of the body of that name."""
+        for name, (led, _) in list(self._teleop_leaders.items()):
+            if led == robot:
                 self._teleop_waiting.void(name)
 
     def teleop_stops(self, deadline: float) -> dict[str, Callable[[], object]]:
-        """For a halt: void every session at once; how to wait for each, until ``deadline`` on the monotonic clock."""
+        """Request the stop of every session; return the waits for their ends until ``deadline``, for a halt."""
         running = self.teleoperating()
         for session in running.values():
             session.request_stop()
         return {f"teleoperation {name}": partial(session.ended_by, deadline) for name, session in running.items()}
 
     @cached_property
-    def _teleop_leaders(self) -> dict[str, Attachment]:
+    def _teleop_leaders(self) -> dict[str, tuple[str, Callable[..., LeaderPolicy]]]:
         return {}
 
     @cached_property
@@ -186,23 +174,15 @@ class TeleopMixin:
         return self.input_sink if publish else None
 
     def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None, permit: Permit) -> Rollout:
-        attachment = self._teleop_leaders.get(name)
-        if attachment is None:
+        if name not in self._teleop_leaders:
             known = ", ".join(self._teleop_leaders) or "none yet"
             raise ValidationError(f"name must be an attached leader ({known}), not {name!r}; attach_teleop it first.")
-        body = self.body(attachment.robot)
+        robot, make_policy = self._teleop_leaders[name]
+        body = self.body(robot)
         busy = self.occupied(body.name) or self.teleoperated_by(body.name)
         if busy:
             raise ValidationError(f"{body.name} is driven by {busy}; stop that first.")
-        policy = LeaderPolicy(
-            attachment.leader,
-            device=name,
-            method=attachment.method,
-            keys=attachment.keys,
-            max_speed=attachment.max_speed,
-            period=1 / rate,
-            sink=sink,
-        )
+        policy = make_policy(period=1 / rate, sink=sink)
         session = Rollout(
             body,
             policy,

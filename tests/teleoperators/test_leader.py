@@ -1,4 +1,4 @@
-"""A leader whose frames travel is kept inside its follower's bounds first."""
+"""A leader that is kept inside its follower's bounds before its frames are sent."""
 
 from __future__ import annotations
 
@@ -15,36 +15,38 @@ RANGES = {"pan.pos": (-100.0, 100.0)}
 
 
 class Leader:
-    def __init__(self, gives: Callable[[], Any]) -> None:
-        self.get_action = gives
+    def __init__(self, get_action: Callable[[], Any]) -> None:
+        self.get_action = get_action
 
 
-def bounded(gives: Callable[[], Any], now: Callable[[], float] = time.monotonic) -> BoundedLeader:
-    return BoundedLeader(LeaderPolicy(Leader(gives), max_speed=1.0, period=0.02, now=now), {"pan.pos": 0.0}, RANGES)
+def bounded(get_action: Callable[[], Any], now: Callable[[], float] = time.monotonic) -> BoundedLeader:
+    return BoundedLeader(
+        LeaderPolicy(Leader(get_action), max_speed=1.0, period=0.02, now=now), {"pan.pos": 0.0}, RANGES
+    )
 
 
-def test_the_first_frames_glide_from_where_the_follower_stands() -> None:
+def test_first_frames_approach_from_the_followers_position() -> None:
     leader = bounded(lambda: {"pan.pos": 90.0}, now=lambda: 5.0)
     # One range of 200 a second, at most, in periods of 20 ms.
     assert [leader.get_action()["pan.pos"] for _ in range(3)] == pytest.approx([4.0, 8.0, 12.0])
 
 
-def test_targets_are_clamped_and_keys_that_the_follower_has_not_are_counted_unusable() -> None:
+def test_unknown_key_makes_a_frame_unusable_without_ending_the_leader() -> None:
     leader = bounded(lambda: {"elbow.pos": 1.0}, now=lambda: 5.0)
     with pytest.raises(ValidationError, match=r"elbow\.pos"):
         leader.get_action()
     assert not leader.done.is_set()
 
 
-def test_after_the_end_the_last_frame_is_held() -> None:
-    def gives() -> dict[str, float]:
-        if gave:
+def test_last_frame_is_repeated_after_the_end() -> None:
+    def get_action() -> dict[str, float]:
+        if given:
             raise LeaderFinished("over")
-        gave.append(1)
+        given.append(1)
         return {"pan.pos": 1.0}
 
-    gave: list[int] = []
-    leader = bounded(gives)
+    given: list[int] = []
+    leader = bounded(get_action)
     first = leader.get_action()
     assert leader.get_action() == first
     assert leader.done.is_set()
@@ -52,12 +54,12 @@ def test_after_the_end_the_last_frame_is_held() -> None:
     assert leader.get_action() == first
 
 
-def test_a_leader_that_fails_for_long_is_given_up_with_its_reason() -> None:
-    def gives() -> dict[str, float]:
+def test_leader_that_fails_for_long_ends_with_its_reason() -> None:
+    def get_action() -> dict[str, float]:
         raise ConnectionError("unplugged")
 
     clock = iter([0.0, 0.1, 1.0])
-    leader = bounded(gives, now=lambda: next(clock))
+    leader = bounded(get_action, now=lambda: next(clock))
     with pytest.raises(ValidationError, match="unplugged"):
         leader.get_action()
     with pytest.raises(ValidationError, match="before its first frame"):
@@ -66,7 +68,7 @@ def test_a_leader_that_fails_for_long_is_given_up_with_its_reason() -> None:
     assert "unplugged" in leader.error
 
 
-def test_a_failed_reading_of_its_events_is_told_to_who_counts_it() -> None:
+def test_failed_read_of_events_is_raised_to_the_caller() -> None:
     class Pad(Leader):
         def get_teleop_events(self) -> dict[str, bool]:
             raise OSError("no events")

@@ -21,7 +21,7 @@ from strands_robots.hardware.motors import joint_units, tells_temperature, tempe
 from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
-from strands_robots.recording.cameras import Shots
+from strands_robots.recording.cameras import LazyFrames
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, PermitVoidError, Waiting
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
@@ -174,7 +174,7 @@ class HardwareRobot(TeleopMixin):
         A picture is taken when it is asked for by its name; that raises what its camera raises.
         """
         cameras = getattr(self.device, "cameras", None)
-        return Shots({str(name): partial(_picture, camera) for name, camera in (cameras or {}).items()})
+        return LazyFrames({str(name): partial(_picture, camera) for name, camera in (cameras or {}).items()})
 
     def send_action(self, action: Mapping[str, float]) -> Envelope:
         """Set targets once; ``sent`` is what the device really took. Refused while a task or a leader drives it."""

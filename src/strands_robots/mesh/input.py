@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.mesh import topics
@@ -18,7 +18,7 @@ from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.mesh.security import validate_mesh_identifier
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
-from strands_robots.teleoperators.leader import named_events
+from strands_robots.teleoperators.leader import teleop_events
 from strands_robots.utils import ValidationError, number, shown, teleoperator_contract_error, text
 
 if TYPE_CHECKING:
@@ -183,12 +183,8 @@ class InputPublisher:
         return joints
 
     def _events(self) -> dict[str, Any] | None:
-        read: Callable[[], Any] | None = getattr(self._teleoperator, "get_teleop_events", None)
-        if not callable(read):
-            return None
         try:
-            events = read()
-            return None if events is None else named_events(events)
+            return teleop_events(self._teleoperator)
         except Exception as exc:  # noqa: BLE001 - counted and logged; the action is still good
             self._event_errors += 1
             if self._event_errors <= LOGGED_ERRORS:

@@ -1,4 +1,4 @@
-"""The one private member of the mcap library that is used, as its 1.x releases have it."""
+"""Use of one private member of the mcap library, as its 1.x releases have it."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from typing import Any
 
 
 def close_chunk(writer: Any) -> None:
-    """Write the chunk that is being filled; the library itself closes one only when it is full, or at the end."""
+    """Write the open chunk; the library itself closes one only when it is full, or at the end."""
     writer._Writer__finalize_chunk()

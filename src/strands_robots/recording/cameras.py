@@ -1,4 +1,4 @@
-"""What a robot sees: its cameras by name, and a picture as JPEG."""
+"""Cameras of a robot by name, and pictures as JPEG."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from strands_robots.utils import ValidationError, missing_extra, shown
 QUALITY = 80
 
 OVERVIEW = "overview"
-"""The camera that every simulated world has."""
+"""Camera that every simulated world has."""
 
 Frames = Callable[[], Mapping[str, Any]]
-"""Gives height x width x 3 arrays of uint8 by camera name."""
+"""Returns height x width x 3 arrays of uint8 by camera name."""
 
 
-class Shots(Mapping[str, Any]):
-    """Pictures by camera name, each taken when it is asked for, so that a camera that fails spoils no other."""
+class LazyFrames(Mapping[str, Any]):
+    """Pictures by camera name, each taken when it is read, so that a failing camera affects no other."""
 
-    def __init__(self, takers: Mapping[str, Callable[[], Any]]) -> None:
-        self._takers = dict(takers)
+    def __init__(self, sources: Mapping[str, Callable[[], Any]]) -> None:
+        self._sources = dict(sources)
 
     def __getitem__(self, name: str) -> Any:
-        return self._takers[name]()
+        return self._sources[name]()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._takers)
+        return iter(self._sources)
 
     def __len__(self) -> int:
-        return len(self._takers)
+        return len(self._sources)
 
 
 def frames_of(robot: Any) -> Frames | None:
-    """How to take a picture with each of a robot's cameras; None for one without.
+    """Return a function that takes a picture with each camera of a robot; None for a robot without cameras.
 
     A robot's own ``camera_frames()`` comes first, then a simulation's ``render``, then the pictures in a device's
     ``get_observation()``. A camera ``arm/wrist`` is called ``arm.wrist`` on the wire, which allows no slash.
@@ -44,10 +44,10 @@ def frames_of(robot: Any) -> Frames | None:
     body = body_of(robot)
     own, render, observe = (getattr(body, verb, None) for verb in ("camera_frames", "render", "get_observation"))
     if callable(own):
-        given: Frames = own
-        return given
+        frames: Frames = own
+        return frames
     if isinstance(robot, WorldRobot) and callable(render):
-        return lambda: Shots(
+        return lambda: LazyFrames(
             {str(name).replace("/", "."): partial(render, name) for name in robot.get_features().get("cameras", ())}
         )
     if callable(observe):
@@ -56,12 +56,12 @@ def frames_of(robot: Any) -> Frames | None:
 
 
 def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
-    """The same of some cameras.
+    """Return the function of :func:`frames_of` for some cameras.
 
     Args:
-        robot: whose cameras.
-        names: which; None means all of a real robot, and of a simulated world the robots' own (such as ``wrist``) or,
-            where they have none, the overview: drawing costs more than seeing.
+        robot: the robot or simulated world.
+        names: of the cameras; None means all of a real robot, and of a simulated world the robots' own (such as
+            ``wrist``) or, where they have none, the overview, because rendering is expensive.
 
     Raises:
         ValidationError: a simulated world has no camera of that name.
@@ -71,7 +71,7 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
         frames = frames_of(robot)
         if frames is None or names is None:
             return frames
-        return lambda: _only(frames(), names)
+        return lambda: _selected(frames(), names)
     features = robot.get_features()
     known = [str(name) for name in features.get("cameras", ())]
     own = [name for name in known if "/" in name] or [OVERVIEW]
@@ -79,16 +79,15 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
     for name in wanted:
         if name not in known:
             raise ValidationError(f"camera must be one of {', '.join(known)}, not {shown(name)}.")
-    return lambda: Shots({name.replace("/", "."): partial(render, name) for name in wanted})
+    return lambda: LazyFrames({name.replace("/", "."): partial(render, name) for name in wanted})
 
 
-def _only(seen: Mapping[str, Any], names: Sequence[str]) -> Shots:
-    """Those of ``names``, each taken when it is asked for where ``seen`` takes it so."""
-    return Shots({name: partial(seen.__getitem__, name) for name in seen if name in names})
+def _selected(frames: Mapping[str, Any], names: Sequence[str]) -> LazyFrames:
+    return LazyFrames({name: partial(frames.__getitem__, name) for name in frames if name in names})
 
 
 def jpeg(name: str, pixels: Any) -> bytes:
-    """One picture of the camera ``name`` as JPEG.
+    """Encode one picture of the camera ``name`` as JPEG.
 
     Raises:
         ValidationError: ``pixels`` is no height x width x 3 array of uint8.

@@ -1,9 +1,9 @@
-"""What Foxglove and Rerun draw by themselves: joint states, JPEG pictures and log lines, encoded for a recording.
+"""Encoding of joint states, JPEG pictures and log lines, which Foxglove and Rerun draw without a plug-in.
 
 Sources: ``sensor_msgs/msg/JointState`` in CDR (OMG XTypes 1.3, plain CDR, little endian) with its definition as text;
 ``foxglove.CompressedImage`` and ``foxglove.Log`` as protobuf, field numbers from docs.foxglove.dev; a protobuf schema
-in MCAP is a ``FileDescriptorSet`` (``google/protobuf/descriptor.proto``). Each is a handful of fields, which are
-written here without a protobuf runtime.
+in MCAP is a ``FileDescriptorSet`` (``google/protobuf/descriptor.proto``). Each has few fields, so they are encoded
+here without a protobuf runtime.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _TIMESTAMP = ".google.protobuf.Timestamp"
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """A row of an MCAP file's table of schemas, with the encoding of its messages."""
+    """One schema of an MCAP file, with the encoding of its messages."""
 
     name: str
     encoding: str
@@ -50,7 +50,7 @@ class Schema:
 
 
 def joint_state(at_ns: int, joints: Mapping[str, float]) -> bytes:
-    """A ``sensor_msgs/msg/JointState``: names and positions, in the order given and in the robot's own units."""
+    """Encode a ``sensor_msgs/msg/JointState``: names and positions in the given order, in the robot's own units."""
     out = bytearray(struct.pack("<iI", at_ns // _NS, at_ns % _NS))
     _text(out, "")
     _count(out, len(joints))
@@ -65,13 +65,13 @@ def joint_state(at_ns: int, joints: Mapping[str, float]) -> bytes:
 
 
 def read_joint_state(data: bytes) -> dict[str, float]:
-    """The joints of a message that :func:`joint_state` made. Raises :class:`struct.error` for what is none."""
+    """Decode a message of :func:`joint_state`. Raises :class:`struct.error` for any other."""
     body, at = data[len(_CDR_LITTLE_ENDIAN) :], 8
 
     def length(here: int) -> tuple[int, int]:
         here += -here % 4
-        (found,) = struct.unpack_from("<I", body, here)
-        return found, here + 4
+        (value,) = struct.unpack_from("<I", body, here)
+        return value, here + 4
 
     size, at = length(at)
     count, at = length(at + size)
@@ -86,12 +86,12 @@ def read_joint_state(data: bytes) -> dict[str, float]:
 
 
 def compressed_image(at_ns: int, camera: str, jpeg: bytes) -> bytes:
-    """A ``foxglove.CompressedImage``: timestamp 1, data 2, format 3, frame_id 4."""
+    """Encode a ``foxglove.CompressedImage``: timestamp 1, data 2, format 3, frame_id 4."""
     return _time(at_ns) + _field(2, jpeg) + _field(3, b"jpeg") + _field(4, camera.encode())
 
 
 def read_compressed_image(data: bytes) -> bytes:
-    """The JPEG of a message that :func:`compressed_image` made; empty where there is none."""
+    """Return the JPEG of a message of :func:`compressed_image`; empty where there is none."""
     at = 0
     while at < len(data):
         key, at = _read_varint(data, at)
@@ -105,7 +105,7 @@ def read_compressed_image(data: bytes) -> bytes:
 
 
 def log_line(at_ns: int, level: int, name: str, message: str) -> bytes:
-    """A ``foxglove.Log``: timestamp 1, level 2, message 3, name 4."""
+    """Encode a ``foxglove.Log``: timestamp 1, level 2, message 3, name 4."""
     return _time(at_ns) + _number(2, level) + _field(3, message.encode()) + _field(4, name.encode())
 
 
@@ -157,30 +157,30 @@ def _time(at_ns: int) -> bytes:
     return _field(1, _number(1, at_ns // _NS) + _number(2, at_ns % _NS))
 
 
-def _described(number: int, name: str, kind: int, of: str = "") -> bytes:
-    """A ``FieldDescriptorProto``: name 1, number 3, label 4 (1 is optional), type 5, type_name 6."""
-    told = _field(1, name.encode()) + _number(3, number) + _number(4, 1) + _number(5, kind)
-    return _field(2, told + (_field(6, of.encode()) if of else b""))
+def _descriptor(number: int, name: str, kind: int, of: str = "") -> bytes:
+    """Encode a ``FieldDescriptorProto``: name 1, number 3, label 4 (1 is optional), type 5, type_name 6."""
+    field = _field(1, name.encode()) + _number(3, number) + _number(4, 1) + _number(5, kind)
+    return _field(2, field + (_field(6, of.encode()) if of else b""))
 
 
 def _file(path: str, package: str, message: bytes, needs: str = "") -> bytes:
-    """A ``FileDescriptorProto`` in its set: name 1, package 2, dependency 3, message_type 4, syntax 12."""
-    told = _field(1, path.encode()) + _field(2, package.encode())
-    told += _field(3, needs.encode()) if needs else b""
-    return _field(1, told + _field(4, message) + _field(12, b"proto3"))
+    """Encode a ``FileDescriptorProto`` in its set: name 1, package 2, dependency 3, message_type 4, syntax 12."""
+    file = _field(1, path.encode()) + _field(2, package.encode())
+    file += _field(3, needs.encode()) if needs else b""
+    return _field(1, file + _field(4, message) + _field(12, b"proto3"))
 
 
 def _set(name: str, fields: bytes) -> bytes:
-    time = _field(1, b"Timestamp") + _described(1, "seconds", _INT64) + _described(2, "nanos", _INT32)
+    time = _field(1, b"Timestamp") + _descriptor(1, "seconds", _INT64) + _descriptor(2, "nanos", _INT32)
     needs = "google/protobuf/timestamp.proto"
     message = _field(1, name.encode()) + fields
     return _file(needs, "google.protobuf", time) + _file(f"foxglove/{name}.proto", "foxglove", message, needs)
 
 
 def _levels() -> bytes:
-    """The nested enumeration of ``foxglove.Log`` (``EnumDescriptorProto``: name 1, value 2)."""
-    words = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
-    values = b"".join(_field(2, _field(1, word.encode()) + _number(2, number)) for number, word in enumerate(words))
+    """Encode the nested enumeration of ``foxglove.Log`` (``EnumDescriptorProto``: name 1, value 2)."""
+    names = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+    values = b"".join(_field(2, _field(1, name.encode()) + _number(2, number)) for number, name in enumerate(names))
     return _field(4, _field(1, b"Level") + values)
 
 
@@ -191,10 +191,10 @@ IMAGE = Schema(
     "protobuf",
     _set(
         "CompressedImage",
-        _described(1, "timestamp", _MESSAGE, _TIMESTAMP)
-        + _described(2, "data", _BYTES)
-        + _described(3, "format", _STRING)
-        + _described(4, "frame_id", _STRING),
+        _descriptor(1, "timestamp", _MESSAGE, _TIMESTAMP)
+        + _descriptor(2, "data", _BYTES)
+        + _descriptor(3, "format", _STRING)
+        + _descriptor(4, "frame_id", _STRING),
     ),
     "protobuf",
 )
@@ -204,12 +204,12 @@ LOG = Schema(
     "protobuf",
     _set(
         "Log",
-        _described(1, "timestamp", _MESSAGE, _TIMESTAMP)
-        + _described(2, "level", _ENUM, ".foxglove.Log.Level")
-        + _described(3, "message", _STRING)
-        + _described(4, "name", _STRING)
-        + _described(5, "file", _STRING)
-        + _described(6, "line", _FIXED32)
+        _descriptor(1, "timestamp", _MESSAGE, _TIMESTAMP)
+        + _descriptor(2, "level", _ENUM, ".foxglove.Log.Level")
+        + _descriptor(3, "message", _STRING)
+        + _descriptor(4, "name", _STRING)
+        + _descriptor(5, "file", _STRING)
+        + _descriptor(6, "line", _FIXED32)
         + _levels(),
     ),
     "protobuf",

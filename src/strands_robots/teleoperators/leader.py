@@ -1,7 +1,7 @@
-"""Leaders: what a follower is teleoperated by, made to look like a policy, and a scripted one for machines without.
+"""Leaders as policies that a follower can take, and a scripted leader for machines without hardware.
 
 A leader is any object with ``get_action() -> dict`` of targets by action key (a LeRobot teleoperator, a gamepad). It
-may have ``is_connected`` and ``get_teleop_events()``, and raises :class:`LeaderFinished` when it has led to the end.
+may have ``is_connected`` and ``get_teleop_events()``, and raises :class:`LeaderFinished` at its end.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from strands_robots.utils import ValidationError, mapping, number
 logger = logging.getLogger(__name__)
 
 GIVE_UP_S = 0.5
-"""A leader without a usable frame for so long ends the teleoperation with an error and a hold."""
+"""Longest time without a usable frame; after it the teleoperation ends with an error and the follower stops."""
 
 FULL_RANGES_PER_S = 2.0
-"""How often a second a follower's joint may cross its whole range."""
+"""Speed bound of a joint with a range, in whole ranges a second."""
 
 UNBOUNDED_PER_S = 1440.0
 """Speed bound of a joint without a range, in its unit a second (two turns a second in degrees, twice)."""
@@ -37,15 +37,18 @@ class LeaderFinished(StrandsRobotsError):  # noqa: N818 - an end, not a fault
 
 
 class InputSink(Protocol):
-    """Where a leader's frames go besides its follower: a network gives one. Returns at once, never blocks."""
+    """Second receiver of a leader's frames, given by a network. It returns at once and never blocks."""
 
     def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
-        """Carry one frame; ``events`` is None when the leader has none or reading them failed."""
+        """Publish one frame; ``events`` is None when the leader has none or reading them failed."""
 
 
-def named_events(events: Mapping[Any, Any]) -> dict[str, Any]:
-    """The events of a leader by name; LeRobot's are named by a plain enumeration."""
-    return {str(getattr(key, "value", key)): value for key, value in dict(events).items()}
+def teleop_events(leader: Any) -> dict[str, Any] | None:
+    """Return a leader's events by name, None where it has none; raises the leader's own exceptions."""
+    read = getattr(leader, "get_teleop_events", None)
+    events = read() if callable(read) else None
+    # LeRobot names events by a plain enumeration.
+    return None if events is None else {str(getattr(key, "value", key)): value for key, value in dict(events).items()}
 
 
 class ScriptedLeader:
@@ -61,13 +64,14 @@ class ScriptedLeader:
     ) -> None:
         self._waves = {key: tuple(number(f"waves[{key!r}]", part) for part in wave) for key, wave in waves.items()}
         self._now = now
-        self._began: float | None = None
+        self._started_at: float | None = None
         self.is_connected = True
 
     def get_action(self) -> Action:
-        """The targets of this moment; the first call is the start of time, with every key at its centre."""
-        self._began = self._now() if self._began is None else self._began
-        seconds = self._now() - self._began
+        """Return the present targets; time starts at the first call, with every key at its centre."""
+        if self._started_at is None:
+            self._started_at = self._now()
+        seconds = self._now() - self._started_at
         return {
             key: centre + amplitude * math.sin(math.tau * hz * seconds)
             for key, (centre, amplitude, hz) in self._waves.items()
@@ -77,17 +81,17 @@ class ScriptedLeader:
 class LeaderPolicy:
     """A leader as a policy: frames are checked, renamed, clamped to the follower's ranges and bounded in speed.
 
-    A frame that cannot be read or used is counted and not applied; after :data:`GIVE_UP_S` without a good one the
-    rollout ends with an error. The follower glides to the leader at the speed bound where the two begin apart.
+    A frame that cannot be read or used is counted and not applied; after :data:`GIVE_UP_S` without a usable one the
+    rollout ends with an error. A follower that starts apart from its leader moves there at the speed bound.
 
     Args:
         leader: has ``get_action()``.
         device: the leader's name on the network.
-        method: how it leads: arm, gamepad, keyboard or phone.
+        method: kind of leader: arm, gamepad, keyboard or phone.
         keys: follower's key for each leader's key; unnamed keys keep their name.
         max_speed: whole joint ranges a second.
         period: control period, seconds.
-        sink: gets every good frame, as the leader gave it.
+        sink: receives every usable frame, as the leader gave it.
     """
 
     uses_cameras = False
@@ -120,7 +124,7 @@ class LeaderPolicy:
         self._ranges: Ranges = {}
         self._limit: SpeedLimit | None = None
         self._last: dict[str, float] = {}
-        self._good_at = 0.0
+        self._usable_at = 0.0
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         if getattr(self._leader, "is_connected", True) is False:
@@ -131,7 +135,7 @@ class LeaderPolicy:
         }
         self._limit = SpeedLimit(ranges, self._max_speed, UNBOUNDED_PER_S)
         self._last = {}
-        self._good_at = self._now()
+        self._usable_at = self._now()
 
     def act(self, observation: Mapping[str, Any]) -> Action | list[Action] | None:
         now = self._now()
@@ -143,13 +147,13 @@ class LeaderPolicy:
         except Exception as exc:
             self.errors += 1
             self.last_error = f"{type(exc).__name__}: {exc}"
-            if now - self._good_at >= GIVE_UP_S:
+            if now - self._usable_at >= GIVE_UP_S:
                 raise
             return []
         self.frames += 1
-        # A pause may not be saved up for a jump.
-        dt = min(max(now - self._good_at, self._period), 2 * self._period)
-        self._good_at = now
+        # A pause must not add up to a jump.
+        dt = min(max(now - self._usable_at, self._period), 2 * self._period)
+        self._usable_at = now
         if not self._last:
             self._last = {key: value for key, value in numbers(observation).items() if key in self._ranges}
         limit = self._limit or SpeedLimit(self._ranges, self._max_speed, UNBOUNDED_PER_S)
@@ -158,10 +162,10 @@ class LeaderPolicy:
         return {key: self._last[key] for key in target}
 
     def interrupt(self) -> None:
-        """A leader cannot be told to give up; a read that hangs ends by itself or never."""
+        """Do nothing: a leader's read cannot be interrupted."""
 
     def close(self) -> None:
-        """The leader stays connected: it is its owner's."""
+        """Do nothing: the leader stays connected for its owner."""
 
     def _publish(self, frame: Mapping[str, Any]) -> None:
         if self._sink is None:
@@ -174,10 +178,8 @@ class LeaderPolicy:
                 logger.exception("The frames of %s do not reach the network; the follower goes on.", self._device)
 
     def events(self) -> dict[str, Any] | None:
-        """What the leader tells besides its targets; None where it tells nothing. Raises what the leader raises."""
-        read = getattr(self._leader, "get_teleop_events", None)
-        events = read() if callable(read) else None
-        return None if events is None else named_events(events)
+        """Return the leader's events, None where it has none. Raises the leader's own exceptions."""
+        return teleop_events(self._leader)
 
     def _readable_events(self) -> dict[str, Any] | None:
         try:
@@ -191,11 +193,11 @@ class LeaderPolicy:
 
 
 class BoundedLeader:
-    """A leader whose every frame the follower can take.
+    """A leader whose every frame is inside the follower's bounds.
 
     Args:
         policy: the leader as a policy, which checks, clamps and bounds its frames.
-        start: where the follower stands, by action key; the first frames glide from there.
+        start: the follower's position by action key; the first frames approach the leader's from there.
         ranges: of the follower's action keys.
 
     Raises:
@@ -206,7 +208,7 @@ class BoundedLeader:
 
     def __init__(self, policy: LeaderPolicy, start: Mapping[str, float], ranges: Ranges) -> None:
         self.done = threading.Event()
-        """Set when the leader has led to the end, or failed for so long that it is given up."""
+        """Set when the leader has finished, or has failed for :data:`GIVE_UP_S`."""
         self.error = ""
         self._policy = policy
         self._start = dict(start)
@@ -214,32 +216,27 @@ class BoundedLeader:
         policy.reset("lead a follower elsewhere", ranges)
 
     def get_action(self) -> Action:
-        """The next frame; after the end the last one.
+        """Return the next frame, or the last one after the end.
 
         Raises:
-            ValidationError: the leader gave nothing usable this time.
+            ValidationError: the leader gave no usable frame this time, or ended before its first.
         """
-        if self.done.is_set():
-            return self._held()
-        try:
-            decided = self._policy.act(self._start)
-        except Exception as exc:  # noqa: BLE001 - a leader raises what it likes; it is over, and the reason is kept
-            self.error = f"{type(exc).__name__}: {exc}"
+        action: object = None
+        if not self.done.is_set():
+            try:
+                action = self._policy.act(self._start)
+            except Exception as exc:  # noqa: BLE001 - a leader may raise anything; it ends, and the reason is stored
+                self.error = f"{type(exc).__name__}: {exc}"
+        if action is None:
             self.done.set()
-            return self._held()
-        if decided is None:
-            self.done.set()
-            return self._held()
-        if not isinstance(decided, Mapping) or not decided:
+            if not self._last:
+                raise ValidationError("leader ended before its first frame.")
+        elif isinstance(action, Mapping) and action:
+            self._last = dict(action)
+        else:
             raise ValidationError(f"leader gave nothing usable: {self._policy.last_error}.")
-        self._last = dict(decided)
-        return dict(decided)
+        return dict(self._last)
 
     def get_teleop_events(self) -> dict[str, Any] | None:
-        """What the leader itself tells besides its targets. Raises what the leader raises."""
+        """Return the leader's own events. Raises the leader's own exceptions."""
         return self._policy.events()
-
-    def _held(self) -> Action:
-        if not self._last:
-            raise ValidationError("leader ended before its first frame.")
-        return dict(self._last)

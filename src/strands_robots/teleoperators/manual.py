@@ -16,7 +16,6 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import Any, Self
 
 from strands_robots.policies.base import Action, Ranges
@@ -30,16 +29,16 @@ UNBOUNDED_PER_S = 45.0
 """The same for a joint without a range, in its unit a second."""
 
 UP, DOWN = "qwertyuiop", "asdfghjkl;"
-"""The key of each joint, in their order, that raises and lowers it."""
+"""Keys that raise and lower each joint, in the joints' order."""
 
 STEP_S = 0.1
-"""One press moves a joint as far as a held one goes in so long."""
+"""One press moves a joint as far as a key held down for this long."""
 
 _END = "\x1b\x03\x04"
 
 PORT = "/dev/input/js0"
 DEAD_ZONE = 0.1
-"""Part of a stick's way that is taken for rest."""
+"""Part of a stick's travel that counts as rest."""
 
 _EVENT = struct.Struct("<IhBB")
 _BUTTON, _AXIS, _OPENING = 1, 2, 0x80
@@ -49,11 +48,11 @@ _GAP_MAX_S = 0.1
 
 
 class Jog:
-    """The targets of some joints, each moved by itself and kept inside its range.
+    """Targets of some joints, each moved on its own and kept inside its range.
 
     Args:
-        start: where they stand, by action key, in the follower's units.
-        ranges: lowest and highest target by action key; what is not named is unbounded.
+        start: their positions by action key, in the follower's units.
+        ranges: lowest and highest target by action key; a missing key is unbounded.
     """
 
     def __init__(self, start: Mapping[str, float], ranges: Ranges) -> None:
@@ -65,21 +64,21 @@ class Jog:
 
     @property
     def targets(self) -> Action:
-        """Every target as it is now."""
+        """The present targets of all joints."""
         return dict(self._targets)
 
     def move(self, key: str, push: float, seconds: float) -> None:
-        """Push a joint for so long; ``push`` is -1 to 1."""
+        """Push a joint for some seconds; ``push`` is -1 to 1."""
         low, high = self._ranges[key]
         speed = (high - low) * SHARE_PER_S if math.isfinite(high - low) else UNBOUNDED_PER_S
         self._targets[key] = min(max(self._targets[key] + push * speed * seconds, low), high)
 
 
 class KeyboardLeader:
-    """Reads single keys of a terminal while it is entered as a context; Escape or Ctrl-D ends the leading.
+    """A leader of single keys, read from a terminal while it is entered as a context; Escape or Ctrl-D ends it.
 
     Args:
-        start: where the follower stands, by action key; at most ten joints.
+        start: the follower's position by action key; at most ten joints.
         ranges: of the follower's action keys.
         fd: the terminal; standard input by default.
 
@@ -100,12 +99,12 @@ class KeyboardLeader:
 
     @property
     def is_connected(self) -> bool:
-        """Whether the terminal gives single keys."""
+        """The terminal gives single keys."""
         return self._before is not None
 
     @property
     def help(self) -> list[tuple[str, str, str]]:
-        """For each joint: its name, the key that raises it and the one that lowers it."""
+        """Name, raising key and lowering key of each joint."""
         return [(key, UP[index], DOWN[index]) for index, key in enumerate(self._jog.keys)]
 
     def __enter__(self) -> Self:
@@ -113,15 +112,13 @@ class KeyboardLeader:
         tty.setcbreak(self._fd)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         before, self._before = self._before, None
         if before is not None:
             termios.tcsetattr(self._fd, termios.TCSADRAIN, before)
 
     def get_action(self) -> Action:
-        """Every target, after the keys that were pressed since.
+        """Return all targets after the keys pressed since the last call.
 
         Raises:
             LeaderFinished: Escape or Ctrl-D was pressed.
@@ -140,10 +137,10 @@ class KeyboardLeader:
 
 
 class GamepadLeader:
-    """Axis 0 pushes the first joint, axis 1 the second and so on; button 1 ends the leading.
+    """A leader of stick axes: axis 0 pushes the first joint, axis 1 the second and so on; button 1 ends it.
 
     Args:
-        start: where the follower stands, by action key.
+        start: the follower's position by action key.
         ranges: of the follower's action keys.
         port: the joystick device.
         now: monotonic seconds.
@@ -171,21 +168,19 @@ class GamepadLeader:
 
     @property
     def is_connected(self) -> bool:
-        """Whether the device is open."""
+        """The device is open."""
         return self._fd is not None
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         fd, self._fd = self._fd, None
         if fd is not None:
             os.close(fd)
 
     def get_action(self) -> Action:
-        """Every target, pushed by the sticks for the time since the last call, of which at most 0.1 s counts.
+        """Return all targets, pushed by the sticks for the time since the last call, of which at most 0.1 s counts.
 
         Raises:
             LeaderFinished: button 1 was pressed.
@@ -203,7 +198,7 @@ class GamepadLeader:
         return self._jog.targets
 
     def get_teleop_events(self) -> dict[str, Any]:
-        """The buttons by number."""
+        """Return the buttons' states by number."""
         return {f"button_{number}": pressed for number, pressed in self._buttons.items()}
 
     def _read(self) -> None:

@@ -1,7 +1,11 @@
-"""A recording as a leader: frames of a file, played at the times they were recorded at.
+"""Recordings as leaders: frames of a file, played at the times at which they were recorded.
 
 A ``.csv`` file has a first line of names: ``t`` (seconds, rising) and action keys, in the follower's units. An empty
-cell leaves its joint where it was.
+cell leaves its joint unchanged.
+
+A LeRobot dataset (v2.1 and v3.0) has ``data/chunk-000/*.parquet`` with the columns ``action`` (a list of numbers),
+``timestamp`` (seconds in its episode) and ``episode_index``, and the action's names in ``meta/info.json``,
+``features.action.names``: a list, or a mapping of one list.
 """
 
 from __future__ import annotations
@@ -26,11 +30,11 @@ _COLUMNS = ("action", "timestamp", "episode_index")
 
 
 class RecordedLeader:
-    """Plays ``frames`` from its first ``get_action``, in between on a straight line.
+    """Leader that plays frames from its first ``get_action`` and interpolates linearly between them.
 
     Args:
         frames: at least one, in the order of their times.
-        speed: times as fast, above 0 and at most 10.
+        speed: factor of the recorded speed, above 0 and at most 10.
         now: monotonic seconds.
 
     Raises:
@@ -47,32 +51,33 @@ class RecordedLeader:
         self._actions = [filled := {**filled, **action} for _, action in frames]
         self._speed = number("speed", speed, above=0, high=10)
         self._now = now
-        self._began: float | None = None
+        self._started_at: float | None = None
         self.is_connected = True
 
     @property
     def duration(self) -> float:
-        """How many seconds it plays."""
+        """Length in seconds, at the chosen speed."""
         return self._times[-1] / self._speed
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The action keys it leads."""
+        """Action keys of the recording."""
         return tuple(self._actions[-1])
 
     @property
     def position(self) -> float:
-        """How many of its seconds are played."""
-        return 0.0 if self._began is None else min((self._now() - self._began), self.duration)
+        """Seconds played so far."""
+        return 0.0 if self._started_at is None else min(self._now() - self._started_at, self.duration)
 
     def get_action(self) -> Action:
-        """The targets of this moment.
+        """Return the present targets.
 
         Raises:
             LeaderFinished: the recording is over.
         """
-        self._began = self._now() if self._began is None else self._began
-        seconds = (self._now() - self._began) * self._speed
+        if self._started_at is None:
+            self._started_at = self._now()
+        seconds = (self._now() - self._started_at) * self._speed
         if seconds > self._times[-1]:
             raise LeaderFinished("the recording is over")
         at = bisect.bisect_right(self._times, seconds) - 1
@@ -85,10 +90,10 @@ class RecordedLeader:
 
 
 def read_frames(path: Path) -> list[Frame]:
-    """The frames of a ``.csv`` file.
+    """Read the frames of a ``.csv`` file.
 
     Raises:
-        ValidationError: no such file, another kind of file, or a line that is none; the sentence names the line.
+        ValidationError: no such file, another kind of file, or a malformed line, which the message names.
     """
     if path.suffix != ".csv":
         raise ValidationError(f"a recording must be a .csv, .parquet or .mcap file, not {shown(str(path))}.")
@@ -105,20 +110,20 @@ def read_frames(path: Path) -> list[Frame]:
 
 def write_csv(path: Path, frames: Iterable[Frame]) -> None:
     """Write frames as ``.csv``; the columns are the keys of all of them."""
-    kept = list(frames)
-    names = list(dict.fromkeys(key for _, action in kept for key in action))
+    rows = list(frames)
+    names = list(dict.fromkeys(key for _, action in rows for key in action))
     with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow([_TIME, *names])
-        rows.writerows([f"{seconds:.6f}", *(action.get(name, "") for name in names)] for seconds, action in kept)
+        writer = csv.writer(file)
+        writer.writerow([_TIME, *names])
+        writer.writerows([f"{seconds:.6f}", *(action.get(name, "") for name in names)] for seconds, action in rows)
 
 
-def _frame(names: list[str], row: list[str], where: str) -> Frame:
+def _frame(names: list[str], row: list[str], place: str) -> Frame:
     if len(row) != len(names):
-        raise ValidationError(f"{where} must have {len(names)} cells, not {len(row)}.")
+        raise ValidationError(f"{place} must have {len(names)} cells, not {len(row)}.")
     cells = dict(zip(names, row, strict=True))
-    seconds = _cell(f"t in {where}", cells.pop(_TIME))
-    return seconds, {name: _cell(f"{name} in {where}", cell) for name, cell in cells.items() if cell.strip()}
+    seconds = _cell(f"t in {place}", cells.pop(_TIME))
+    return seconds, {name: _cell(f"{name} in {place}", cell) for name, cell in cells.items() if cell.strip()}
 
 
 def _cell(name: str, cell: str) -> float:
@@ -130,7 +135,7 @@ def _cell(name: str, cell: str) -> float:
 
 
 def read_episode(path: Path, episode: str | None = None) -> list[Frame]:
-    """The frames of one episode.
+    """Read the frames of one episode of a LeRobot dataset.
 
     Args:
         path: a data file inside its dataset.
@@ -160,30 +165,29 @@ def read_episode(path: Path, episode: str | None = None) -> list[Frame]:
     frames: list[Frame] = []
     rows = zip(columns["episode_index"], columns["timestamp"], columns["action"], strict=True)
     for row, (_, seconds, action) in enumerate(each for each in rows if each[0] == wanted):
-        where = f"row {row} of episode {wanted} in {path.name}"
+        place = f"row {row} of episode {wanted} in {path.name}"
         if not isinstance(action, Sequence) or len(action) != len(names):
-            raise ValidationError(f"action of {where} must have {len(names)} numbers ({', '.join(names)}).")
-        values = {name: number(f"{name} in {where}", value) for name, value in zip(names, action, strict=True)}
-        frames.append((number(f"timestamp of {where}", seconds), values))
+            raise ValidationError(f"action of {place} must have {len(names)} numbers ({', '.join(names)}).")
+        values = {name: number(f"{name} in {place}", value) for name, value in zip(names, action, strict=True)}
+        frames.append((number(f"timestamp of {place}", seconds), values))
     return frames
 
 
-def _episode(path: Path, column: list[Any], asked: str | None) -> int:
+def _episode(path: Path, column: list[Any], requested: str | None) -> int:
     known = sorted(set(column))
-    if asked is None and len(known) == 1:
+    if requested is None and len(known) == 1:
         return int(known[0])
-    if asked is not None and asked.isdecimal() and int(asked) in known:
-        return int(asked)
-    held = f"{known[0]} to {known[-1]}" if known else "none"
-    raise ValidationError(f"device must be an episode of {path.name} ({held}), not {shown(asked)}.")
+    if requested is not None and requested.isdecimal() and int(requested) in known:
+        return int(requested)
+    choices = f"{known[0]} to {known[-1]}" if known else "none"
+    raise ValidationError(f"device must be an episode of {path.name} ({choices}), not {shown(requested)}.")
 
 
 def _names(path: Path) -> list[str]:
-    """What the numbers of an action are called."""
     info = next((each / "meta" / "info.json" for each in path.resolve().parents if (each / "meta").is_dir()), None)
     try:
-        told = json.loads(info.read_text(encoding="utf-8")) if info is not None else {}
-        names = told["features"]["action"]["names"]
+        content = json.loads(info.read_text(encoding="utf-8")) if info is not None else {}
+        names = content["features"]["action"]["names"]
     except (OSError, ValueError, KeyError, TypeError) as exc:
         raise ValidationError(f"{path.name} needs meta/info.json of its dataset, which names the actions.") from exc
     if isinstance(names, Mapping) and len(names) == 1:
