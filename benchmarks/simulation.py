@@ -1,4 +1,4 @@
-"""Physics: our stepping against a plain loop, and thirty-two arms in real time in one process."""
+"""Physics: stepping against a plain loop, and 32 arms in real time in a process."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ ANNOUNCED_S = 12.0
 
 
 def run(*, quick: bool = False) -> list[Row]:
-    """Every row of this part."""
+    """Measure every row of this part."""
     return [stepping(2 if quick else 7), fleet(4.0 if quick else 15.0)]
 
 
 def stepping(repeats: int) -> Row:
-    """``Simulation.step(10_000)`` and a Python loop of ``mj_step`` on the same model, in turn; medians."""
+    """Compare ``Simulation.step(10_000)`` with a loop of ``mj_step`` by medians."""
     simulation = Simulation(realtime=False)
     simulation.add_robot("arm", "so100")
     plain = compile_stage(Plan(robots=(RobotPlan("arm", find("so100")),)))
@@ -66,7 +66,7 @@ def stepping(repeats: int) -> Row:
 
 
 def fleet(seconds: float) -> Row:
-    """Worlds of one arm each, served on Device Connect, a rollout of 50 Hz in each, heard by another process."""
+    """Serve worlds of one arm with a rollout of 50 Hz each, and count their events."""
     usual = settings.raw("STRANDS_DC_STREAM_HZ")
     settings.put("STRANDS_DC_STREAM_HZ", str(PUBLISH_HZ))
     logging.disable(logging.ERROR)
@@ -90,7 +90,7 @@ def fleet(seconds: float) -> Row:
             began, cpu = time.monotonic(), process.cpu_times()
             listener.stdin.write("go\n")
             listener.stdin.flush()
-            heard = json.loads(listener.stdout.readline())
+            received = json.loads(listener.stdout.readline())
             real, spent = time.monotonic() - began, process.cpu_times()
             after = [moment(world) for world in worlds]
         used = (spent.user + spent.system - cpu.user - cpu.system) / real
@@ -106,12 +106,12 @@ def fleet(seconds: float) -> Row:
         settings.put("STRANDS_DC_STREAM_HZ", usual)
     pairs = zip(before, after, strict=True)
     factor = min((later.sim_time - sooner.sim_time) / (later.at - sooner.at) for sooner, later in pairs)
-    slowest = min(heard.values()) if len(heard) == FLEET else 0.0
+    slowest = min(received.values()) if len(received) == FLEET else 0.0
     return Row(
         f"{FLEET} simulated arms in one process on Device Connect, a 50 Hz rollout each, each publishing its joints, "
         f"steps and state at {PUBLISH_HZ} Hz: real-time factor",
         f"{factor:.3f} (slowest arm), {rate:.0f} actions/s each, {100 * used / FLEET:.2f} % of a core and "
-        f"{grown / FLEET:.2f} MB per robot; {slowest:.1f} observations/s heard of the least heard arm",
+        f"{grown / FLEET:.2f} MB per robot; {slowest:.1f} observations/s received of the slowest arm",
         "real time, 1.0",
         factor,
         ">= 1.0, to a thousandth",
@@ -120,7 +120,7 @@ def fleet(seconds: float) -> Row:
 
 
 def listen(port: int, seconds: float) -> None:
-    """Another process that hears every arm: prints how many observations a second came of each."""
+    """Print the observations a second of every arm; run as another process."""
     counts: Counter[str] = Counter()
     with (
         FleetClient(loopback_config(port)) as client,
@@ -144,7 +144,10 @@ class Moment(NamedTuple):
 
 
 def moment(world: Simulation) -> Moment:
-    """The clocks just after the pacing thread has visited ``world``: its ticks are not part of the measurement."""
+    """Return both clocks just after a visit of the pacing thread to ``world``.
+
+    So the ticks of that thread are not part of the measurement.
+    """
     first = world.get_state()["sim_time"]
     while (now := world.get_state()["sim_time"]) == first:
         time.sleep(0.0002)
@@ -152,7 +155,7 @@ def moment(world: Simulation) -> Moment:
 
 
 def timed(work: Callable[[], object]) -> float:
-    """Seconds that ``work`` takes."""
+    """Return the seconds that ``work`` takes."""
     began = time.perf_counter()
     work()
     return time.perf_counter() - began

@@ -63,7 +63,7 @@ def test_name_makes_a_running_simulation_with_that_robot() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "reason"),
     [
         ({"name": "so10"}, "near it: so101, so100"),
         ({"name": ""}, "name must be"),
@@ -77,8 +77,8 @@ def test_name_makes_a_running_simulation_with_that_robot() -> None:
     ],
     ids=str,
 )
-def test_bad_argument_is_refused_by_name(arguments: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
+def test_bad_argument_is_refused_by_name(arguments: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ValidationError, match=reason):
         Robot(**arguments)
 
 

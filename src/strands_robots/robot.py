@@ -1,4 +1,4 @@
-"""The factory ``Robot(name)`` for simulated and real robots, and ``run``, which serves a robot until a signal."""
+"""The factory ``Robot(name)``, and ``run``, which serves a robot until a signal."""
 
 from __future__ import annotations
 
@@ -97,10 +97,10 @@ def run(
     until: threading.Event | None = None,
     **network: Any,
 ) -> StopVerdict:
-    """Serve ``robot`` on Device Connect until SIGINT, SIGTERM or ``until``, then halt it and leave the network.
+    """Serve ``robot`` until SIGINT, SIGTERM or ``until``, then halt it and leave.
 
-    Without a network in the arguments or the environment it is served on this machine alone. Outside the main
-    thread there are no signals, so ``until`` is needed.
+    It is served on Device Connect; without a network in arguments or environment on this machine alone. Outside the
+    main thread there are no signals, so ``until`` is needed.
 
     Args:
         robot: any robot that ``init_device_connect`` accepts.

@@ -1,4 +1,4 @@
-"""The control loop: its rate, its ends, its events, and that it writes nothing after a stop."""
+"""The control loop: rate, ends, events, and no write after a stop."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_policy_that_is_done_completes_the_rollout_and_the_body_holds() -> None:
     one, body = run(policy)
     assert (one.state, one.step_count, one.error) == ("completed", 2, "")
     assert [action for _, action in body.writes] == [{"a": 0.1}, {"a": 0.2}]
-    assert (body.holds, policy.closed, policy.told) == (1, 1, ["wave"])
+    assert (body.holds, policy.closed, policy.instructions) == (1, 1, ["wave"])
 
 
 def test_rollout_ends_after_its_duration() -> None:
@@ -196,7 +196,8 @@ def test_stop_ends_the_loop_at_once() -> None:
     one = rollout(body, policy, hz=0.01)
     one.start()
     eventually(lambda: body.writes)
-    assert one.stop(timeout=20) is True
+    one.request_stop()
+    assert one.join(20)
     assert (one.state, one.running, body.holds) == ("stopped", False, 1)
     assert policy.interrupted.is_set()
 
@@ -213,7 +214,8 @@ def test_loop_that_outlives_its_stop_is_not_reported_stopped_and_writes_nothing(
     one = rollout(body, ScriptedPolicy([{"a": 0.1}, thinking], always={"a": 0.9}))
     one.start()
     assert thinks.wait(20)
-    assert one.stop(timeout=0.05) is False
+    one.request_stop()
+    assert one.ended_by(time.monotonic() + 0.05)["stopped"] is False
     assert one.running
     written = len(body.writes)
     go_on.set()
@@ -256,12 +258,12 @@ def test_rollout_keeps_its_rate_on_the_real_clock() -> None:
     assert one.join(20)
     dues = [until for until, _ in clock.waits]
     ticks = [(due - dues[0]) * 100 for due in dues]
-    assert ticks == pytest.approx([round(tick) for tick in ticks], abs=1e-3), "every tick is one of the beat"
+    assert ticks == pytest.approx([round(tick) for tick in ticks], abs=1e-3), "every tick is a multiple of the period"
     assert all(later > sooner for sooner, later in itertools.pairwise(dues)), "what was missed is not made up"
     assert all(over >= until for until, over in clock.waits)
     # However late the machine was, each tick until the last was a step or was missed.
-    told = one.step_count + one.missed_ticks
-    assert (dues[-1] - body.writes[0][0]) * 100 - 1e-3 <= told <= (dues[-1] - before) * 100 + 1e-3
+    ticked = one.step_count + one.missed_ticks
+    assert (dues[-1] - body.writes[0][0]) * 100 - 1e-3 <= ticked <= (dues[-1] - before) * 100 + 1e-3
     assert one.elapsed_s >= 0.5
 
 
@@ -278,11 +280,17 @@ def test_observer_may_stop_its_own_rollout() -> None:
     observers = RolloutObservers()
     body = RecordingBody()
     one = rollout(body, ScriptedPolicy([], always={"a": 0.5}), observers=observers)
-    said: list[bool] = []
-    observers.subscribe(lambda event: said.append(one.stop()) if event.kind == "step" else None)
+    ended: list[bool] = []
+
+    def stop(event: RolloutEvent) -> None:
+        if event.kind == "step":
+            one.request_stop()
+            ended.append(one.join())
+
+    observers.subscribe(stop)
     one.start()
     assert one.join(20)
-    assert said == [False]
+    assert ended == [False]
     assert len(body.writes) == 1
 
 

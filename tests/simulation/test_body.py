@@ -1,4 +1,4 @@
-"""Pose and velocity of the bases of simulated robots, and the units of their commands."""
+"""Pose and velocity of simulated bases, and the units of commands."""
 
 from __future__ import annotations
 

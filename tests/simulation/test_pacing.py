@@ -1,4 +1,4 @@
-"""Real time, locks and halts: reads never wait, commands never follow a halt, and no thread remains."""
+"""Real time, locks and halts of a simulated world."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_simulated_time_follows_real_time(physics: Physics) -> None:
     with clock.running():
         for passed in (0.05, 0.55):
             eventually(lambda passed=passed: physics.snapshot.time > passed)
-            # Never ahead of real time; how far behind is the machine's affair.
+            # Never ahead of real time; the delay depends on the machine.
             assert physics.snapshot.time <= time.monotonic() - began + 0.05
     clock.close()
     assert pacers() == []
@@ -146,7 +146,7 @@ def test_halt_freezes_a_moving_arm(world: Simulation) -> None:
     where = world.get_observation()["shoulder_pan"]
     assert verdict.stopped is True
     steps = world.get_state()["step_count"]
-    eventually(lambda: world.get_state()["step_count"] > steps + 300, what="physics goes on")
+    eventually(lambda: world.get_state()["step_count"] > steps + 300, what="physics continues")
     # It runs out its speed within a few degrees and stays, instead of going on to 2.0.
     assert abs(world.get_observation()["shoulder_pan"] - where) < 0.35
 

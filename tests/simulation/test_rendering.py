@@ -1,4 +1,4 @@
-"""Pictures without OpenGL, paths and animations; with OpenGL where the machine has it."""
+"""Pictures with and without OpenGL, paths and animations."""
 
 from __future__ import annotations
 
@@ -173,13 +173,13 @@ def test_available_backend_is_chosen_without_a_display(
         gl.prepare.cache_clear()
 
 
-@pytest.mark.parametrize("asked", ["egl", "osmesa", "glfw"])
-def test_configured_backend_that_cannot_load_is_disabled(monkeypatch: pytest.MonkeyPatch, asked: str) -> None:
-    monkeypatch.setenv("MUJOCO_GL", asked)
+@pytest.mark.parametrize("configured", ["egl", "osmesa", "glfw"])
+def test_configured_backend_that_cannot_load_is_disabled(monkeypatch: pytest.MonkeyPatch, configured: str) -> None:
+    monkeypatch.setenv("MUJOCO_GL", configured)
     monkeypatch.setattr(gl, "loads", lambda backend: False)
     gl.prepare.cache_clear()
     try:
-        assert gl.prepare() == ("glfw" if asked == "glfw" else "disable")
+        assert gl.prepare() == ("glfw" if configured == "glfw" else "disable")
     finally:
         gl.prepare.cache_clear()
 

@@ -1,4 +1,4 @@
-"""Models: lengths and limits of the published ones, stable at rest, quick to follow, straight to drive."""
+"""Models: lengths and limits of the published ones, and their motion."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_model_is_stable_at_every_timestep(model: str, timestep: float) -> None:
 
 @pytest.fixture
 def descriptions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package with the shape of ``robot_descriptions``: names, and one module for each that knows its file."""
+    """A stand-in for the package ``robot_descriptions``."""
     package = tmp_path / "robot_descriptions"
     package.mkdir()
     names = ["pole_mj_description", "far_description"]

@@ -1,4 +1,4 @@
-"""The world's verbs: building it, stepping it, reading it, and refusing what is out of domain."""
+"""The world's verbs: building, stepping, reading, and refusals."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def test_missing_mujoco_is_reported_with_the_extra() -> None:
         "try:\n    from strands_robots.simulation import Simulation\n"
         "except ImportError as e:\n    print(e)"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said == "Simulation needs the [sim] extra: in the clone, .venv/bin/pip install -e '.[sim]'.\n"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output == "Simulation needs the [sim] extra: in the clone, .venv/bin/pip install -e '.[sim]'.\n"
 
 
 def test_step_advances_exactly_that_many_steps(world: Simulation) -> None:

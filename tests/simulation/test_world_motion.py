@@ -1,4 +1,4 @@
-"""Motion in a simulated world: one rollout for each robot, stops that report truly, nothing written after a halt."""
+"""Motion in a simulated world: rollouts, leaders, single actions and stops."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def busy(world: Simulation) -> list[str]:
 
 
 class Stuck:
-    """A policy that does not come back from its third step until it is let go."""
+    """A policy whose third step blocks until ``let_go`` is set."""
 
     uses_cameras = False
 
@@ -63,7 +63,7 @@ class Stuck:
         return {"shoulder_pan": 1.5}
 
     def interrupt(self) -> None:
-        """It does not listen."""
+        """Do nothing: this policy ignores the stop."""
 
     def close(self) -> None:
         """Nothing to free."""
@@ -91,7 +91,7 @@ def test_each_robot_runs_its_own_policy(world: Simulation, events: list[RolloutE
     assert world.stop_policy("left")["stopped"] is True
     assert busy(world) == ["right"]
     step = world.list_policies_running()[0]["step"]
-    eventually(lambda: world.list_policies_running()[0]["step"] > step + 5, what="the other goes on")
+    eventually(lambda: world.list_policies_running()[0]["step"] > step + 5, what="the other robot continues")
 
 
 def test_a_rollout_moves_only_its_robot(world: Simulation, events: list[RolloutEvent]) -> None:
@@ -421,19 +421,19 @@ def test_reset_that_waited_for_the_lock_is_refused_after_a_halt(
     world.step(500)
     before = world.get_observation("left")
     answers: list[Any] = []
-    asked: list[str] = []
+    requested: list[str] = []
     permit = world.gate.permit
 
     def noted(verb: str) -> Permit:
-        given = permit(verb)
-        asked.append(verb)
-        return given
+        granted = permit(verb)
+        requested.append(verb)
+        return granted
 
     monkeypatch.setattr(world.gate, "permit", noted)
     with world.starting:
         thread = threading.Thread(target=lambda: answers.append(world.reset()))
         thread.start()
-        eventually(lambda: "reset" in asked)
+        eventually(lambda: "reset" in requested)
         thread.join(0.1)
         assert thread.is_alive(), "it waits for the lock of a world that is being built"
         assert world.halt("test").stopped is True

@@ -1,4 +1,4 @@
-"""Policies by name: the built-in ones, and those that other packages register under the entry-point group."""
+"""Policies by name: built-in ones, and those registered under an entry point."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _BUILT_IN = {
 
 
 def policy_names() -> tuple[str, ...]:
-    """Return every provider that :func:`create_policy` knows by its own name: built-in ones first, then plug-ins."""
+    """Return the names of all providers: built-in ones first, then plug-ins."""
     return (*_BUILT_IN, *(name for name in sorted(_plug_ins()) if name not in _BUILT_IN))
 
 
@@ -47,7 +47,7 @@ def resolve_provider(provider: object) -> str:
 
 
 def create_policy(provider: str, **options: Any) -> Policy:
-    """Make a policy of ``provider``; cheap, because loading and connecting happen in its ``reset``.
+    """Make a policy; cheap, because its ``reset`` loads and connects.
 
     ``policy_port=0`` is the provider's own default, and a port is passed only to a provider that takes one.
 

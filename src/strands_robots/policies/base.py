@@ -1,4 +1,4 @@
-"""The policy protocol, and the check of the actions that policies and leaders ask of a robot."""
+"""The policy protocol, and the check of actions of policies and leaders."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Ranges = Mapping[str, tuple[float, float]]
 
 
 class PolicyError(StrandsRobotsError, RuntimeError):
-    """A policy cannot go on; its message is complete, so it is logged without a traceback."""
+    """A policy cannot go on; the message is logged without a traceback."""
 
 
 @runtime_checkable
 class Policy(Protocol):
-    """Decides a robot's actions. One object serves one rollout, on that rollout's control thread.
+    """Source of a robot's actions; one object serves one rollout, on its thread.
 
     ``uses_cameras`` is False for a policy that looks at numbers alone: it then works while a camera fails.
     """
@@ -30,20 +30,20 @@ class Policy(Protocol):
     uses_cameras: bool
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
-        """Prepare for a task: load, connect, seed. Raises whatever makes the task impossible."""
+        """Prepare for a task: load, connect, seed. Raises when that is impossible."""
 
     def act(self, observation: Mapping[str, Any]) -> Action | Sequence[Action] | None:
-        """Return the next action, or a chunk of them played one a control step; None when the task is done.
+        """Return an action, a chunk played one a control step, or None when done.
 
         An empty chunk lets this control step pass without a command. Only numbers under the robot's own action keys
         are accepted; anything else ends the rollout with an error, and the body keeps its last position.
         """
 
     def interrupt(self) -> None:
-        """Make a waiting ``reset`` or ``act`` give up. Called from another thread; never waits."""
+        """Make ``reset`` or ``act`` give up. Called from another thread; never waits."""
 
     def close(self) -> None:
-        """Free the policy's resources. Called once, whatever happened, also after a failed reset."""
+        """Free the policy's resources. Called once, also after a failed reset."""
 
 
 def checked_action(action: object, ranges: Ranges) -> Action:
@@ -72,7 +72,7 @@ def numbers(observation: Mapping[str, object]) -> dict[str, float]:
 
 
 def _plain(value: object) -> object:
-    """Unwrap a scalar of an array package to a Python number; return anything else unchanged."""
+    """Unwrap a scalar of an array package; return anything else unchanged."""
     item = getattr(value, "item", None)
     return item() if callable(item) and getattr(value, "ndim", None) == 0 else value
 

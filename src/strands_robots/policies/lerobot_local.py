@@ -45,7 +45,7 @@ class LeRobotPolicy:
         self._after: Any = None
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
-        """Load the checkpoint, which is fetched from the hub the first time; that takes minutes."""
+        """Load the checkpoint; fetching it from the hub first takes minutes."""
         factory = import_module("lerobot.policies.factory")
         config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(self._checkpoint)
         if self._device:

@@ -1,4 +1,4 @@
-"""A policy without a model: smooth motion inside the joint ranges, the same every time."""
+"""A policy without a model: smooth, repeatable motion inside the joint ranges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 
 
 class MockPolicy:
-    """Policy that moves every joint along two slow sines around the middle of its range, faded in from its position.
+    """Policy that moves every joint along two slow sines around its middle.
 
     Motion is a function of the seed, the instruction, the start position and the count of steps, so a run can be
     repeated exactly. It starts at the present position with zero velocity and acceleration. A joint without a
@@ -81,6 +81,6 @@ class MockPolicy:
 
 
 def _smooth_step(part: float) -> float:
-    """Return 0 before 0, 1 after 1, and between them the quintic without a jump of velocity or acceleration."""
+    """Return the quintic from 0 to 1, smooth in velocity and acceleration."""
     x = min(max(part, 0.0), 1.0)
     return x * x * x * (x * (6 * x - 15) + 10)

@@ -1,4 +1,4 @@
-"""The control loop: a policy drives a body at a steady rate until its time is over, it is done, or it is stopped.
+"""The control loop: a policy drives a body at a steady rate until it ends.
 
 The lock discipline of every write: a body sends an action only while its permit is valid, and checks that under the
 same lock as the write. A stop voids the permit first and then passes that lock once; from then on nothing is written.
@@ -32,7 +32,7 @@ STEPS_MAX = 10_000_000
 """Most actions of one rollout."""
 
 STOP_JOIN_S = 2.0
-"""How long :meth:`Rollout.stop` waits for the loop by default."""
+"""Seconds that a stop of one robot waits for its loop."""
 
 
 class RolloutOptions(TypedDict):
@@ -89,7 +89,7 @@ class Body(Protocol):
         """
 
     def hold(self, permit: Permit | None = None) -> None:
-        """Freeze the body where it is; do nothing when ``permit`` was revoked, because that halt freezes it."""
+        """Freeze the body, unless ``permit`` was revoked: then that halt freezes it."""
 
     def running(self) -> AbstractContextManager[None]:
         """Return a context that is entered while a loop drives the body."""
@@ -109,7 +109,7 @@ class Clock:
 
 
 class RolloutObservers:
-    """Observers of rollout events. One that raises stays subscribed and is logged once for each kind of error."""
+    """Observers of rollout events; one that raises is logged and stays subscribed."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -117,7 +117,7 @@ class RolloutObservers:
         self._logged: set[tuple[int, str]] = set()
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Call ``observer`` with every event until the returned callable is called, which may be called twice."""
+        """Call ``observer`` with every event; the returned callable ends that."""
         with self._lock:
             self._observers = (*self._observers, observer)
         once = threading.Lock()
@@ -149,7 +149,7 @@ class Rollout:
     Args:
         body: driven by the policy.
         policy: decides the actions; closed at the end.
-        permit: permission to move, revoked by a halt and withdrawn by :meth:`stop`.
+        permit: permission to move, revoked by a halt and withdrawn by :meth:`request_stop`.
         instruction: the task, passed to the policy.
         policy_name: the policy's name in events and answers.
         duration: seconds, or None for no end.
@@ -199,7 +199,7 @@ class Rollout:
 
     @property
     def running(self) -> bool:
-        """True from :meth:`start` until the loop's thread has ended, even after a stop was requested."""
+        """True from :meth:`start` until the loop's thread has ended."""
         return self.state == "running" or self._thread.is_alive()
 
     @property
@@ -231,7 +231,7 @@ class Rollout:
         return not self.running
 
     def request_stop(self) -> None:
-        """Void the permit, wake the loop and tell the policy; returns at once."""
+        """Void the permit, wake the loop and interrupt the policy; return at once."""
         self._permit.withdraw()
         self._stop_requested.set()
         try:
@@ -239,16 +239,11 @@ class Rollout:
         except Exception:
             logger.exception("The policy %s of %s raised when interrupted.", self.policy_name, self.robot)
 
-    def stop(self, timeout: float = STOP_JOIN_S) -> bool:
-        """Stop, and return False when the loop has not ended within ``timeout`` seconds.
+    def ended_by(self, deadline: float) -> Envelope:
+        """Answer a stop: wait for the loop's end until ``deadline`` (monotonic).
 
         A loop that outlives it, in a policy that computes or on a bus that hangs, sends no action any more.
         """
-        self.request_stop()
-        return self.join(timeout)
-
-    def ended_by(self, deadline: float) -> Envelope:
-        """Answer a stop: wait for the requested end until ``deadline`` on the monotonic clock."""
         if self.join(max(0.0, deadline - time.monotonic())):
             return success("Stopped.", stopped=True)
         return error(

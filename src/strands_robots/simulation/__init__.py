@@ -1,4 +1,4 @@
-"""Robots in a MuJoCo world: arms, a rover and any MJCF or URDF, behind the same contract as real ones.
+"""Simulated robots in MuJoCo: arms, a rover, and any MJCF or URDF model.
 
 Importing this package alone loads neither numpy nor MuJoCo; :class:`Simulation` is loaded when it is first used, and
 without the ``sim`` extra that raises one sentence.

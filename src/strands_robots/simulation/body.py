@@ -1,4 +1,4 @@
-"""One robot of a simulated world: its observations, its actions, its base and the units of its commands."""
+"""One robot of a simulated world: observations, actions, base and units."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class RobotBody:
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest command of each action key; infinite where the model gives none."""
+        """Lowest and highest command of each action key; infinite without a limit."""
         return {key: (a.low, a.high) for key, a in self.parts.actuators.items()}
 
     @property
@@ -59,13 +59,13 @@ class RobotBody:
 
     @property
     def joint_units(self) -> dict[str, str]:
-        """``radians`` or ``metres`` of each action key whose position servo is commanded in its joint's own unit."""
+        """``radians`` or ``metres`` of each position servo commanded in its joint's unit."""
         snapshot, parts = self._present()
         units = {key: _unit(snapshot.stage.model, actuator) for key, actuator in parts.actuators.items()}
         return {key: unit for key, unit in units.items() if unit}
 
     def get_observation(self) -> dict[str, float]:
-        """Return joint positions (rad, or m for a sliding joint) and the pose of a free base. Never waits."""
+        """Return joint positions (rad; m for a slide) and the pose of a free base."""
         snapshot, parts = self._present()
         return snapshot.observation(parts)
 
@@ -73,7 +73,7 @@ class RobotBody:
     """An observation of a simulated robot holds numbers alone."""
 
     def send_action(self, action: Mapping[str, float], permit: Permit | None = None) -> dict[str, float]:
-        """Set targets for physics to follow, clamped to the actuators' ranges, and return them.
+        """Set targets, clamped to the actuators' ranges, and return them.
 
         Raises:
             ValidationError: an unknown key, or a value that is no finite number; nothing was written.
@@ -85,22 +85,22 @@ class RobotBody:
         return sent
 
     def hold(self, permit: Permit | None = None) -> None:
-        """Freeze the robot where it is; do nothing when ``permit`` was revoked, because that halt froze it."""
+        """Freeze the robot, unless ``permit`` was revoked: then that halt froze it."""
         self._physics.hold(self.name, permit)
 
     def running(self) -> AbstractContextManager[None]:
-        """Return a context in which physics keeps real time, for a loop that drives this robot."""
+        """Return a context in which physics keeps real time."""
         return self._clock.running()
 
     def tip_position(self) -> tuple[float, float, float]:
-        """Return the gripper tip's place in the world, metres; the base's where there is no gripper."""
+        """Return the place of the gripper's tip, else of the base, in metres."""
         snapshot, parts = self._present()
         data = snapshot.data()
         x, y, z = data.site(parts.tip).xpos if parts.tip else data.body(parts.root).xpos
         return float(x), float(y), float(z)
 
     def base_pose(self) -> dict[str, Any]:
-        """Return ``x``, ``y``, ``z`` (m), ``theta`` (yaw, rad) and ``quat`` (w, x, y, z) of the base in the world.
+        """Return ``x``, ``y``, ``z`` (m), ``theta`` (yaw, rad), ``quat`` (w, x, y, z).
 
         The base of a mobile robot is its first body; any other stands where it was placed.
         """
@@ -115,9 +115,9 @@ class RobotBody:
         return {"x": x, "y": y, "z": z, "theta": yaw_of(quat), "quat": w_positive(quat)}
 
     def base_velocity(self) -> dict[str, list[float]] | None:
-        """Return ``linear`` (m/s) and ``angular`` (rad/s) of a mobile base along its own axes, x forwards, z up.
+        """Return ``linear`` (m/s) and ``angular`` (rad/s) of a mobile base, else None.
 
-        The axes are those of the twist in ROS's ``nav_msgs/Odometry``. None where the base does not move.
+        The axes are the base's own, x forwards and z up, as in the twist of ROS's ``nav_msgs/Odometry``.
         """
         snapshot, parts = self._present()
         if not _mobile(snapshot, parts):
@@ -150,7 +150,7 @@ def _mobile(snapshot: Snapshot, robot: RobotParts) -> bool:
 
 
 def _unit(model: Any, actuator: Actuator) -> str:
-    """Return the unit of a position servo's command, empty where it is not its joint's own."""
+    """Return the unit of a position servo's command; empty unless it is the joint's."""
     index = actuator.index
     gain, bias = model.actuator_gainprm[index][0], model.actuator_biasprm[index][1]
     direct = model.actuator_gear[index][0] == 1.0 and math.isclose(gain, -bias)

@@ -1,4 +1,4 @@
-"""Sources of robot models: built-in ones by name, files, and the ``robot_descriptions`` package."""
+"""Sources of robot models: built-in, files, and ``robot_descriptions``."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ModelSource:
     path: Path
 
     def load(self) -> Any:
-        """Return a fresh ``MjSpec`` of the file. Raises :class:`ValidationError` with MuJoCo's reason."""
+        """Return a fresh ``MjSpec``. Raises :class:`ValidationError` with the reason."""
         try:
             return mujoco.MjSpec.from_file(str(self.path))
         except (ValueError, OSError, mujoco.FatalError) as exc:
@@ -44,7 +44,7 @@ class ModelSource:
 
 
 def find(model: object) -> ModelSource:
-    """Return the source of ``model``: a built-in one, a path to MJCF or URDF, or a ``robot_descriptions`` name.
+    """Return the source of a built-in name, a file, or a ``robot_descriptions`` name.
 
     Raises:
         ValidationError: no such model; the message names similar ones.

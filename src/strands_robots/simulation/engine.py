@@ -19,7 +19,7 @@ import mujoco  # noqa: E402 - MuJoCo reads MUJOCO_GL while it is imported
 
 
 def _set_context_class() -> None:
-    """Give a MuJoCo that was imported before the choice the context class of the chosen backend."""
+    """Correct the context class of a MuJoCo that was imported before the choice."""
     contexts = sys.modules.get("mujoco.rendering.classic.gl_context") or sys.modules.get("mujoco.gl_context")
     if contexts is not None:
         vars(contexts)["GLContext"] = importlib.import_module(f"mujoco.{BACKEND}").GLContext

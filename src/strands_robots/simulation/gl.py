@@ -1,4 +1,4 @@
-"""Choice of the OpenGL backend that MuJoCo renders with. This module loads without MuJoCo.
+"""Choice of the OpenGL backend that MuJoCo renders with; loads without MuJoCo.
 
 MuJoCo reads ``MUJOCO_GL`` once, while it is imported; ``engine`` repairs an import that came too early. Without a
 display MuJoCo's default (GLFW) cannot work, so EGL is taken where its library is there, else OSMesa. A value of the
@@ -25,7 +25,7 @@ LIBRARIES = {"egl": ("libEGL.so.1", "libGL.so.1"), "osmesa": ("libOSMesa.so.8",)
 
 
 def loads(backend: str) -> bool:
-    """Return True when every shared library of ``backend`` (egl or osmesa) can be loaded."""
+    """Return True when every library of ``backend`` (egl or osmesa) can be loaded."""
     try:
         for library in LIBRARIES[backend]:
             ctypes.CDLL(library)
@@ -41,7 +41,7 @@ def undecided() -> bool:
 
 @cache
 def prepare() -> str:
-    """Choose the backend, set ``MUJOCO_GL`` and return it: the user's own, another, or empty for MuJoCo's default."""
+    """Choose the backend and set ``MUJOCO_GL``; empty stands for MuJoCo's default."""
     if not undecided():
         wanted = settings.raw("MUJOCO_GL").lower()
         if wanted not in LIBRARIES or loads(wanted):

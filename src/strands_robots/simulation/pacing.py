@@ -1,4 +1,4 @@
-"""Real time: one thread for all the worlds of a process, alive only while one of them runs.
+"""Real time: one thread for all worlds of a process, alive while one of them runs.
 
 Stepping releases the GIL, and thirty worlds that each wake a thread two hundred times a second would spend more
 time passing it on than computing; one thread visits them in turn instead. A world runs while a rollout or a
@@ -38,7 +38,7 @@ _CHUNK = 16
 
 
 class WorldClock:
-    """Pacing of one world. ``slipped_s`` is the simulated time dropped because the machine was too slow."""
+    """Pacing of one world; ``slipped_s`` is simulated time that was dropped when late."""
 
     def __init__(self, physics: Physics, *, on_command: bool = True) -> None:
         self._physics = physics
@@ -67,7 +67,7 @@ class WorldClock:
                 self._until = time.monotonic() + SETTLE_S / 4
 
     def commanded(self) -> None:
-        """Let physics follow a setpoint that was written, unless the world is stepped by hand."""
+        """Let physics follow a new setpoint, unless the world is stepped by hand."""
         with self._lock:
             if self.closed or self._by_hand or not self._on_command:
                 return
@@ -94,7 +94,7 @@ class WorldClock:
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated seconds for each real one while paced: 1.0 unless the machine is too slow."""
+        """Simulated seconds for each real one: 1.0 unless the machine is too slow."""
         with self._lock:
             return 1.0 if self.paced_s <= 0 else max(0.0, 1.0 - self.slipped_s / self.paced_s)
 
@@ -169,7 +169,7 @@ class _Pacer:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def _still_running(self) -> list[WorldClock]:
-        """Return the clocks that still run; without any, mark the thread as ended under the lock."""
+        """Return the clocks that still run; without any, mark the thread as ended."""
         with self._lock:
             for clock in [c for c in self._clocks if not c.wanted]:
                 self._clocks.remove(clock)

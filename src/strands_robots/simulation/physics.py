@@ -1,6 +1,6 @@
-"""The physics of one world, and the lock discipline of the whole simulation, which is documented only here.
+"""The physics of one world, and the lock discipline of the simulation.
 
-There are three locks of a world, always taken in this order, and one published value:
+This is the only place that documents it. A world has three locks, always taken in this order, and one published value:
 
 1. The *starting lock* (``Simulation.starting``, re-entrant) is held while the world is rebuilt or reset, and while a
    rollout or a teleoperation starts. A stop never takes it, so nothing that is built or loaded delays a stop.
@@ -38,7 +38,7 @@ _QVEL = {0: 6, 1: 3, 2: 1, 3: 1}
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State after some step. ``time`` in seconds, ``steps`` since the world was made; the arrays never change."""
+    """State after a step: time in seconds, steps since the start; it never changes."""
 
     stage: Stage
     time: float
@@ -53,14 +53,14 @@ class Snapshot:
         return {key: float(qpos[joint.qpos]) for key, joint in robot.joints.items()}
 
     def observation(self, robot: RobotParts) -> dict[str, float]:
-        """Return the joint positions, and ``base_x``, ``base_y`` (m) and ``base_yaw`` (rad) of a free base."""
+        """Return joints, and ``base_x``, ``base_y`` (m), ``base_yaw`` (rad) of a free base."""
         if robot.base is None:
             return self.joints(robot)
         x, y, _, *quat = (float(v) for v in self.qpos[robot.base : robot.base + 7])
         return {**self.joints(robot), "base_x": x, "base_y": y, "base_yaw": yaw_of(quat)}
 
     def pose(self, data: Any) -> None:
-        """Put this state into ``data`` of the same model, and compute its bodies, sites, cameras and lights."""
+        """Put this state into ``data``, and compute bodies, sites, cameras and lights."""
         model = self.stage.model
         data.qpos[:] = self.qpos
         data.qvel[:] = self.qvel
@@ -76,7 +76,7 @@ class Snapshot:
 
 
 class Physics:
-    """Model, data and setpoints of one world. Thread-safe; the module's docstring has the lock discipline."""
+    """Model, data and setpoints of one world; thread-safe as the module says."""
 
     def __init__(self, stage: Stage) -> None:
         self._step_lock = threading.Lock()
@@ -129,9 +129,10 @@ class Physics:
             return sent
 
     def hold(self, robot_name: str | None = None, permit: Permit | None = None) -> None:
-        """Freeze one robot, or all: servos keep their present position, everything else is commanded to zero.
+        """Freeze one robot, or all.
 
-        Nothing is written when ``permit`` was revoked: the halt that revoked it has frozen the robot.
+        Servos keep their present position, everything else is commanded to zero. Nothing is
+        written when ``permit`` was revoked: the halt that revoked it has frozen the robot.
         """
         with self._command_lock:
             if permit is not None and permit.revoked:
@@ -156,7 +157,7 @@ class Physics:
             self.snapshot = self._start(self.stage)
 
     def replace(self, stage: Stage) -> None:
-        """Go on with another stage. What both have by name keeps its position, velocity and setpoint."""
+        """Switch to another stage; what both have by name keeps its state and setpoint."""
         with self._step_lock, self._command_lock:
             old_model, old_data, old_setpoints = self._model, self._data, self._setpoints
             self._model = stage.model
@@ -171,7 +172,7 @@ class Physics:
 
     @property
     def diverged(self) -> bool:
-        """True once MuJoCo had to reset the world because a number ran away since the last reset."""
+        """True once MuJoCo reset a diverging world since the last reset."""
         warnings = self._data.warning
         kinds = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
         return any(warnings[kind].number for kind in kinds)

@@ -1,4 +1,4 @@
-"""The contents of a world as data: robots and primitive objects, made from checked arguments."""
+"""The contents of a world as data, made from checked arguments."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ class RobotPlan:
 
     @classmethod
     def checked(cls, name: object, model: str | Path | None, position: object, yaw: object) -> RobotPlan:
-        """Check a robot, and find its model, which may be fetched; see :meth:`Simulation.add_robot` for the domains.
+        """Check a robot, and find its model, which may be fetched.
+
+        :meth:`Simulation.add_robot` has the domains.
 
         Raises:
             ValidationError: an argument outside its domain, or no such model.
@@ -46,7 +48,7 @@ class RobotPlan:
 
 @dataclass(frozen=True, slots=True)
 class ObjectPlan:
-    """One object of primitive shape: sizes in metres, mass in kilograms, colour from 0 to 1."""
+    """One object of primitive shape: metres, kilograms, and colour from 0 to 1."""
 
     name: str
     shape: str
@@ -88,7 +90,7 @@ class Plan:
 
     @classmethod
     def checked(cls, timestep: object, gravity: object) -> Plan:
-        """Return an empty plan. Raises :class:`ValidationError` for a number outside its domain."""
+        """Return an empty plan. Raises :class:`ValidationError`."""
         return cls(number("timestep", timestep, low=1e-4, high=2e-2), number("gravity", gravity, low=-100, high=100))
 
     def with_robot(self, robot: RobotPlan, *, beside: bool = False) -> Plan:
@@ -111,7 +113,7 @@ class Plan:
         return replace(self, objects=(*self.objects, item))
 
     def without_object(self, name: object) -> Plan:
-        """Remove an object. Raises :class:`ValidationError` where there is none of that name."""
+        """Remove an object. Raises :class:`ValidationError` for an unknown name."""
         names = [o.name for o in self.objects]
         if name not in names:
             raise ValidationError(f"name must be one of {names}, not {shown(name)}.")
@@ -138,7 +140,7 @@ def _colour(value: object) -> tuple[float, float, float, float]:
 
 
 def _sizes(shape: str, value: object) -> Triple:
-    """Check the sizes of a shape, and fill MuJoCo's three up with zeros. One number is enough for a cube."""
+    """Check a shape's sizes and add zeros up to three; a cube needs one number."""
     count = SHAPES[shape]
     values = list(value) if isinstance(value, list | tuple) else [value]
     if count == 3 and len(values) == 1:

@@ -1,4 +1,4 @@
-"""A software picture of a world, without OpenGL: shaded faces through a depth buffer, in numpy alone.
+"""Pictures without OpenGL: shaded faces through a depth buffer, in numpy alone.
 
 It serves machines without OpenGL. It is slower and plainer: one light, its shadow on the floor, flat faces. Every
 primitive and mesh is drawn; textures other than the floor's are not.
@@ -39,7 +39,7 @@ Patch = tuple[tuple[float, float, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Face:
-    """A flat convex face: corners (n, 3) in metres, anticlockwise seen from outside; ``colour`` 0 to 255."""
+    """A flat convex face: corners (n, 3) in metres, anticlockwise; colour 0 to 255."""
 
     points: Floats
     normal: Floats
@@ -100,7 +100,7 @@ def _shade(face: Face, towards: Floats) -> Floats:
 
 
 def _background(view: CameraView, wide: int, high: int, shadow_of: list[Face] | None) -> tuple[Pixels, Pixels]:
-    """Draw the sky, and the tiled floor with its shadows where there is one; the depth buffer has one over depth."""
+    """Draw the sky, and the floor with its shadows; the buffer has one over depth."""
     ramp = np.linspace(0, 1, high, dtype=np.float32)[:, None, None]
     image = np.broadcast_to(_SKY_TOP * (1 - ramp) + _SKY_LOW * ramp, (high, wide, 3)).astype(np.float32)
     depth = np.zeros((high, wide), dtype=np.float32)
@@ -143,7 +143,7 @@ def _tiles(x: Pixels, y: Pixels, reach: Pixels) -> Pixels:
 
 
 def _shadow(faces: list[Face], x: Pixels, y: Pixels) -> Pixels:
-    """Return the share of light that each floor point lacks: the faces projected along the light, with a soft edge."""
+    """Return the share of light that each floor point lacks: soft projected faces."""
     laid = [f.points[:, :2] - _LIGHT[:2] / _LIGHT[2] * np.maximum(f.points[:, 2:], 0) for f in faces]
     if not laid:
         return np.zeros_like(x)
@@ -234,7 +234,7 @@ def _box(x: float, y: float, z: float) -> tuple[Patch, ...]:
 
 
 def _arc(radius: float, height: float, start: float, end: float) -> tuple[tuple[float, float], ...]:
-    """Return the profile of a sphere segment: (radius, z) from ``start`` to ``end`` quarter turns above the equator."""
+    """Return (radius, z) of an arc from ``start`` to ``end`` quarter turns up."""
     angles = np.linspace(start, end, 9 if end - start > 1 else 5) * np.pi / 2
     return tuple((float(radius * np.cos(a)), float(height + radius * np.sin(a))) for a in angles)
 

@@ -40,7 +40,7 @@ _EARLY, _LATE = np.array([60, 120, 235]), np.array([235, 55, 95])
 
 
 class RenderingError(StrandsRobotsError, RuntimeError):
-    """No picture by OpenGL is possible on this machine; the message says what to install."""
+    """OpenGL does not work on this machine; the message says what to install."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class CameraView:
     distance: float = 0.0
 
     def pixels(self, points: Iterable[Iterable[float]], width: int, height: int) -> Floats:
-        """Convert world points (n, 3) in metres to picture coordinates (n, 3): x right, y down, depth in metres."""
+        """Convert points (n, 3) in metres to pixels x (right) and y (down), depth in metres."""
         local = (np.array([list(p) for p in points], dtype=np.float64).reshape(-1, 3) - self.position) @ self.rotation
         depth = -local[:, 2]
         scale = height / 2 / np.tan(np.radians(self.fovy) / 2)
@@ -69,7 +69,7 @@ class CameraView:
 
 
 def picture_size(width: object, height: object) -> tuple[int, int]:
-    """Check a picture's width and height. Raises :class:`ValidationError` naming the one outside its domain."""
+    """Check a picture's width and height. Raises :class:`ValidationError`."""
     return _pixels("width", width, MAX_WIDTH), _pixels("height", height, MAX_HEIGHT)
 
 
@@ -85,7 +85,7 @@ def camera_names(stage: Stage) -> list[str]:
 
 
 def find_camera(stage: Stage, name: object) -> str:
-    """Return a camera's full name; the robot's own part of it is enough where only one robot has it.
+    """Return a camera's full name; its part without the robot is enough if unique.
 
     Raises:
         ValidationError: no such camera, or several robots have one of that name.
@@ -101,7 +101,7 @@ def find_camera(stage: Stage, name: object) -> str:
 
 
 def camera_view(stage: Stage, data: Any, camera: object) -> CameraView:
-    """Return the view of ``camera`` in the state of ``data``. Raises as :func:`find_camera`."""
+    """Return the view of ``camera`` in ``data``. Raises as :func:`find_camera`."""
     name = find_camera(stage, camera)
     if name != OVERVIEW:
         index = stage.model.camera(name).id
@@ -121,7 +121,7 @@ def camera_view(stage: Stage, data: Any, camera: object) -> CameraView:
 
 
 def _fit(stage: Stage, data: Any) -> tuple[Floats, float]:
-    """Return the point to look at and the distance from which every robot and its reach are seen."""
+    """Return the point and the distance from which every robot's reach is visible."""
     model = stage.model
     prefixes = tuple(f"{name}/" for name in stage.robots)
     bodies = [i for i in range(model.nbody) if prefixes and model.body(i).name.startswith(prefixes)]
@@ -218,7 +218,7 @@ def _mujoco_camera(view: CameraView) -> Any:
 
 
 def draw_path(picture: Picture, points: Floats) -> Picture:
-    """Return a copy of ``picture`` with a line through ``points`` (n, at least 2) in pixels.
+    """Return a copy of ``picture`` with a line through ``points`` (n, 2+) in pixels.
 
     The line is blue at its start and red at its end, which has a dot. Points behind the camera (a third column of
     depth below zero) are left out.

@@ -1,4 +1,4 @@
-"""Joints and cameras of a simulated world on a ROS 2 graph, as those of a real robot."""
+"""Joints and cameras of a simulated world on a ROS 2 graph."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from strands_robots.utils import ValidationError
 
 
 class SimRosBridge(RosTelemetryBridge):
-    """Publisher of a simulation on ROS 2. It takes no commands; the simulation's own verbs drive it.
+    """Publisher of a simulation on ROS 2; it takes no commands.
 
     ``publish_joint_states`` and ``publish_image`` are those of a real robot's bridge. With a simulation,
     :meth:`publish` publishes all its robots at once, and ``start`` does so at a rate.
@@ -35,7 +35,7 @@ class SimRosBridge(RosTelemetryBridge):
         self._simulation = simulation
 
     def publish(self, cameras: Sequence[str] = (), *, width: int = 320, height: int = 240) -> None:
-        """Publish the joints of every robot (rad, or m for a sliding joint) and one picture of each of these cameras.
+        """Publish every robot's joints (rad; m for a slide) and a picture a camera.
 
         Raises:
             ValidationError: no simulation, or no such camera.

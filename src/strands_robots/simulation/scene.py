@@ -1,4 +1,4 @@
-"""Pictures of a motion as files: one with the gripper's path, and a short animation."""
+"""Files of a motion: a picture with the gripper's path, and a short animation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def save_picture(picture: Picture, path: str | Path) -> Path:
 
 
 def save_animation(frames: Sequence[Picture], path: str | Path, fps: float = 12.5) -> Path:
-    """Write pictures of one size as an endless GIF. ``fps`` from 1 to 50: a GIF counts in hundredths of a second.
+    """Write pictures of one size as an endless GIF; ``fps`` is from 1 to 50.
 
     Raises:
         ValidationError: no frames, or ``fps`` out of its domain.
@@ -42,7 +42,7 @@ def save_animation(frames: Sequence[Picture], path: str | Path, fps: float = 12.
 
 
 class Recording:
-    """Frames and the gripper's path along a motion, taken by :meth:`capture` and saved at the end."""
+    """Frames of a motion with the gripper's path, taken by :meth:`capture`."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class Recording:
         self.how = ""
 
     def trace(self) -> None:
-        """Add the gripper's place to the path, without a picture; cheap enough for every control step."""
+        """Add the gripper's place to the path; cheap enough for every control step."""
         self.path.append(self._world.tip_position(self._robot))
 
     def capture(self) -> None:

@@ -1,4 +1,4 @@
-"""The MuJoCo model that is compiled from a plan, and the place of each robot's parts in it.
+"""The MuJoCo model compiled from a plan, and each robot's parts in it.
 
 A :class:`Stage` never changes: adding or removing something makes a new plan and a new stage. Inside the model the
 names of a robot's parts start with its own name and a slash (``left/elbow_flex``); outside, its keys are without it.
@@ -26,7 +26,7 @@ UNBOUNDED = float("inf")
 
 @dataclass(frozen=True, slots=True)
 class Actuator:
-    """One command: its key in actions, its index in ``ctrl``, its range; ``servo`` is true for a position servo."""
+    """One action key: index in ``ctrl``, range; ``servo`` marks a position servo."""
 
     key: str
     index: int
@@ -41,7 +41,7 @@ class Actuator:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """One joint with a single coordinate: its index in ``qpos`` and ``qvel``, and its range (rad or m)."""
+    """One joint with a single coordinate: indices and range (rad or m)."""
 
     key: str
     qpos: int
@@ -52,7 +52,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class RobotParts:
-    """Parts of one robot in the model. ``base`` is the ``qpos`` address of its free joint, or None."""
+    """Parts of one robot; ``base`` is the ``qpos`` address of a free joint, or None."""
 
     name: str
     model: str
@@ -119,7 +119,7 @@ def _set_options(spec: Any, plan: Plan) -> None:
 
 
 def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats], dict[str, float]]:
-    """Put ``child`` into ``spec``, and return its home pose and controls by their prefixed names."""
+    """Put ``child`` into ``spec``; return its home pose and controls by full name."""
     try:
         if not child.actuators:
             _add_servos(child)
@@ -138,7 +138,7 @@ def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats],
 
 
 def _add_servos(child: Any) -> None:
-    """Give a model without actuators (a URDF has none) a critically damped position servo at each joint."""
+    """Add a critically damped position servo to each joint; a URDF has no actuators."""
     for joint in child.joints:
         if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) or not joint.name:
             continue
@@ -151,7 +151,7 @@ def _add_servos(child: Any) -> None:
 
 
 def _home(model: Any, prefix: str) -> tuple[dict[str, Floats], dict[str, float]]:
-    """Return a model's pose named home (else its first), by prefixed joint and actuator name."""
+    """Return a model's pose named home, else its first, by full name."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
     index = max(key, 0)
     pose: dict[str, Floats] = {}
@@ -237,7 +237,7 @@ def _map_robot(model: Any, name: str, label: str) -> RobotParts:
 
 
 def _is_servo(model: Any, index: int) -> bool:
-    """Return True for a position servo: its bias pulls back in proportion to its length."""
+    """Return True for a position servo: its bias pulls back with its length."""
     return bool(model.actuator_biasprm[index][1] < 0.0)
 
 
@@ -247,14 +247,14 @@ def _root(model: Any, prefix: str) -> str:
 
 
 def _tip(model: Any, prefix: str) -> str:
-    """Return the site of the robot's hand: the one called gripper_tip, else its last, else none."""
+    """Return the site of the hand: gripper_tip, else the last one, else none."""
     sites = [n for n in (str(model.site(i).name) for i in range(model.nsite)) if n.startswith(prefix)]
     named = [n for n in sites if n.endswith("gripper_tip")]
     return (named or sites[-1:] or [""])[0]
 
 
 def _furnish(spec: Any, *, floor: bool, lights: bool) -> None:
-    """Add sky, lights and cameras; ``floor`` and ``lights`` are false where a robot's model brings its own."""
+    """Add sky and cameras, and ``floor`` and ``lights`` unless a robot brings them."""
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = MAX_WIDTH, MAX_HEIGHT
     visual.headlight.active = 1

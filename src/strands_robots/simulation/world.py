@@ -1,4 +1,4 @@
-"""``Simulation``: a MuJoCo world with robots in it, as the networks, tools and people use it."""
+"""``Simulation``: a MuJoCo world with robots in it, behind the robot contract."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class _CleanedUp:
 
 
 class Simulation(TeleopMixin):
-    """A world of simulated robots, each with its own rollout, behind the contract :class:`WorldRobot`.
+    """A world of simulated robots, each with its own rollout: a :class:`WorldRobot`.
 
     Physics keeps real time while a rollout or a teleoperation runs, and for a moment after a single command;
     :meth:`step` advances it as fast as it computes. Verbs answer envelopes; a wrong argument is refused by name and
@@ -111,7 +111,7 @@ class Simulation(TeleopMixin):
         self._closed = False
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Call ``observer`` with every rollout event until the returned callable is called."""
+        """Call ``observer`` with every rollout event; the returned callable ends that."""
         return self.observers.subscribe(observer)
 
     def list_robots(self) -> list[str]:
@@ -136,7 +136,12 @@ class Simulation(TeleopMixin):
 
     @answered
     def create_world(self, timestep: float = 0.002, gravity: float = -9.81) -> Envelope:
-        """Start over with an empty world. ``timestep`` 0.0001 to 0.02 s, ``gravity`` -100 to 100 m/s² along z."""
+        """Start over with an empty world.
+
+        Args:
+            timestep: 0.0001 to 0.02 s.
+            gravity: along z, -100 to 100 m/s².
+        """
         plan = Plan.checked(timestep, gravity)
         with self.starting:
             self._require_idle("create_world")
@@ -222,7 +227,7 @@ class Simulation(TeleopMixin):
 
     @answered
     def step(self, n: int = 1) -> Envelope:
-        """Advance physics by ``n`` time steps (1 to 1,000,000) as fast as they compute; setpoints stay as they are."""
+        """Advance physics by ``n`` time steps (1 to 1,000,000) as fast as they compute."""
         count = whole("n", n, low=1, high=STEPS_MAX)
         self._require_open()
         self._clock.by_hand()
@@ -240,7 +245,7 @@ class Simulation(TeleopMixin):
 
     @answered
     def reset(self) -> Envelope:
-        """Halt, then put the world back to its initial state. Refused while the robot is locked."""
+        """Halt, then restore the initial state of the world; refused while it is locked."""
         self._require_open()
         permit = self.gate.permit("reset")
         with self.starting:
@@ -254,7 +259,11 @@ class Simulation(TeleopMixin):
 
     @answered
     def get_state(self) -> Envelope:
-        """``sim_time`` (s), ``step_count``, ``robots`` (name to joints in radians), ``running_policies``, and more."""
+        """Return the state of physics and of every robot.
+
+        ``sim_time`` (s), ``step_count``, ``robots`` (name to joints in radians), ``running_policies`` (rows by robot),
+        ``real_time_factor`` and ``diverged``.
+        """
         snapshot = self.physics.snapshot
         robots = {name: snapshot.observation(parts) for name, parts in snapshot.stage.robots.items()}
         return success(
@@ -269,7 +278,7 @@ class Simulation(TeleopMixin):
 
     @answered
     def get_features(self) -> Envelope:
-        """Joints, actuators and cameras by robot, with ranges in the joint's unit (null where there is no limit)."""
+        """Return joints, actuators and cameras by robot; a range is null without limit."""
         snapshot = self.physics.snapshot
         stage = snapshot.stage
         robots: dict[str, Any] = {
@@ -292,17 +301,15 @@ class Simulation(TeleopMixin):
         )
 
     def get_observation(self, robot_name: str | None = None) -> dict[str, float]:
-        """Return joint positions of one robot (rad, or m for a sliding joint) and the pose of a free base.
-
-        Raises:
-            ValidationError: no such robot.
-        """
+        """Return joint positions of one robot, as :meth:`RobotBody.get_observation`."""
         return self.body(robot_name).get_observation()
 
     @answered
     def get_pose(self, robot_name: str | None = None) -> Envelope:
-        """Pose of a robot's base: ``x``, ``y``, ``z`` (m), ``theta`` (yaw, rad), ``quat`` (w, x, y, z), ``source`` and
-        ``frame``. The name may be left out where there is one robot."""
+        """Return the pose of a robot's base, with ``source`` and ``frame``.
+
+        The fields are those of :meth:`RobotBody.base_pose`. The name may be left out where there is one robot.
+        """
         body = self._only(robot_name)
         pose = body.base_pose()
         summary = f"{body.name} is at {pose['x']:.3f}, {pose['y']:.3f} m."
@@ -310,7 +317,7 @@ class Simulation(TeleopMixin):
 
     @answered
     def get_odom(self, robot_name: str | None = None) -> Envelope:
-        """Pose of a mobile robot as :meth:`get_pose`, with ``linear`` (m/s) and ``angular`` (rad/s), own axes."""
+        """Return the pose of a mobile robot, with :meth:`RobotBody.base_velocity`."""
         body = self._only(robot_name)
         velocity = body.base_velocity()
         if velocity is None:
@@ -319,12 +326,12 @@ class Simulation(TeleopMixin):
 
     @property
     def joint_units(self) -> dict[str, str]:
-        """``radians`` or ``metres`` by action key, of the robot that an action without a name goes to."""
+        """Units of the robot that an action without a name goes to."""
         return self.body().joint_units if self._bodies else {}
 
     @answered
     def send_action(self, action: dict[str, float], robot_name: str | None = None) -> Envelope:
-        """Set targets of one robot; ``sent`` holds what was really set, clamped to each actuator's range."""
+        """Set targets of one robot; ``sent`` has them clamped to each actuator's range."""
         self._require_open()
         body = self.body(robot_name)
         permit = self.gate.permit("send_action")
@@ -373,7 +380,7 @@ class Simulation(TeleopMixin):
         duration: float = 30.0,
         **policy: Any,
     ) -> Envelope:
-        """Run a rollout as :meth:`start_policy` does and wait; an error when it failed or did not end in time."""
+        """Run a rollout as :meth:`start_policy` does, and wait for its end."""
         rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
         if not rollout.join((rollout.duration or 0.0) + TEARDOWN_S):
             rollout.request_stop()
@@ -384,7 +391,7 @@ class Simulation(TeleopMixin):
 
     @answered
     def stop_policy(self, robot_name: str) -> Envelope:
-        """Stop the policy or the leader that drives one robot, and freeze the robot where it is.
+        """Stop the policy or the leader of one robot, and freeze the robot where it is.
 
         ``stopped`` is false if the loop outlived it. A policy or a leader that is still loading never starts, and the
         targets of a single action are given up.
@@ -406,16 +413,16 @@ class Simulation(TeleopMixin):
         return success(f"{body.name} stopped after {rollout.step_count} steps.", **row)
 
     def list_policies_running(self) -> list[dict[str, Any]]:
-        """Return one row for each running rollout: robot, instruction, policy, step, elapsed_s."""
+        """Return one row for each running rollout, as :meth:`Rollout.row`."""
         return [rollout.row() for rollout in self._running().values()]
 
     def occupied(self, robot: str) -> str:
-        """Name the rollout that drives this robot now, for a refusal; empty when none does."""
+        """Name the rollout that drives this robot, for a refusal; empty without one."""
         rollout = self._running().get(robot)
         return "" if rollout is None else f"the policy {rollout.policy_name} ({rollout.instruction!r})"
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop everything that moves a robot of this world, and freeze the robots where they are.
+        """Stop everything that moves a robot, and freeze the robots where they are.
 
         The gate is revoked first and the setpoints are frozen second; both take microseconds, and after them no
         action is written, whatever a policy is doing. Last it waits for the loops to end, to report whether they did.
@@ -467,7 +474,7 @@ class Simulation(TeleopMixin):
         *,
         path: Iterable[tuple[float, float, float]] = (),
     ) -> tuple[Picture, Literal["opengl", "projection"]]:
-        """Draw the best picture this machine can make, and say how it was made; ``path`` (metres) is drawn over it."""
+        """Draw the best possible picture and ``path`` (metres); also return how it was made."""
         how: Literal["opengl", "projection"] = "opengl"
         try:
             picture = self.render(camera, width, height, quality=True)
@@ -484,11 +491,7 @@ class Simulation(TeleopMixin):
         return camera_view(snapshot.stage, snapshot.data(), camera)
 
     def tip_position(self, robot_name: str | None = None) -> tuple[float, float, float]:
-        """Return the place of a robot's gripper tip in the world, metres; of its base where it has no gripper.
-
-        Raises:
-            ValidationError: no such robot.
-        """
+        """Return the place of one robot's tip, as :meth:`RobotBody.tip_position`."""
         return self.body(robot_name).tip_position()
 
     def _require_open(self) -> None:
@@ -513,7 +516,7 @@ class Simulation(TeleopMixin):
         return self.body(robot_name)
 
     def _rebuild(self, plan: Plan) -> None:
-        """Compile ``plan`` and go on with it; when it does not compile nothing has changed."""
+        """Compile ``plan`` and switch to it; nothing changes when it does not compile."""
         self.physics.replace(compile_stage(plan))
         self._bodies = {
             r.name: self._bodies.get(r.name) or RobotBody(r.name, self.physics, self._clock) for r in plan.robots
