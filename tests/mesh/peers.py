@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +17,8 @@ from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.plane import SafetyPlane
+
+Message = dict[str, Any]
 
 
 class Clock:
@@ -103,3 +107,50 @@ def fleet(folder: Path) -> Iterator[Fleet]:
         yield peers
     finally:
         peers.close()
+
+
+def received(peers: Fleet, key: str) -> list[Message]:
+    """The messages on a key from now on; the list grows as they arrive."""
+    messages: list[Message] = []
+    peers.stranger().declare_subscriber(key, lambda sample: messages.append(json.loads(sample.payload)))
+    return messages
+
+
+class ScriptedPeer:
+    """A peer in the field: it serves one command of a turn, and answers after ``seconds``."""
+
+    def __init__(
+        self,
+        peers: Fleet,
+        name: str,
+        seconds: float,
+        first: dict[str, Any] | None = None,
+        always: dict[str, Any] | None = None,
+    ) -> None:
+        self.name, self.seconds, self.first, self.always = name, seconds, first, always
+        self.turns: list[str] = []
+        self.threads: list[threading.Timer] = []
+        self.wire = peers.stranger()
+        self.wire.put(f"strands/{name}/presence", {"robot_id": name, "timestamp": peers.clock()})
+        for key in ("strands/broadcast", f"strands/{name}/cmd"):
+            self.wire.declare_subscriber(key, self.asked)
+
+    def asked(self, sample: Any) -> None:
+        body = json.loads(sample.payload)
+        again = body["turn_id"] in self.turns
+        first = self.first if not self.turns else None
+        first = self.always or first
+        self.turns.append(body["turn_id"])
+        head = {"responder_id": self.name, "turn_id": body["turn_id"], "timestamp": body["timestamp"]}
+        key = f"strands/{body['sender_id']}/response/{self.name}/{body['turn_id']}"
+        if again:
+            self.wire.put(key, {**head, "type": "error", "error": "replay"})
+            return
+        said = first or {"type": "response", "result": {"ok": True}}
+        late = threading.Timer(self.seconds if first is None else 0.0, lambda: self.wire.put(key, {**head, **said}))
+        self.threads.append(late)
+        late.start()
+
+    def join(self) -> None:
+        for each in self.threads:
+            each.join(20)

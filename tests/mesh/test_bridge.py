@@ -67,7 +67,7 @@ def test_a_command_that_comes_by_both_legs_is_served_once(buses: tuple[MemoryBus
     assert len(served) == 2
 
 
-def test_a_stop_goes_to_the_broker_without_a_session_that_nobody_there_could_check(
+def test_stop_goes_to_the_broker_without_its_session(
     buses: tuple[MemoryBus, MemoryBus],
 ) -> None:
     both, near, far = bridge(buses), on(buses[0]), on(buses[1])
@@ -81,7 +81,7 @@ def test_a_stop_goes_to_the_broker_without_a_session_that_nobody_there_could_che
     }
 
 
-def test_who_is_near_is_heard_on_the_local_leg_alone(buses: tuple[MemoryBus, MemoryBus]) -> None:
+def test_message_of_a_local_peer_is_dropped_from_the_cloud_leg(buses: tuple[MemoryBus, MemoryBus]) -> None:
     both, near, far = bridge(buses), on(buses[0]), on(buses[1])
     heard: list[tuple[str, str | None]] = []
     both.declare_subscriber("strands/*/presence", lambda sample: heard.append((sample.key, sample.session)))
@@ -92,7 +92,7 @@ def test_who_is_near_is_heard_on_the_local_leg_alone(buses: tuple[MemoryBus, Mem
     assert heard == [("strands/a/presence", near.session_id), ("strands/b/presence", far.session_id)]
 
 
-def test_who_is_not_heard_nearby_any_more_is_heard_from_the_broker_again() -> None:
+def test_peer_silent_on_the_local_leg_is_no_longer_local() -> None:
     clock = Clock()
     near = LocalPeers(clock)
     near.note("a")
@@ -104,7 +104,7 @@ def test_who_is_not_heard_nearby_any_more_is_heard_from_the_broker_again() -> No
     assert "p0" not in near
 
 
-def test_it_is_connected_while_either_leg_is(buses: tuple[MemoryBus, MemoryBus]) -> None:
+def test_bridge_is_connected_while_either_leg_is(buses: tuple[MemoryBus, MemoryBus]) -> None:
     half = BridgeTransport(MemoryTransport(buses[0]), Down(buses[1]))
     half.connect()
     assert half.is_alive()
@@ -128,7 +128,7 @@ class Late(MemoryTransport):
         super().connect()
 
 
-def test_a_leg_that_is_down_at_start_is_brought_up_with_what_was_subscribed_and_stopped_meanwhile(
+def test_leg_down_at_start_later_gets_subscribers_and_stops(
     buses: tuple[MemoryBus, MemoryBus], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bridges, "RETRY_S", 0.02)
@@ -171,7 +171,7 @@ def test_an_unknown_topic_in_the_setting_is_refused(monkeypatch: pytest.MonkeyPa
         BridgeTransport(MemoryTransport(MemoryBus()), MemoryTransport(MemoryBus()))
 
 
-def test_what_was_seen_is_forgotten_by_age_and_number() -> None:
+def test_seen_commands_are_bounded_by_age_and_number() -> None:
     clock = Clock()
     seen = SeenCommands(clock)
     message = b'{"sender_id":"x","turn_id":"t","command":{}}'

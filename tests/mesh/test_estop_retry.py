@@ -1,4 +1,4 @@
-"""An emergency stop follows those who missed it."""
+"""An emergency stop is repeated to the peers that missed it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import time
 import pytest
 from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
-from tests.mesh.peers import Fleet
-from tests.mesh.test_repeats import Strict
+from tests.mesh.peers import Fleet, ScriptedPeer
 
 from strands_robots.mesh import safety
 from strands_robots.mesh.core import Mesh
@@ -41,7 +40,7 @@ def test_a_robot_that_was_cut_off_is_stopped_and_locked_when_it_is_back(peers: F
     eventually(lambda: arm.halts)
 
 
-def test_a_robot_that_was_dropped_from_the_roster_is_not_forgotten(peers: Fleet) -> None:
+def test_robot_dropped_from_the_registry_is_stopped_when_it_is_back(peers: Fleet) -> None:
     arm = Arm()
     console, far = peers.join(None, "console"), peers.join(arm, "arm-1")
     peers.bus.partition(peers.transports["arm-1"])
@@ -53,18 +52,18 @@ def test_a_robot_that_was_dropped_from_the_roster_is_not_forgotten(peers: Fleet)
     eventually(lambda: far.lockout_epoch == console.lockout_epoch)
 
 
-def test_nobody_is_pursued_once_the_stop_was_cleared(peers: Fleet) -> None:
+def test_cleared_stop_is_not_repeated(peers: Fleet) -> None:
     _, far, arm = cut_off(peers)
     peers.planes["console"].clear_local("operator")
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
-    # Longer than two rounds of the safety.
+    # Longer than two rounds of repeats.
     time.sleep(1.3)
     assert far.lockout_epoch is None
     assert arm.halts == []
 
 
-def test_a_newcomer_is_not_pursued(peers: Fleet) -> None:
+def test_newcomer_is_not_stopped(peers: Fleet) -> None:
     cut_off(peers)
     late = Arm()
     mesh = peers.join(late, "arm-2")
@@ -73,7 +72,7 @@ def test_a_newcomer_is_not_pursued(peers: Fleet) -> None:
     assert late.halts == []
 
 
-def test_a_peer_that_is_heard_and_never_answers_is_given_up(
+def test_peer_in_reach_that_never_answers_is_given_up(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
@@ -84,7 +83,7 @@ def test_a_peer_that_is_heard_and_never_answers_is_given_up(
     asked: list[str] = []
     ghost.declare_subscriber("strands/ghost/cmd", lambda sample: asked.append(sample.key))
     console.emergency_stop()
-    # What it was asked so far belongs to the stop itself; it is pursued once it is heard again.
+    # Requests so far belong to the stop itself; it is repeated after the next heartbeat.
     asked.clear()
     peers.clock.pass_(1)
     ghost.put("strands/ghost/presence", {**heartbeat, "timestamp": peers.clock()})
@@ -92,7 +91,7 @@ def test_a_peer_that_is_heard_and_never_answers_is_given_up(
     assert len(asked) == safety.UNANSWERED_MAX
 
 
-def test_a_peer_that_comes_back_and_does_not_stop_is_named_once_and_asked_until_it_does(
+def test_returning_peer_that_does_not_stop_is_logged_once_and_asked_until_it_stops(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
@@ -109,13 +108,13 @@ def test_a_peer_that_comes_back_and_does_not_stop_is_named_once_and_asked_until_
     eventually(lambda: "has answered emergency stop" in caplog.text)
 
 
-def test_an_error_for_an_answer_is_no_stop(
+def test_error_reply_does_not_count_as_stopped(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
     monkeypatch.setattr(safety, "RETRY_ANSWER_S", 20.0)
     console = peers.join(None, "console")
-    faulty = Strict(peers, "faulty", 0.0, first={"type": "error", "error": "dispatch error"})
+    faulty = ScriptedPeer(peers, "faulty", 0.0, first={"type": "error", "error": "dispatch error"})
     peers.bus.partition(faulty.wire)
     peers.clock.pass_(1)
     console.emergency_stop()

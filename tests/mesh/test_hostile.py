@@ -1,4 +1,4 @@
-"""Bytes from anybody on every topic: nothing raises, nothing is kept, the peer still answers."""
+"""Arbitrary bytes on every topic: nothing raises, nothing is stored, the peer still answers."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_any_input_action_is_finite_or_refused(action: Any) -> None:
         b"",
     ],
 )
-def test_what_breaks_parsers_is_a_wire_error(data: bytes) -> None:
+def test_bytes_that_break_parsers_are_a_wire_error(data: bytes) -> None:
     try:
         body = wire.decode(data, 1 << 20)
     except wire.WireError:
@@ -137,7 +137,7 @@ def test_any_signature_is_verified_or_refused(certified: Path, body: dict[str, A
 
 @given(st.binary(max_size=100) | bodies.map(lambda body: json.dumps(body).encode()))
 @settings(max_examples=120)
-def test_any_bytes_are_a_command_that_was_seen_or_not(data: bytes) -> None:
+def test_any_bytes_can_be_checked_for_a_seen_command(data: bytes) -> None:
     seen = SeenCommands()
     assert seen.first(data) is True
     assert isinstance(seen.first(data), bool)
@@ -232,7 +232,7 @@ def test_a_hundred_thousand_mutated_messages_leave_nothing_behind(peers: Fleet, 
     assert console.send("arm-1", {"action": "status"}, timeout=20)["type"] == "response"
 
 
-def test_a_flood_of_refusals_is_told_as_a_count(peers: Fleet) -> None:
+def test_flood_of_refusals_is_audited_as_a_count(peers: Fleet) -> None:
     peers.join(Arm(), "arm-1")
     stranger, began = peers.stranger(), time.monotonic()
     for _ in range(1000):
@@ -269,7 +269,7 @@ def test_invented_peers_do_not_fill_the_registry_beyond_its_bound(
         ("**/a/**/b", "x/a/y/z", False),
     ],
 )
-def test_key_expressions_match_as_zenoh_has_them(pattern: str, key: str, fits: bool) -> None:
+def test_key_expressions_match_like_zenohs(pattern: str, key: str, fits: bool) -> None:
     assert topics.matches(pattern, key) is fits
 
 

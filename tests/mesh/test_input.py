@@ -10,16 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.devices import RecordingDevice
 from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import success
+from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh import input as input_module
 from strands_robots.mesh import safety
 from strands_robots.mesh.core import Mesh
-from strands_robots.mesh.input import InputPublisher, InputReceiver
+from strands_robots.mesh.input import InputPublisher, InputReceiver, MeshInputSink
 from strands_robots.mesh.security import ValidationError
+from strands_robots.teleoperators.leader import ScriptedLeader
 
 
 class Leader:
@@ -96,7 +99,7 @@ def test_a_leaders_actions_reach_the_follower_in_order(peers: Fleet) -> None:
     assert peers.events("input_stream_opened")
 
 
-def test_a_leader_that_begins_again_is_followed_on(peers: Fleet) -> None:
+def test_restarted_leader_is_still_followed(peers: Fleet) -> None:
     arm = Arm()
     follower, lead = peers.join(arm, "follower"), peers.join(None, "lead")
     receiver = InputReceiver(follower, arm, "lead")
@@ -194,7 +197,7 @@ def test_a_null_action_an_old_frame_and_a_burst_move_nothing(stream: Stream, mon
     assert len(stream.arm.actions) <= 25
 
 
-def test_frames_that_waited_for_a_slow_bus_are_no_flood(stream: Stream) -> None:
+def test_frames_delayed_by_a_slow_bus_do_not_count_as_a_flood(stream: Stream) -> None:
     free = threading.Event()
     taken: list[dict[str, float]] = []
 
@@ -222,7 +225,7 @@ def test_a_joint_commanded_too_fast_is_refused(stream: Stream, monkeypatch: pyte
     eventually(lambda: stream.stat("frames_received")() == 2)
 
 
-def test_the_first_frame_is_bounded_from_where_the_follower_stands(stream: Stream) -> None:
+def test_first_frame_is_bounded_by_the_followers_position(stream: Stream) -> None:
     where = success("state", joints={"shoulder.pos": 10.0}, task={})
     stream.arm.get_state = lambda: where  # type: ignore[method-assign]
     stream.send(action={"shoulder.pos": 700.0})
@@ -232,7 +235,7 @@ def test_the_first_frame_is_bounded_from_where_the_follower_stands(stream: Strea
     assert stream.arm.actions == [{"shoulder.pos": 11.0}]
 
 
-def test_no_frame_is_applied_while_the_follower_cannot_tell_its_joints_just_now(stream: Stream) -> None:
+def test_no_frame_is_applied_while_the_followers_joints_cannot_be_read(stream: Stream) -> None:
     told = {"joints": {"shoulder.pos": 90.0}, "joints_error": "The bus was busy for 1 s."}
     stream.arm.get_state = lambda: success("state", **told)  # type: ignore[method-assign]
     for _ in range(2):
@@ -245,7 +248,7 @@ def test_no_frame_is_applied_while_the_follower_cannot_tell_its_joints_just_now(
     eventually(lambda: stream.arm.actions == [{"shoulder.pos": 11.0}])
 
 
-def test_a_follower_that_cannot_tell_its_joints_is_led_all_the_same(stream: Stream) -> None:
+def test_follower_without_readable_joints_is_still_led(stream: Stream) -> None:
     def unread() -> Any:
         raise ConnectionError("no status packet")
 
@@ -263,14 +266,14 @@ def test_a_stream_ends_with_its_lifetime(stream: Stream, monkeypatch: pytest.Mon
     assert stream.receiver.stats["running"] is False
 
 
-def test_a_robot_that_refuses_every_frame_reads_as_errors(stream: Stream) -> None:
+def test_robot_that_refuses_every_frame_counts_as_errors(stream: Stream) -> None:
     for _ in range(3):
         stream.send(action={"broken": 1.0})
     eventually(lambda: stream.stat("errors")() == 3)
     assert stream.receiver.stats["frames_received"] == 3
 
 
-def test_streams_are_opened_told_and_closed_by_command(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_are_opened_listed_and_closed_by_command(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "teleop_receive")
     arm = Arm()
     peers.join(arm, "follower")
@@ -312,7 +315,7 @@ def test_a_device_without_actions_and_a_wildcard_name_are_refused(peers: Fleet) 
         InputReceiver(mesh, Arm(), "**")
 
 
-def test_events_named_by_an_enumeration_travel_under_their_own_names(peers: Fleet) -> None:
+def test_events_named_by_an_enumeration_are_published_under_their_own_names(peers: Fleet) -> None:
     class TeleopEvents(Enum):
         TERMINATE_EPISODE = "terminate_episode"
 
@@ -324,7 +327,7 @@ def test_events_named_by_an_enumeration_travel_under_their_own_names(peers: Flee
     assert told["events"] == {"terminate_episode": True, "success": False}
 
 
-def test_what_travels_of_an_action_is_floats(peers: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+def test_published_action_holds_only_floats(peers: Fleet, caplog: pytest.LogCaptureFixture) -> None:
     class Odd(Leader):
         def get_action(self) -> dict[str, Any]:
             return {
@@ -397,3 +400,28 @@ def test_a_device_that_fails_is_counted_and_goes_on(peers: Fleet) -> None:
     stats = publisher.stop()
     assert stats["errors"] == 1
     assert stats["event_read_errors"] >= 3
+
+
+def test_frames_of_a_local_leader_move_a_remote_follower(peers: Fleet) -> None:
+    peers.clock = time.time  # type: ignore[assignment]  # these peers live in real time
+    here, there = HardwareRobot(RecordingDevice()), HardwareRobot(RecordingDevice())
+    here.connect()
+    there.connect()
+    mesh = peers.join(here, "lead")
+    follower = InputReceiver(peers.join(there, "follower"), there, "lead")
+    follower.start()
+    assert follower.start_refusal is None
+    assert here.attach_teleop(ScriptedLeader({"pan.pos": (10.0, 5.0, 0.5)}))["status"] == "success"
+    assert "no network" in here.teleoperate(publish=True)["reason"]
+    here.input_sink = MeshInputSink(mesh)
+    assert here.teleoperate(publish=True)["status"] == "success"
+    eventually(lambda: follower.stats["frames_received"] > 20)
+    assert here.stop_teleoperate()["status"] == "success"
+    told = follower.stop()
+    assert told["errors"] == 0
+    assert told["out_of_order"] == 0
+    written = [write.action["pan.pos"] for write in there.device.writes]
+    assert len(set(written)) > 10
+    assert all(5.0 <= value <= 15.0 for value in written)
+    here.cleanup()
+    there.cleanup()

@@ -1,4 +1,4 @@
-"""What importing the mesh loads: next to nothing, so that a program that may never use it pays next to nothing."""
+"""Importing the mesh loads next to nothing, so that a program that does not use it pays nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is there, and which session speaks for whom."""
+"""Presence, the registry of peers, and the binding of a peer to its session."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def heartbeat(peers: Fleet, peer: str, **fields: Any) -> dict[str, Any]:
     return {"robot_id": peer, "robot_type": "robot", "hostname": "host", "timestamp": peers.clock(), **fields}
 
 
-def test_peers_see_each_other_and_what_they_are(peers: Fleet) -> None:
+def test_peers_see_each_other_with_their_descriptions(peers: Fleet) -> None:
     arm = peers.join(Arm("so100"), "arm-1")
     sim = peers.join(World("left", "right"), "sim-1", "sim")
     # A robot that a busy machine has not read yet is announced by its name alone.
@@ -86,7 +86,7 @@ def test_local_facts_are_written_over_what_a_heartbeat_claims(peers: Fleet) -> N
     assert row["type"] == "robot"
 
 
-def test_a_silent_peer_is_pruned_or_kept_as_out_of_reach() -> None:
+def test_silent_peer_is_pruned_or_listed_as_out_of_reach() -> None:
     clock, kept = Clock(), [0.0]
     registry = PeerRegistry(clock=clock, most=lambda: 2, retention=lambda: kept[0])
     assert registry.update("a", "robot", "h", {}) is True
@@ -141,7 +141,7 @@ def test_a_peer_that_cannot_join_is_not_alive(monkeypatch: pytest.MonkeyPatch) -
     mesh.close()
 
 
-def test_subscriptions_deliver_objects_and_end_with_the_stay(peers: Fleet) -> None:
+def test_subscriptions_deliver_objects_and_end_when_the_mesh_stops(peers: Fleet) -> None:
     one, two = peers.join(None, "one"), peers.join(None, "two")
     heard: list[tuple[str, dict[str, Any], str | None]] = []
     name = one.subscribe("strands/**", on_sample=lambda key, data, zid: heard.append((key, data, zid)), name="all")
@@ -185,7 +185,7 @@ def reachable(registry: PeerRegistry) -> bool:
     return bool(registry.all()[0]["reachable"])
 
 
-def test_a_token_that_went_with_our_own_link_says_nothing_until_the_link_is_back(
+def test_token_lost_with_our_own_link_is_not_judged_until_the_link_is_back(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.2)
@@ -205,7 +205,7 @@ def test_a_token_that_went_with_our_own_link_says_nothing_until_the_link_is_back
     publisher.stop()
 
 
-def test_who_does_not_come_back_with_the_link_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peer_whose_token_does_not_return_with_the_link_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.05)
     monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
     transport, publisher, registry = watched(MemoryBus())
@@ -231,7 +231,7 @@ class Late(MemoryTransport):
         super().connect()
 
 
-def test_a_bridge_whose_local_leg_came_late_shows_who_is_alive_and_watches_the_others(
+def test_bridge_declares_and_watches_tokens_when_its_local_leg_comes_up_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(bridges, "RETRY_S", 0.02)
@@ -272,7 +272,7 @@ def test_a_row_that_is_refreshed_without_a_session_keeps_the_living_peers_bindin
     assert registry.session_of("arm-1") is None
 
 
-def test_a_peer_that_cannot_begin_gives_the_session_back(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peer_that_fails_to_join_releases_the_session(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     first = Mesh(None, "console", parts=peers.parts("console"))
     transport = peers.transports["console"]
     declare = transport.declare_subscriber

@@ -32,7 +32,7 @@ def key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return load_signing_key(tmp_path / "operator.pem", PASSPHRASE)
 
 
-def test_an_emergency_stop_halts_and_locks_everybody_under_one_epoch(peers: Fleet) -> None:
+def test_emergency_stop_halts_and_locks_every_peer_under_one_epoch(peers: Fleet) -> None:
     arms = [Arm(f"arm-{number}") for number in range(3)]
     meshes = [peers.join(arm, arm.tool_name_str) for arm in arms]
     answers = meshes[0].emergency_stop()
@@ -45,7 +45,7 @@ def test_an_emergency_stop_halts_and_locks_everybody_under_one_epoch(peers: Flee
     assert (recorded["responses_received"], recorded["peers_not_stopped"], recorded["peers_silent"]) == (3, 0, 0)
 
 
-def test_a_console_has_nothing_to_halt_and_answers_nothing(peers: Fleet) -> None:
+def test_console_without_robot_adds_no_reply(peers: Fleet) -> None:
     console = peers.join(None, "console")
     assert console.emergency_stop() == []
     peers.join(Arm("arm-1"), "arm-1")
@@ -54,9 +54,7 @@ def test_a_console_has_nothing_to_halt_and_answers_nothing(peers: Fleet) -> None
 
 
 @pytest.mark.parametrize("assertion", [None, "no object", 5, {"v": 1}])
-def test_a_resume_that_is_none_is_rejected_like_every_other_and_counted(
-    peers: Fleet, key: Any, assertion: object
-) -> None:
+def test_malformed_resume_is_rejected_and_counted(peers: Fleet, key: Any, assertion: object) -> None:
     arm = peers.join(Arm("arm-1"), "arm-1")
     arm.emergency_stop()
     console = peers.join(None, "console")
@@ -70,7 +68,7 @@ def test_a_resume_that_is_none_is_rejected_like_every_other_and_counted(
     assert arm.lockout_epoch is not None
 
 
-def test_hardware_is_kept_locked_under_its_own_key_whatever_it_is_called(peers: Fleet, tmp_path: Path) -> None:
+def test_hardware_lockout_is_stored_under_its_own_key(peers: Fleet, tmp_path: Path) -> None:
     arm = Arm("arm-1")
     arm.safety_key = "hardware:so101:left"  # type: ignore[attr-defined]  # as real robots have it
     peers.join(arm, "arm-1").emergency_stop()
@@ -82,7 +80,7 @@ def test_hardware_is_kept_locked_under_its_own_key_whatever_it_is_called(peers: 
     eventually(lambda: kept() == [["hardware:so101:left"]])
 
 
-def test_who_did_not_stop_and_who_was_silent_is_named(
+def test_peers_that_did_not_stop_or_answer_are_named(
     peers: Fleet, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(safety, "COLLECT_S", 3.0)
@@ -99,7 +97,7 @@ def test_who_did_not_stop_and_who_was_silent_is_named(
     assert any("ghost" in message for message in critical)
 
 
-def test_the_envelope_goes_out_at_once_and_again_with_the_counts(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estop_is_published_at_once_and_again_with_the_counts(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(safety, "SPACING_S", 60.0)  # it goes out once more for who has not answered by then
     console = peers.join(None, "console")
     peers.join(Arm(), "arm-1")
@@ -116,7 +114,7 @@ def test_the_envelope_goes_out_at_once_and_again_with_the_counts(peers: Fleet, m
 
 
 @pytest.mark.parametrize("shift", [0.0, -3600.0, 3600.0, 30.0])
-def test_a_stop_counts_whatever_its_time_says(peers: Fleet, shift: float) -> None:
+def test_estop_counts_whatever_its_time(peers: Fleet, shift: float) -> None:
     arm = Arm()
     mesh = peers.join(arm, "arm-1")
     stranger = peers.stranger()
@@ -130,7 +128,7 @@ def test_a_stop_counts_whatever_its_time_says(peers: Fleet, shift: float) -> Non
     assert len(arm.halts) == 1
 
 
-def test_an_envelope_without_an_id_has_the_epoch_of_its_issuer_and_time(peers: Fleet) -> None:
+def test_epoch_of_an_estop_without_id_derives_from_issuer_and_time(peers: Fleet) -> None:
     mesh = peers.join(Arm(), "arm-1")
     stranger = peers.stranger()
     stranger.put("strands/safety/estop", {"peer_id": "far", "t": 1700000000.25, "source_zid": stranger.session_id})
@@ -150,7 +148,7 @@ def test_an_envelope_without_an_id_has_the_epoch_of_its_issuer_and_time(peers: F
         {"peer_id": 5},
     ],
 )
-def test_an_envelope_that_contradicts_itself_stops_nobody(peers: Fleet, change: dict[str, Any]) -> None:
+def test_inconsistent_estop_is_rejected(peers: Fleet, change: dict[str, Any]) -> None:
     arm = Arm()
     mesh = peers.join(arm, "arm-1")
     stranger = peers.stranger()
@@ -172,7 +170,7 @@ def test_a_locked_peer_refuses_motion_and_answers_reads_and_stops(peers: Fleet) 
         assert console.send("sim-1", {"action": action}, timeout=20)["type"] == "response", action
 
 
-def test_the_operators_resume_frees_the_fleet_and_nobody_elses_does(peers: Fleet, key: Any, tmp_path: Path) -> None:
+def test_only_the_operators_resume_clears_the_fleet(peers: Fleet, key: Any, tmp_path: Path) -> None:
     console, robot = peers.join(None, "console"), peers.join(Arm(), "arm-1")
     console.emergency_stop()
     keygen(tmp_path / "thief.pem", PASSPHRASE)
@@ -187,7 +185,7 @@ def test_the_operators_resume_frees_the_fleet_and_nobody_elses_does(peers: Fleet
     assert console.resume(key) == {"status": "error", "error": "resume rejected"}
 
 
-def test_a_resume_frees_only_its_targets(peers: Fleet, key: Any) -> None:
+def test_resume_clears_only_its_targets(peers: Fleet, key: Any) -> None:
     console = peers.join(None, "console")
     first, second = peers.join(Arm(), "arm-1"), peers.join(Arm(), "arm-2")
     console.emergency_stop()
@@ -225,7 +223,7 @@ def test_two_stops_need_two_resumes(peers: Fleet, key: Any) -> None:
     assert one.lockout_epoch not in (None, first)
 
 
-def test_relays_that_are_not_for_us_are_not_held_against_anybody(peers: Fleet, key: Any) -> None:
+def test_resume_for_other_peers_does_not_count_as_a_refusal(peers: Fleet, key: Any) -> None:
     robot = peers.join(Arm(), "arm-1")
     console = peers.join(None, "console")
     console.emergency_stop()
@@ -238,7 +236,7 @@ def test_relays_that_are_not_for_us_are_not_held_against_anybody(peers: Fleet, k
     eventually(lambda: robot.lockout_epoch is None)
 
 
-def test_without_sessions_a_stop_that_the_broker_kept_locks_a_late_joiner(peers: Fleet) -> None:
+def test_retained_estop_locks_a_late_joiner(peers: Fleet) -> None:
     mesh = peers.join(Arm(), "arm-1", sessionless=True)
     body = {"peer_id": "far", "t": peers.clock() - 86_400, "estop_id": "b" * 32}
     sample = Sample("strands/safety/estop", json.dumps(body).encode(), None, sessionless=True, retained=True)
@@ -246,7 +244,7 @@ def test_without_sessions_a_stop_that_the_broker_kept_locks_a_late_joiner(peers:
     eventually(lambda: mesh.lockout_epoch == "b" * 32)
 
 
-def test_a_kept_stop_that_a_signed_resume_followed_does_not_lock(peers: Fleet, key: Any) -> None:
+def test_retained_estop_followed_by_a_signed_resume_does_not_lock(peers: Fleet, key: Any) -> None:
     mesh = peers.join(Arm(), "arm-1", sessionless=True)
     [assertion] = sign(key, "b" * 32, ["arm-1"], clock=lambda: peers.clock() - 3600)
     relay = {"peer_id": "far", "t": peers.clock() - 3600, "assertion": assertion}

@@ -38,7 +38,7 @@ def test_an_arm_is_driven_watched_and_stopped_over_the_mesh(peers: Fleet, arm: S
     assert arm.start_policy("so100", "wave")["status"] == "error"
 
 
-def test_execute_runs_to_its_end_and_says_so(peers: Fleet, arm: Simulation) -> None:
+def test_execute_returns_when_the_task_is_completed(peers: Fleet, arm: Simulation) -> None:
     peers.join(arm, "sim-1", "sim")
     console = peers.join(None, "console")
     reply = console.tell("sim-1", "wave", policy_provider="mock", duration=0.5)
@@ -48,7 +48,7 @@ def test_execute_runs_to_its_end_and_says_so(peers: Fleet, arm: Simulation) -> N
     assert arm.list_policies_running() == []
 
 
-def test_a_provider_that_the_robot_lacks_is_its_own_answer(peers: Fleet, arm: Simulation) -> None:
+def test_unknown_provider_is_refused_by_the_robot(peers: Fleet, arm: Simulation) -> None:
     peers.join(arm, "sim-1", "sim")
     console = peers.join(None, "console")
     reply = console.send("sim-1", {"action": "start", "instruction": "x", "policy_provider": "groot"}, timeout=20)
@@ -56,7 +56,7 @@ def test_a_provider_that_the_robot_lacks_is_its_own_answer(peers: Fleet, arm: Si
     assert reply["result"]["status"] == "error"
 
 
-def test_the_steps_of_a_rollout_are_published_without_anybody_asking(peers: Fleet, arm: Simulation) -> None:
+def test_rollout_steps_are_published_without_a_request(peers: Fleet, arm: Simulation) -> None:
     steps: list[dict[str, Any]] = []
     mesh = peers.join(arm, "sim-1", "sim")
     console = peers.join(None, "console")
@@ -77,7 +77,7 @@ def test_the_steps_of_a_rollout_are_published_without_anybody_asking(peers: Flee
     assert len(steps) == told
 
 
-def test_a_simulated_robot_publishes_where_it_is(peers: Fleet, arm: Simulation) -> None:
+def test_simulated_robot_publishes_its_pose(peers: Fleet, arm: Simulation) -> None:
     poses: list[dict[str, Any]] = []
     peers.stranger().declare_subscriber("strands/sim-1/pose", lambda sample: poses.append(json.loads(sample.payload)))
     peers.join(arm, "sim-1", "sim")

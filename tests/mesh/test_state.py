@@ -1,4 +1,4 @@
-"""State section by section and presence field by field: what cannot be read takes nothing else with it."""
+"""State messages and presence fields: a section or field that cannot be read leaves the others."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet, received
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware import HardwareRobot
@@ -20,7 +22,7 @@ def read(robot: Any) -> dict[str, Any]:
     return body
 
 
-def test_joints_stay_where_the_task_cannot_be_read() -> None:
+def test_joints_are_published_while_the_task_cannot_be_read() -> None:
     class Mute(Arm):
         def get_task_status(self) -> Envelope:
             raise RuntimeError("no status")
@@ -32,7 +34,7 @@ def test_joints_stay_where_the_task_cannot_be_read() -> None:
     assert body["degraded"]["task"]["detail"] == "no status"
 
 
-def test_a_refusal_is_told_and_not_published_as_joints() -> None:
+def test_refused_read_is_reported_as_degraded() -> None:
     class Refusing(Arm):
         def get_state(self) -> Envelope:
             return error("the bus is gone")
@@ -45,7 +47,7 @@ def test_a_refusal_is_told_and_not_published_as_joints() -> None:
     )
 
 
-def test_a_joint_that_is_no_number_takes_no_other_with_it() -> None:
+def test_joint_that_is_no_number_leaves_the_others() -> None:
     class Odd(Arm):
         def get_state(self) -> Envelope:
             return success("state", joints={"pan": 1.0, "lift": float("nan"), "grip": None, "name": "x"})
@@ -55,7 +57,7 @@ def test_a_joint_that_is_no_number_takes_no_other_with_it() -> None:
     assert body["degraded"]["joints"]["detail"] == "lift, grip, name"
 
 
-def test_joints_of_an_earlier_read_are_told_and_published_for_a_second_only() -> None:
+def test_stale_joints_are_published_for_one_second() -> None:
     class Stale(Arm):
         age = 0.3
 
@@ -70,7 +72,7 @@ def test_joints_of_an_earlier_read_are_told_and_published_for_a_second_only() ->
     assert body["degraded"]["joints"]["reason"] == "stale"
 
 
-def test_trouble_ends_with_the_first_good_read() -> None:
+def test_degraded_section_recovers_with_the_first_good_read() -> None:
     class Shaky(Arm):
         broken = True
 
@@ -86,7 +88,7 @@ def test_trouble_ends_with_the_first_good_read() -> None:
     assert "degraded" not in (reader.read() or {})
 
 
-def test_a_world_tells_its_robots_though_its_state_cannot_be_read() -> None:
+def test_world_lists_its_robots_while_its_state_cannot_be_read() -> None:
     class Lost(World):
         def get_state(self) -> Envelope:
             raise OSError("no physics")
@@ -134,3 +136,36 @@ def test_presence_of_a_simulation_names_cameras_and_action_keys() -> None:
     assert two["cameras"] == ["overview", "left.wrist"]
     assert Description("sim-1", Featured("left")).read()["action_keys"] == ["elbow"]
     assert Description("console", None).read() == {}
+
+
+def test_joints_task_and_simulated_time_are_published(peers: Fleet) -> None:
+    states = received(peers, "strands/*/state")
+    peers.join(Arm(), "arm-1")
+    peers.join(World("left"), "sim-1", "sim")
+    eventually(lambda: {body["peer_id"] for body in states} == {"arm-1", "sim-1"})
+    arm = next(body for body in states if body["peer_id"] == "arm-1")
+    sim = next(body for body in states if body["peer_id"] == "sim-1")
+    assert arm["joints"] == {"shoulder": 1.5}
+    assert arm["task"]["status"] == "idle"
+    assert sim["joints"]["joint"]["position"] == 0.5
+    eventually(lambda: {"joint": {"position": 0.5, "velocity": 0.0}} in [body["joints"] for body in states])
+    assert sim["sim_time"] == 1.25
+    assert sim["robots"] == {"left": False}
+
+
+def test_unreadable_robot_is_degraded_and_still_published() -> None:
+    class Broken(Arm):
+        def get_state(self) -> dict[str, Any]:
+            raise OSError("bus timeout " + "x" * 1000)
+
+    reader = StateReader("arm-1", Broken())
+    reader.read()
+    body = reader.read()
+    assert body is not None
+    told = body["degraded"]["joints"]
+    assert set(told) == {"reason", "detail", "failures", "seconds"}
+    assert (told["reason"], told["failures"]) == ("OSError", 2)
+    assert told["detail"].startswith("bus timeout")
+    assert len(told["detail"]) < 200
+    assert body["task"]["status"] == "idle"
+    assert StateReader("console", None).read() is None

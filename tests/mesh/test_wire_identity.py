@@ -54,7 +54,7 @@ def test_a_signed_message_is_verified_once(folder: Path) -> None:
     ("peer", "speaks"),
     [("arm-1", True), ("arm-1__left", True), ("arm-10", False), ("arm-1_x", False), ("arm-2", False)],
 )
-def test_a_name_speaks_for_itself_and_its_children(folder: Path, peer: str, speaks: bool) -> None:
+def test_certificate_speaks_for_its_name_and_its_children(folder: Path, peer: str, speaks: bool) -> None:
     clock = Clock()
     identity = Identity(None, verifier(folder, clock), required=True)
     why = identity.refusal(signer(folder, "arm-1", clock).sign(BODY), peer)
@@ -124,7 +124,7 @@ def test_a_certificate_whose_name_is_no_text_does_not_count(folder: Path) -> Non
         verifier(folder, clock).verify(signed)
 
 
-def test_the_issuer_is_asked_before_the_certificates_dates(folder: Path, tmp_path: Path) -> None:
+def test_issuer_is_checked_before_the_validity_dates(folder: Path, tmp_path: Path) -> None:
     clock = Clock()
     message = signed_elsewhere(tmp_path, clock)
     clock.pass_(100 * 365 * 86400.0)
@@ -133,7 +133,7 @@ def test_the_issuer_is_asked_before_the_certificates_dates(folder: Path, tmp_pat
 
 
 @pytest.mark.parametrize(("word", "required"), [("1", True), ("yes", True), ("TRUE", True), ("0", False)])
-def test_any_unknown_word_demands_signatures_on_every_road_and_is_warned_of_once(
+def test_unknown_policy_demands_signatures_on_every_transport_with_one_warning(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     word: str,

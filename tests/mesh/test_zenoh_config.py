@@ -1,4 +1,4 @@
-"""How the mesh meets the network: endpoints, certificates, refusals that name the remedy."""
+"""Endpoints and certificates of a session, and refusals that name the remedy."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_multicast_leaves_loopback_too(monkeypatch: pytest.MonkeyPatch) -> None:
         Posture.from_settings()
 
 
-def test_none_needs_its_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auth_mode_none_needs_its_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/10.0.0.1:7447")
     monkeypatch.setenv("STRANDS_MESH_AUTH_MODE", "none")
     with pytest.raises(TransportError):
@@ -67,7 +67,7 @@ def test_none_needs_its_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
         ("nonsense", False),
     ],
 )
-def test_loopback_is_told_by_the_address(endpoint: str, inside: bool) -> None:
+def test_loopback_is_recognised_by_the_address(endpoint: str, inside: bool) -> None:
     assert zenoh_config.is_loopback(endpoint) is inside
 
 
@@ -149,7 +149,7 @@ def test_access_rules_name_every_peer_and_nothing_else() -> None:
         keys.acl([])
 
 
-def test_every_topic_has_a_size_and_only_telemetry_is_thinned_out() -> None:
+def test_every_topic_has_a_size_and_only_telemetry_is_downsampled() -> None:
     for topic in topics.TABLE:
         assert topic.max_bytes > 0
         if topic.name in ("cmd", "broadcast", "response", "estop", "resume", "input"):

@@ -85,7 +85,7 @@ def until_answered(transport: Transport, key: str, body: dict[str, Any], found: 
 # Who is there.
 
 
-def test_a_peer_tells_what_it_is(net: Network) -> None:
+def test_peer_publishes_its_description(net: Network) -> None:
     rows = {row["peer_id"]: row for row in net.peers["console"].ask("peers")}
     assert (rows["sim-1"]["type"], rows["sim-1"]["world"], rows["sim-1"]["sim_robots"]) == ("sim", True, ["left"])
     assert (rows["arm-1"]["type"], rows["arm-1"]["tool_name"]) == ("robot", "arm-1")
@@ -108,7 +108,7 @@ def test_a_peer_is_bound_to_the_session_it_came_from(net: Network) -> None:
     assert net.peers["console"].ask("zid", "sim-1") not in seen
 
 
-def test_nobody_takes_a_living_peers_name(net: Network) -> None:
+def test_living_peers_name_cannot_be_taken(net: Network) -> None:
     mallory, sim = net.stranger("impostor"), net.peers["sim-1"]
     before = sim.ask("zid", "arm-1"), sim.ask("cert", "arm-1")
     for number in range(30):
@@ -132,12 +132,12 @@ def test_a_ping_is_answered_and_timed(net: Network) -> None:
     assert answer["latency_ms"] > 0
 
 
-def test_a_peer_that_is_nowhere_is_offline_at_once(net: Network) -> None:
+def test_absent_peer_is_offline_at_once(net: Network) -> None:
     net.needs("confirm")
     assert net.peers["console"].ask("ping", "nobody")["status"] == "offline"
 
 
-def test_a_peer_that_is_nowhere_times_out(net: Network) -> None:
+def test_absent_peer_times_out(net: Network) -> None:
     answer = net.peers["console"].ask("send", "nobody", {"action": "status"}, 0.2)
     assert answer.get("status") == "timeout" or answer.get("error") == "offline"
 
@@ -183,7 +183,7 @@ def test_a_broadcast_collects_every_peer(net: Network) -> None:
 # Publishing.
 
 
-def test_what_is_published_is_heard_until_one_is_deaf(net: Network) -> None:
+def test_published_message_is_received_until_unsubscribed(net: Network) -> None:
     console, sim = net.peers["console"], net.peers["sim-1"]
     assert console.ask("hear", "strands/*/notes", None, "notes") == "notes"
 
@@ -306,7 +306,7 @@ def test_a_command_is_carried_out_once(net: Network) -> None:
 
 
 @pytest.mark.parametrize("shift", [-61.0, 60.0])
-def test_a_motion_of_another_time_is_refused(net: Network, shift: float) -> None:
+def test_motion_with_a_wrong_time_is_refused(net: Network, shift: float) -> None:
     mallory, sim = net.stranger("late" if shift < 0 else "early"), net.peers["sim-1"]
     sender, before = "late" if shift < 0 else "early", sim.ask("steps")
     found = replies_to(mallory, sender)
@@ -326,7 +326,7 @@ def test_a_command_out_of_bounds_is_answered_with_the_reason(net: Network) -> No
 # Safety.
 
 
-def test_an_emergency_stop_halts_and_locks_everybody_until_the_signed_resume(net: Network) -> None:
+def test_emergency_stop_halts_and_locks_every_peer_until_the_signed_resume(net: Network) -> None:
     console, arm, sim = (net.peers[name] for name in ("console", "arm-1", "sim-1"))
     arm.ask("start", "wave")
     sim.ask("start", "wave")
@@ -344,7 +344,7 @@ def test_an_emergency_stop_halts_and_locks_everybody_until_the_signed_resume(net
     assert console.ask("send", "sim-1", WAVE, 20)["result"]["status"] == "success"
 
 
-def test_a_stop_of_anybody_counts_and_a_resume_of_anybody_does_not(net: Network, tmp_path: Path) -> None:
+def test_any_peer_may_stop_and_only_the_operator_may_resume(net: Network, tmp_path: Path) -> None:
     keygen(tmp_path / "own.pem", PASSPHRASE)
     console, arm = net.peers["console"], net.peers["arm-1"]
     arm.ask("estop")

@@ -66,7 +66,7 @@ def test_a_served_arm_is_seen_from_another_terminal_and_ctrl_c_stops_it(tmp_path
         assert json.loads(rest.splitlines()[0])["stopped"] is True
 
 
-def test_a_served_arm_is_stopped_locked_and_freed_from_another_terminal(tmp_path: Path, port: int) -> None:
+def test_served_arm_is_stopped_locked_and_cleared_from_another_terminal(tmp_path: Path, port: int) -> None:
     with served(tmp_path, port) as (_, settings):
         assert asked(settings, "stop", "arm-1", "--mesh")[1]["stopped"] is True
         code, told = asked(settings, "estop", "--mesh")
@@ -79,14 +79,14 @@ def test_a_served_arm_is_stopped_locked_and_freed_from_another_terminal(tmp_path
         assert held(file) == {"arm-1": []}
 
 
-def test_a_stop_that_nobody_answers_is_no_success(tmp_path: Path, port: int) -> None:
+def test_unanswered_stop_is_no_success(tmp_path: Path, port: int) -> None:
     settings = {**os.environ, "STRANDS_MESH_PORT": str(port), "STRANDS_STATE_DIR": str(tmp_path)}
     code, told = asked(settings, "estop", "--mesh")
     assert (code, told["stopped"]) == (3, None)
 
 
 @pytest.mark.parametrize("command", [["serve", "so100"], ["peers"], ["stop", "--all"], ["estop"]])
-def test_a_network_flag_that_the_mesh_has_no_use_for_is_refused(command: list[str]) -> None:
+def test_network_flag_that_the_mesh_does_not_take_is_refused(command: list[str]) -> None:
     ended = CliRunner().invoke(build(), [*command, "--mesh", "--nats", "nats://127.0.0.1:4222"])
     assert ended.exit_code == 2
     assert "--mesh takes no network flag but --port" in ended.output

@@ -79,7 +79,7 @@ def test_five_peers_lose_their_hub_and_get_it_back(join: Join, port: int) -> Non
     everybody_answers_everybody(left)
 
 
-def test_a_suspended_robot_is_told_as_silent_and_stops_when_it_goes_on(join: Join) -> None:
+def test_suspended_robot_is_reported_silent_and_stops_when_it_continues(join: Join) -> None:
     console, arm = join("console", "none"), join("arm-1", "arm")
     meet([console, arm])
     arm.ask("start", "wave")
@@ -91,7 +91,7 @@ def test_a_suspended_robot_is_told_as_silent_and_stops_when_it_goes_on(join: Joi
     eventually(lambda: arm.ask("moving") is False, what="it stands still")
 
 
-def test_a_suspended_hub_holds_the_mesh_up_and_a_stop_arrives_when_it_goes_on(join: Join, port: int) -> None:
+def test_stop_arrives_when_a_suspended_hub_continues(join: Join, port: int) -> None:
     hub = join("hub", "none")
     console, arm = join("console", "none"), join("arm-1", "arm")
     meet([hub, console, arm])

@@ -75,7 +75,7 @@ def test_a_short_partition_costs_an_answer_and_no_binding(site: Site, lab: Netwo
     assert lab.dropped > 0
 
 
-def test_a_long_partition_parts_the_roster_and_heals_by_itself(site: Site, lab: NetworkLab) -> None:
+def test_long_partition_removes_peers_and_heals_by_itself(site: Site, lab: NetworkLab) -> None:
     site.arm.ask("start", "wave")
     lab.weather.parted = True
     eventually(lambda: site.console.ask("reachable") == [], what="the far side is out of reach")

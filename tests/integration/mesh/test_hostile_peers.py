@@ -114,7 +114,7 @@ def test_a_forged_presence_binds_nobody_anew_and_is_audited(net: OverZenoh, atta
 
 
 @pytest.mark.parametrize("shift", [-61.0, 60.0, 1e12])
-def test_a_presence_of_another_time_is_nobody(net: OverZenoh, attacker: Attacker, shift: float) -> None:
+def test_presence_with_a_wrong_time_is_dropped(net: OverZenoh, attacker: Attacker, shift: float) -> None:
     name = f"ghost-{abs(int(shift)) % 1000}"
     attacker.put(f"strands/{name}/presence", presence(name, timestamp=time.time() + shift))
     after = f"after-{name}"
@@ -192,7 +192,7 @@ def test_a_sender_that_is_no_identifier_gets_no_reply(net: OverZenoh, attacker: 
     audited(net, "sim-1", "command_rejected")
 
 
-def test_what_is_above_its_topics_size_is_not_taken(net: OverZenoh, attacker: Attacker) -> None:
+def test_message_above_its_topics_size_is_dropped(net: OverZenoh, attacker: Attacker) -> None:
     sim, pad = net.peers["sim-1"], {"pad": "x" * 16_384}
     steps = sim.ask("steps")
     attacker.put("strands/sim-1/cmd", {**request("mallory", {"action": "step"}), **pad})

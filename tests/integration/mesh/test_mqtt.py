@@ -26,7 +26,7 @@ def test_key_expressions_become_topic_filters() -> None:
     assert filter_of("strands/a/response/**") == "strands/a/response/#"
 
 
-def test_what_is_not_stated_is_named() -> None:
+def test_missing_setting_is_named() -> None:
     with pytest.raises(TransportError, match="STRANDS_IOT_ENDPOINT"):
         Account.from_settings()
 
@@ -73,7 +73,7 @@ def join(broker: MqttBroker, folder: Path, tmp_path: Path) -> Iterator[Join]:
 
 
 @pytest.mark.system
-def test_peers_meet_command_and_tell_how_it_was_delivered(join: Join) -> None:
+def test_peers_command_each_other_and_report_the_delivery(join: Join) -> None:
     sim, console = join("sim-1"), join("console", "none")
     console.sees("sim-1")
     answer = console.ask("ping", "sim-1")
@@ -109,7 +109,7 @@ def test_a_signed_command_moves_approved_hardware_over_mqtt(join: Join, folder: 
 
 
 @pytest.mark.system
-def test_a_late_joiner_locks_on_the_kept_stop_and_not_once_it_was_resumed(join: Join, tmp_path: Path) -> None:
+def test_late_joiner_locks_on_a_retained_stop_unless_it_was_resumed(join: Join, tmp_path: Path) -> None:
     key = str(tmp_path / "operator.pem")
     trusted = {"STRANDS_MESH_RESUME_PUBLIC_KEY": keygen(key, PASSPHRASE)}
     first, console = join("sim-1", **trusted), join("console", "none", **trusted)
@@ -129,7 +129,7 @@ def test_a_late_joiner_locks_on_the_kept_stop_and_not_once_it_was_resumed(join: 
 
 
 @pytest.mark.system
-def test_a_stop_of_a_bridge_reaches_who_is_on_the_broker_alone_and_the_other_way_round(join: Join) -> None:
+def test_stop_crosses_the_bridge_in_both_directions(join: Join) -> None:
     local = {"STRANDS_MESH_PORT": str(free_port())}
     bridge = join("bridge", "none", STRANDS_MESH_BACKEND="bridge", **local)
     near, far = join("sim-1", STRANDS_MESH_BACKEND="zenoh", **local), join("sim-2")
@@ -155,9 +155,7 @@ def test_peers_meet_again_when_the_broker_comes_back(join: Join, broker: MqttBro
 
 
 @pytest.mark.system
-def test_a_stop_while_the_broker_is_away_stops_here_and_everybody_when_it_is_back(
-    join: Join, broker: MqttBroker
-) -> None:
+def test_stop_while_the_broker_is_down_reaches_every_peer_when_it_is_back(join: Join, broker: MqttBroker) -> None:
     sim, arm = join("sim-1"), join("arm-1", "arm")
     arm.sees("sim-1")
     for peer in (sim, arm):

@@ -59,9 +59,7 @@ def test_a_certificate_may_not_announce_another_peer(join: Join, fleet: Fleet, t
 
 
 @pytest.mark.parametrize("outsider", ["another authority", "no certificate"])
-def test_who_is_not_of_the_fleet_gets_no_link(
-    join: Join, fleet: Fleet, tmp_path: Path, port: int, outsider: str
-) -> None:
+def test_peer_of_another_fleet_gets_no_link(join: Join, fleet: Fleet, tmp_path: Path, port: int, outsider: str) -> None:
     console = join("console", "none", **fleet["console"])
     other: dict[str, str] = {"ZENOH_CONNECT": f"tcp/127.0.0.1:{port}"}
     if outsider == "another authority":

@@ -26,7 +26,7 @@ def test_two_processes_without_configuration_see_and_command_each_other(join: Jo
     assert arm.ask("zid", "sim-1") != sim.ask("zid", "arm-1")
 
 
-def test_a_killed_peer_is_seen_gone_long_before_its_heartbeat_is_missed_and_may_come_back(join: Join) -> None:
+def test_killed_peer_is_gone_long_before_its_heartbeat_is_missed_and_may_return(join: Join) -> None:
     hub, child = join("hub", "none"), join("child")
     hub.sees("child")
     child.kill()
@@ -54,7 +54,7 @@ def test_the_children_of_a_dead_hub_find_each_other_again(join: Join, port: int)
     eventually(lambda: late.ask("ping", "child-2", 0.5)["status"] == "ok")
 
 
-def test_a_suspended_peer_is_out_of_reach_and_back_when_it_goes_on(join: Join) -> None:
+def test_suspended_peer_is_out_of_reach_until_it_continues(join: Join) -> None:
     hub, child = join("hub", "none"), join("child")
     hub.sees("child")
     child.signal(signal.SIGSTOP)

@@ -98,9 +98,7 @@ def test_ctrl_c_stops_the_follower_first(join: Join, replay: Any, wave: Path) ->
     assert len(arm.ask("halts")[0]) == 1
 
 
-def test_a_follower_that_is_lost_is_told_as_one_whose_stop_was_not_answered(
-    join: Join, replay: Any, wave: Path
-) -> None:
+def test_lost_follower_is_reported_as_not_having_answered_the_stop(join: Join, replay: Any, wave: Path) -> None:
     arm = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive")
     replaying = replay(str(wave), "--to", "mesh:arm-1")
     followed(arm, 5)
@@ -111,7 +109,7 @@ def test_a_follower_that_is_lost_is_told_as_one_whose_stop_was_not_answered(
     assert "arm-1" in told["reason"]
 
 
-def test_a_follower_that_is_not_there_is_one_sentence(replay: Any, wave: Path) -> None:
+def test_absent_follower_is_reported_in_one_sentence(replay: Any, wave: Path) -> None:
     code, [told] = ended(replay(str(wave), "--to", "mesh:nobody-1"))
     assert code == 3
     assert "nobody-1" in told["reason"]
@@ -140,7 +138,7 @@ def test_a_leader_that_is_published_drives_a_robot_of_this_machine(replay: Any, 
     assert (told["errors"], told["rejected"]) == (0, 0)
 
 
-def test_a_leader_is_published_alone_where_nobody_follows_here(replay: Any, wave: Path) -> None:
+def test_leader_is_published_without_a_local_follower(replay: Any, wave: Path) -> None:
     line = [*COMMAND, "teleop", str(wave), "none", "--for", "2", "--json"]
     done = subprocess.run([*line, "--publish", "lead-1"], stdout=subprocess.PIPE, text=True, check=True, timeout=90)
     told = json.loads(done.stdout)
