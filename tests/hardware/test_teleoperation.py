@@ -1,4 +1,4 @@
-"""A leader drives a real robot through the same loop, gate and write path as a task."""
+"""Teleoperation of a real robot through the loop, gate and write path of tasks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WAVES = {"pan.pos": (20.0, 50.0, 1.0), "lift.pos": (20.0, 50.0, 1.0)}
 
 
 class Leader:
-    """Gives what ``action`` is; a callable is called."""
+    """Returns ``action``, or calls it."""
 
     def __init__(self, action: Any) -> None:
         self.action = action
@@ -47,7 +47,7 @@ def robot() -> Iterator[HardwareRobot]:
     made.cleanup()
 
 
-def test_a_leader_drives_the_follower_until_stopped(robot: HardwareRobot) -> None:
+def test_leader_drives_the_follower_until_stopped(robot: HardwareRobot) -> None:
     robot.attach_teleop(ScriptedLeader(WAVES))
     assert robot.teleoperate(hz=200)["status"] == "success"
     eventually(lambda: len(robot.device.writes) > 20)
@@ -62,7 +62,7 @@ def test_a_leader_drives_the_follower_until_stopped(robot: HardwareRobot) -> Non
     assert robot.stop_teleoperate()["was_running"] is False
 
 
-def test_a_halt_stops_a_leader_too(robot: HardwareRobot) -> None:
+def test_halt_stops_a_leader(robot: HardwareRobot) -> None:
     robot.attach_teleop(ScriptedLeader(WAVES))
     robot.teleoperate()
     eventually(lambda: robot.device.writes)
@@ -83,7 +83,7 @@ def test_one_source_drives_at_a_time(robot: HardwareRobot) -> None:
     assert "the task 'wave'" in robot.teleoperate()["reason"]
 
 
-def test_the_follower_glides_to_a_leader_that_is_elsewhere(robot: HardwareRobot) -> None:
+def test_follower_moves_to_a_distant_leader_at_the_speed_bound(robot: HardwareRobot) -> None:
     robot.attach_teleop(Leader({"pan.pos": 100.0}), max_speed=1.0)
     robot.teleoperate(hz=100)
     eventually(lambda: robot.device.positions["pan.pos"] == 100.0)
@@ -92,14 +92,14 @@ def test_the_follower_glides_to_a_leader_that_is_elsewhere(robot: HardwareRobot)
     assert max(b - a for a, b in itertools.pairwise(targets)) <= 200 * 2 / 100 + 1e-6
 
 
-def test_a_leaders_keys_may_be_named_otherwise(robot: HardwareRobot) -> None:
+def test_keys_of_a_leader_are_renamed(robot: HardwareRobot) -> None:
     robot.attach_teleop(Leader({"shoulder": 12.0}), keys={"shoulder": "pan.pos"})
     robot.teleoperate()
     eventually(lambda: robot.device.positions["pan.pos"] == 12.0)
 
 
 @pytest.mark.parametrize("bad", [{"pan.pos": float("nan")}, {"elbow": 1.0}, None, [], {"pan.pos": True}], ids=repr)
-def test_a_leader_that_gives_nothing_usable_ends_in_error_and_a_hold(robot: HardwareRobot, bad: Any) -> None:
+def test_leader_without_usable_frames_ends_in_an_error_and_the_follower_stops(robot: HardwareRobot, bad: Any) -> None:
     robot.attach_teleop(Leader(bad))
     robot.teleoperate()
     eventually(lambda: robot.teleop_status()["leaders"]["leader"]["state"] == "error")
@@ -109,7 +109,7 @@ def test_a_leader_that_gives_nothing_usable_ends_in_error_and_a_hold(robot: Hard
     assert [write.action for write in robot.device.writes] == [dict.fromkeys(robot.device.positions, 10.0)]
 
 
-def test_a_bad_frame_now_and_then_is_counted_and_not_applied(robot: HardwareRobot) -> None:
+def test_occasional_bad_frame_is_counted_and_not_applied(robot: HardwareRobot) -> None:
     count = iter(range(10**9))
 
     def sometimes() -> dict[str, float]:
@@ -124,7 +124,7 @@ def test_a_bad_frame_now_and_then_is_counted_and_not_applied(robot: HardwareRobo
     assert robot.teleop_status()["running"] == ["leader"]
 
 
-def test_a_leader_whose_read_hangs_is_honestly_not_stopped(robot: HardwareRobot) -> None:
+def test_leader_whose_read_hangs_is_reported_as_not_stopped(robot: HardwareRobot) -> None:
     free, hangs = threading.Event(), threading.Event()
 
     def hang() -> dict[str, float]:
@@ -142,7 +142,7 @@ def test_a_leader_whose_read_hangs_is_honestly_not_stopped(robot: HardwareRobot)
     assert all(write.action["pan.pos"] != 99.0 for write in robot.device.writes)
 
 
-def test_frames_go_to_the_network_when_asked(robot: HardwareRobot) -> None:
+def test_frames_go_to_the_network_on_publish(robot: HardwareRobot) -> None:
     robot.attach_teleop(Leader({"pan.pos": 12.0}), name="left", method="gamepad")
     assert "publish" in robot.teleoperate("left", publish=True)["reason"]
     sink = robot.input_sink = Sink()
@@ -152,7 +152,7 @@ def test_frames_go_to_the_network_when_asked(robot: HardwareRobot) -> None:
     assert sink.frames[0] == ("left", "gamepad", {"pan.pos": 12.0}, None)
 
 
-def test_a_network_that_fails_does_not_disturb_the_follower(robot: HardwareRobot) -> None:
+def test_failing_network_does_not_disturb_the_follower(robot: HardwareRobot) -> None:
     robot.input_sink = Sink(broken=True)
     robot.attach_teleop(Leader({"pan.pos": 12.0}))
     robot.teleoperate(publish=True)
@@ -160,7 +160,7 @@ def test_a_network_that_fails_does_not_disturb_the_follower(robot: HardwareRobot
     assert robot.teleop_status()["running"] == ["leader"]
 
 
-def test_what_cannot_lead_is_refused(robot: HardwareRobot) -> None:
+def test_unusable_leader_and_bad_options_are_refused(robot: HardwareRobot) -> None:
     assert "get_action" in robot.attach_teleop(object())["reason"]
     leader = ScriptedLeader(WAVES)
     for bad in ({"name": "a/b"}, {"method": "mind"}, {"max_speed": 0}, {"robot_name": "other"}):
@@ -174,7 +174,7 @@ def test_what_cannot_lead_is_refused(robot: HardwareRobot) -> None:
     eventually(lambda: "not connected" in robot.teleop_status()["leaders"]["leader"]["error"])
 
 
-def test_events_of_a_leader_go_with_its_frames() -> None:
+def test_events_of_a_leader_are_published_with_its_frames() -> None:
     class Pad(Leader):
         def get_teleop_events(self) -> dict[str, bool]:
             return {"terminate_episode": True}
@@ -186,9 +186,7 @@ def test_events_of_a_leader_go_with_its_frames() -> None:
     assert sink.frames[0][3] == {"terminate_episode": True}
 
 
-def test_events_that_cannot_be_read_are_counted_told_once_and_shown(
-    robot: HardwareRobot, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unreadable_events_are_counted_and_logged_once(robot: HardwareRobot, caplog: pytest.LogCaptureFixture) -> None:
     class Mute(Leader):
         def get_teleop_events(self) -> dict[str, bool]:
             raise OSError("no events")

@@ -1,4 +1,4 @@
-"""Daemons to test on: the stand-in always, the real ones where they are installed (`make test-all` does that)."""
+"""Daemons for the tests: the stand-in always, the real ones where they are installed (`make test-all` does that)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def every(kinds: list[Kind]) -> list[object]:
 
 @pytest.fixture(scope="module", params=every(STAND_INS + REAL))
 def shared(request: pytest.FixtureRequest) -> Iterator[Daemon]:
-    """One running daemon for a module's tests, of every kind in turn."""
+    """A running daemon for a module's tests, of every kind in turn."""
     kind: Kind = request.param
-    if why := kind.missing():
-        (pytest.fail if os.environ.get("CI") else pytest.skip)(why)
+    if reason := kind.missing():
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     with Daemon(kind) as daemon:
         yield daemon
 
@@ -51,7 +51,7 @@ def daemon(shared: Daemon) -> Daemon:
 
 @pytest.fixture
 def connect(daemon: Daemon) -> Iterator[Connect]:
-    """Drivers of the daemon, connected, and let go of at the end."""
+    """Connected drivers of the daemon, disconnected at the end."""
     drivers: list[ReachyDriver] = []
 
     def make(**options: object) -> ReachyDriver:

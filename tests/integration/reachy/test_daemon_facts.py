@@ -1,4 +1,4 @@
-"""What daemons really do. Each of these passes on the stand-in and on Pollen's own, so that the stand-in cannot lie."""
+"""Behaviour of real daemons. Each test passes on the stand-in and on Pollen's own, which holds the stand-in to it."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def socket(daemon: Daemon) -> Iterator[ClientConnection]:
 
 
 def frames(ws: ClientConnection, seconds: float) -> list[dict[str, Any]]:
-    found, end = [], time.monotonic() + seconds
+    received, end = [], time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         try:
-            found.append(json.loads(ws.recv(left)))
+            received.append(json.loads(ws.recv(left)))
         except TimeoutError:
             break
-    return found
+    return received
 
 
 def antennas(ws: ClientConnection) -> list[Any]:
@@ -58,7 +58,7 @@ def rest(daemon: Daemon) -> Iterator[RestClient]:
     client.close()
 
 
-def test_the_status_tells_the_era(daemon: Daemon, rest: RestClient) -> None:
+def test_status_reports_version_and_state(daemon: Daemon, rest: RestClient) -> None:
     status = rest.get("/api/daemon/status")
     assert status["version"] == daemon.kind.version
     assert ("type" in status) is not daemon.kind.zenoh
@@ -67,7 +67,7 @@ def test_the_status_tells_the_era(daemon: Daemon, rest: RestClient) -> None:
     assert status["robot_name"] == "reachy_mini"
 
 
-def test_the_socket_streams_joints_poses_and_status_without_being_asked(daemon: Daemon) -> None:
+def test_socket_streams_joints_poses_and_status_unasked(daemon: Daemon) -> None:
     kinds: list[str] = []
     with socket(daemon) as ws:
         while kinds.count("daemon_status") < 4:
@@ -81,7 +81,7 @@ def test_the_socket_streams_joints_poses_and_status_without_being_asked(daemon: 
 
 
 @pytest.mark.parametrize("frame", ["{bad", "", "[1]", '{"type":"nobody"}', '{"head_pose":[[1]]}', '{"a":1}'])
-def test_a_frame_that_is_not_understood_is_ignored_and_the_socket_lives(daemon: Daemon, frame: str) -> None:
+def test_unknown_frame_is_ignored_and_the_socket_stays_open(daemon: Daemon, frame: str) -> None:
     with socket(daemon) as ws:
         ws.send(frame)
         ws.send(json.dumps({"type": "set_antennas", "antennas": [0.31, -0.31]}))
@@ -89,7 +89,7 @@ def test_a_frame_that_is_not_understood_is_ignored_and_the_socket_lives(daemon: 
 
 
 @pytest.mark.parametrize("frame", [b"{}", json.dumps({"type": "set_target", "head": UPRIGHT[:15]})])
-def test_some_frames_end_the_connection_without_a_close_frame(daemon: Daemon, frame: str | bytes) -> None:
+def test_binary_and_short_frames_end_the_connection_without_a_close_frame(daemon: Daemon, frame: str | bytes) -> None:
     with socket(daemon) as ws:
         ws.send(frame)
         with pytest.raises(ConnectionClosed) as closed:
@@ -97,7 +97,7 @@ def test_some_frames_end_the_connection_without_a_close_frame(daemon: Daemon, fr
         assert closed.value.rcvd is None
 
 
-def test_a_nan_comes_back_as_null_until_a_number_repairs_it(daemon: Daemon) -> None:
+def test_nan_comes_back_as_null_until_a_number_repairs_it(daemon: Daemon) -> None:
     if daemon.kind.simulation == "mujoco":
         pytest.skip("physics keeps its own numbers")
     with socket(daemon) as ws:
@@ -107,7 +107,7 @@ def test_a_nan_comes_back_as_null_until_a_number_repairs_it(daemon: Daemon) -> N
         eventually(lambda: antennas(ws) == pytest.approx([0, 0], abs=0.01), what="repaired")
 
 
-def test_a_move_that_is_over_cannot_be_stopped_and_the_next_request_works(daemon: Daemon, rest: RestClient) -> None:
+def test_stop_of_an_ended_move_fails_and_the_next_request_works(daemon: Daemon, rest: RestClient) -> None:
     for _ in range(3):
         with pytest.raises(DaemonFaultError) as fault:
             rest.post("/api/move/stop", {"uuid": "00000000-0000-4000-8000-000000000000"})
@@ -117,7 +117,7 @@ def test_a_move_that_is_over_cannot_be_stopped_and_the_next_request_works(daemon
 
 
 @pytest.mark.parametrize(
-    ("path", "body", "kind", "says"),
+    ("path", "body", "kind", "message"),
     [
         ("/api/move/stop", {"uuid": "nope"}, DaemonRefusedError, "valid UUID"),
         ("/api/move/goto", {"head_pose": {"yaw": 0.1}}, DaemonRefusedError, "body.duration: Field required"),
@@ -128,10 +128,10 @@ def test_a_move_that_is_over_cannot_be_stopped_and_the_next_request_works(daemon
         ("/nope", None, DaemonNotFoundError, "Not Found"),
     ],
 )
-def test_a_wrong_request_is_refused_with_the_daemons_words(
-    rest: RestClient, path: str, body: dict[str, Any] | None, kind: type[Exception], says: str
+def test_wrong_request_is_refused_with_the_daemons_message(
+    rest: RestClient, path: str, body: dict[str, Any] | None, kind: type[Exception], message: str
 ) -> None:
-    with pytest.raises(kind, match=says):
+    with pytest.raises(kind, match=message):
         rest.post(path, body)
 
 
@@ -146,7 +146,7 @@ def test_only_local_names_are_answered_since_1_12(daemon: Daemon) -> None:
     assert (answer.status_code, answer.text) == (403, '{"detail": "Cross-origin request rejected"}')
 
 
-def test_two_moves_run_at_the_same_time_and_nobody_objects(daemon: Daemon, rest: RestClient) -> None:
+def test_two_moves_run_at_the_same_time(daemon: Daemon, rest: RestClient) -> None:
     moves = [rest.post("/api/move/goto", {"antennas": [a, a], "duration": 60.0})["uuid"] for a in (1.0, -1.0)]
     assert {move["uuid"] for move in rest.get("/api/move/running")} == set(moves)
     for uuid in moves:
@@ -154,7 +154,7 @@ def test_two_moves_run_at_the_same_time_and_nobody_objects(daemon: Daemon, rest:
     assert rest.get("/api/move/running") == []
 
 
-def test_recorded_moves_in_the_cache_need_no_hub(rest: RestClient) -> None:
+def test_cached_recorded_moves_need_no_hub(rest: RestClient) -> None:
     path = "/api/move/recorded-move-datasets/list/pollen-robotics/reachy-mini-"
     assert sorted(rest.get(path + "emotions-library")) == ["no1", "yes1"]
     with pytest.raises(DaemonFaultError):
@@ -163,7 +163,7 @@ def test_recorded_moves_in_the_cache_need_no_hub(rest: RestClient) -> None:
         rest.post("/api/move/play/recorded-move-dataset/pollen-robotics/reachy-mini-emotions-library/nope")
 
 
-def test_after_a_restart_the_old_socket_stays_open_and_says_nothing(daemon: Daemon, rest: RestClient) -> None:
+def test_old_socket_stays_open_and_silent_after_a_restart(daemon: Daemon, rest: RestClient) -> None:
     with socket(daemon) as ws:
         antennas(ws)
         rest.post("/api/daemon/restart")
@@ -175,7 +175,7 @@ def test_after_a_restart_the_old_socket_stays_open_and_says_nothing(daemon: Daem
         assert antennas(ws)
 
 
-def test_six_joints_end_the_backend_and_a_restart_repairs_it(daemon: Daemon, rest: RestClient) -> None:
+def test_six_joints_end_the_backend_until_a_restart(daemon: Daemon, rest: RestClient) -> None:
     if daemon.kind.simulation == "mujoco":
         pytest.skip("measured on the mock-up only")
     with socket(daemon) as ws:

@@ -1,4 +1,4 @@
-"""Reachy Mini on Device Connect: every function, its refusals, its stops and its truth."""
+"""Reachy Mini on Device Connect: its functions, refusals, stops and status."""
 
 from __future__ import annotations
 
@@ -58,25 +58,25 @@ def call(device: ReachyMiniDriver, fleet: FleetClient) -> Call:
 
 
 @pytest.mark.usefixtures("allowed")
-def test_the_head_looks_where_it_is_told_in_degrees_and_millimetres(call: Call, device: ReachyMiniDriver) -> None:
+def test_look_takes_degrees_and_millimetres(call: Call, device: ReachyMiniDriver) -> None:
     assert call("look", pitch=0, yaw=0)["status"] == "success"
     answer = call("look", pitch=10, roll=-5, yaw=15, x=5, z=-4)
     assert answer["status"] == "success"
     assert answer["target"]["head_pitch"] == pytest.approx(0.17453, abs=1e-4)
     assert answer["target"]["head_x"] == pytest.approx(0.005)
 
-    def off() -> bool:
+    def looks_there() -> bool:
         error = device.reachy.facts()["head_error_rad"]
         return error is not None and error < 0.1
 
-    eventually(off, what="it looks there")
+    eventually(looks_there, what="it looks there")
     assert call("antennas", left=20, right=-20)["status"] == "success"
     assert call("body", yaw=10)["status"] == "success"
 
 
 @pytest.mark.usefixtures("allowed")
 @pytest.mark.parametrize(
-    ("function", "params", "says"),
+    ("function", "params", "reason"),
     [
         ("look", {"pitch": 41}, "pitch (degrees) must be a finite number from -40 to 40, not 41"),
         ("look", {"roll": True}, "roll (degrees) must be a finite number from -40 to 40, not True"),
@@ -94,35 +94,35 @@ def test_the_head_looks_where_it_is_told_in_degrees_and_millimetres(call: Call, 
         ("nod", {"times": 3}, "nod takes no parameters"),
     ],
 )
-def test_a_value_out_of_its_domain_is_refused_by_name(
-    call: Call, device: ReachyMiniDriver, function: str, params: dict[str, Any], says: str
+def test_value_out_of_its_domain_is_refused_by_name(
+    call: Call, device: ReachyMiniDriver, function: str, params: dict[str, Any], reason: str
 ) -> None:
     sent = device.reachy.motions.frames_sent
     answer = call(function, **params)
     assert answer["status"] == "error"
-    assert says in answer["reason"]
+    assert reason in answer["reason"]
     assert device.reachy.motions.frames_sent == sent
 
 
 @pytest.mark.usefixtures("allowed")
-def test_a_gesture_does_not_hold_the_line_and_stop_motion_ends_it(
+def test_gesture_returns_at_once_and_stop_motion_ends_it(
     call: Call, device: ReachyMiniDriver, fleet: FleetClient
 ) -> None:
-    told: list[DeviceEvent] = []
-    with fleet.subscription("head-1", told.append):
+    events: list[DeviceEvent] = []
+    with fleet.subscription("head-1", events.append):
         assert call("shake")["status"] == "success"
         eventually(lambda: device.reachy.motions.frames_sent > 3, what="frames")
         answer = call("stopMotion")
         sent = device.reachy.motions.frames_sent
         assert (answer["stopped"], answer["halted"]) == (True, ["shake"])
-        eventually(lambda: any(event.name == "motionComplete" for event in told), what="motionComplete")
+        eventually(lambda: any(event.name == "motionComplete" for event in events), what="motionComplete")
     assert device.reachy.motions.frames_sent == sent
-    ended = next(event for event in told if event.name == "motionComplete")
+    ended = next(event for event in events if event.name == "motionComplete")
     assert (ended.payload["name"], ended.payload["state"]) == ("shake", "stopped")
 
 
 @pytest.mark.usefixtures("allowed")
-def test_wake_up_and_a_recorded_move_and_sleep(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
+def test_wake_up_recorded_move_and_sleep_complete(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
     if daemon.kind.simulation == "mujoco":
         pytest.skip("its motors cannot be switched off")
 
@@ -145,7 +145,7 @@ def test_wake_up_and_a_recorded_move_and_sleep(call: Call, device: ReachyMiniDri
     assert call("getStatus")["motor_mode"] == "disabled"
 
 
-def test_without_permission_nothing_moves_and_everything_else_answers(
+def test_caller_without_permission_can_only_stop_and_read(
     call: Call, device: ReachyMiniDriver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for function in MOTIONS:
@@ -157,7 +157,7 @@ def test_without_permission_nothing_moves_and_everything_else_answers(
     assert device.reachy.motions.frames_sent == 0
 
 
-def test_the_status_tells_the_truth(call: Call, daemon: Daemon) -> None:
+def test_status_reports_link_version_state_and_fresh_joints(call: Call, daemon: Daemon) -> None:
     status = call("getStatus")
     assert status["link"] == ("zenoh" if daemon.kind.zenoh else "websocket")
     assert status["version"] == daemon.kind.version
@@ -171,7 +171,7 @@ def test_the_status_tells_the_truth(call: Call, daemon: Daemon) -> None:
 
 
 @pytest.mark.usefixtures("allowed")
-def test_an_emergency_stop_of_its_own_halts_it(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
+def test_own_emergency_stop_halts_and_releases_the_motors(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
     call("shake")
     asyncio.run(device.emergencyStop(reason="test"))
     motion = device.reachy.motions.current
@@ -182,7 +182,7 @@ def test_an_emergency_stop_of_its_own_halts_it(call: Call, device: ReachyMiniDri
 
 
 @pytest.mark.usefixtures("allowed")
-def test_the_stop_lane_halts_and_locks_a_head_and_a_signed_resume_frees_it(
+def test_emergency_stop_halts_and_locks_until_a_signed_resume(
     call: Call, device: ReachyMiniDriver, daemon: Daemon, fleet: FleetClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     operator = Ed25519PrivateKey.generate()
@@ -207,7 +207,7 @@ def test_the_stop_lane_halts_and_locks_a_head_and_a_signed_resume_frees_it(
         controller.close()
 
 
-def test_a_daemon_that_is_away_does_not_kill_the_device(fleet: FleetClient) -> None:
+def test_device_without_its_daemon_is_unavailable_and_still_answers(fleet: FleetClient) -> None:
     driver = ReachyMiniDriver("127.0.0.1", api_port=free_port())
     runtime = init_device_connect_sync(driver, peer_id="head-2", link=fleet.link)
     try:

@@ -1,4 +1,4 @@
-"""The driver on a daemon: the same suite on the stand-in, in the mock-up, in MuJoCo, and in the Zenoh era."""
+"""The driver on every daemon: the stand-in, the mock-up, MuJoCo, and a daemon that speaks Zenoh."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def running(daemon: Daemon) -> list[str]:
     return [move["uuid"] for move in daemon.request("GET", "/api/move/running").json()]
 
 
-def test_the_link_is_the_one_of_the_era_whatever_the_badge_says(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_link_follows_the_version_and_not_the_badge(daemon: Daemon, reachy: ReachyDriver) -> None:
     facts = reachy.facts()
     assert facts["link"] == ("zenoh" if daemon.kind.zenoh else "websocket")
     assert facts["version"] == daemon.kind.version
@@ -36,7 +36,7 @@ def test_the_link_is_the_one_of_the_era_whatever_the_badge_says(daemon: Daemon, 
     assert reachy.get_joints()["age_s"] < 1.5
 
 
-def test_a_far_target_is_reached_by_a_ramp_that_does_not_hold_the_caller(reachy: ReachyDriver) -> None:
+def test_distant_target_is_reached_by_a_ramp_in_the_background(reachy: ReachyDriver) -> None:
     reachy.go(Target(HeadPose(), 0.0, (-0.17, 0.17)))
     finished(reachy)
     answer = reachy.go(Target(HeadPose(pitch=0.3, yaw=0.4), 0.2, (0.8, -0.8)), "look")
@@ -50,14 +50,14 @@ def test_a_far_target_is_reached_by_a_ramp_that_does_not_hold_the_caller(reachy:
 
     eventually(arrived, what="antennas and body there")
 
-    def off() -> float:
+    def head_error() -> float:
         error = reachy.facts()["head_error_rad"]
         return math.inf if error is None else error
 
-    eventually(lambda: off() < 0.1, what="head there")
+    eventually(lambda: head_error() < 0.1, what="head there")
 
 
-def test_an_action_is_cut_to_one_frames_step_and_what_was_sent_is_returned(reachy: ReachyDriver) -> None:
+def test_action_is_cut_to_one_frames_step_and_returned_as_sent(reachy: ReachyDriver) -> None:
     reachy.go(Target(antennas=(0.0, 0.0)))
     finished(reachy)
     assert reachy.send_action({"antenna_left": 1.0})["antenna_left"] == pytest.approx(0.3)
@@ -65,17 +65,17 @@ def test_an_action_is_cut_to_one_frames_step_and_what_was_sent_is_returned(reach
     eventually(lambda: abs(reachy.get_observation()["antenna_left"] - 0.6) < 0.1, what="there")
 
 
-def test_waking_up_enables_the_motors_and_arrives_upright(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_wake_up_enables_the_motors_and_arrives_upright(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.request("POST", "/api/motors/set_mode/disabled")
     assert reachy.wake_up()["motor_mode"] == "enabled"
     assert finished(reachy) == {"name": "wakeUp", "state": "completed", "detail": ""}
 
 
-def test_going_to_sleep_ends_with_the_motors_off(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_sleep_ends_with_the_motors_off(daemon: Daemon, reachy: ReachyDriver) -> None:
     reachy.sleep()
     end = finished(reachy)
     if daemon.kind.simulation == "mujoco":
-        # MuJoCo's backend knows no torque: the driver must say so, not pretend.
+        # MuJoCo's backend has no torque, which the driver must report.
         assert end["detail"] == "the motors are enabled"
         return
     assert end == {"name": "sleep", "state": "completed", "detail": ""}
@@ -85,13 +85,13 @@ def test_going_to_sleep_ends_with_the_motors_off(daemon: Daemon, reachy: ReachyD
 
 
 @pytest.mark.parametrize("gesture", ["nod", "shake", "happy"])
-def test_a_gesture_returns_at_once_and_runs_to_its_end(reachy: ReachyDriver, gesture: str) -> None:
+def test_gesture_returns_at_once_and_runs_to_its_end(reachy: ReachyDriver, gesture: str) -> None:
     reachy.gesture(gesture)
     assert reachy.facts()["moving"] == gesture
     assert finished(reachy) == {"name": gesture, "state": "completed", "detail": ""}
 
 
-def test_a_halt_ends_a_gesture_and_no_frame_follows(reachy: ReachyDriver) -> None:
+def test_halt_ends_a_gesture_and_no_frame_follows(reachy: ReachyDriver) -> None:
     reachy.gesture("shake")
     eventually(lambda: reachy.motions.frames_sent > 5, what="frames")
     verdict = reachy.halt("test")
@@ -103,7 +103,7 @@ def test_a_halt_ends_a_gesture_and_no_frame_follows(reachy: ReachyDriver) -> Non
     assert reachy.motions.frames_sent == sent
 
 
-def test_a_halt_stops_a_move_of_the_daemon(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_halt_stops_a_move_of_the_daemon(daemon: Daemon, reachy: ReachyDriver) -> None:
     reachy.wake_up()
     assert len(running(daemon)) == 1
     verdict = reachy.halt("test")
@@ -112,15 +112,15 @@ def test_a_halt_stops_a_move_of_the_daemon(daemon: Daemon, reachy: ReachyDriver)
     assert finished(reachy)["state"] == "stopped"
 
 
-def test_a_halt_stops_the_moves_that_somebody_else_started_too(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_halt_stops_the_moves_of_other_clients(daemon: Daemon, reachy: ReachyDriver) -> None:
     for antenna in (1.0, -1.0):
         daemon.request("POST", "/api/move/goto", json={"antennas": [antenna, antenna], "duration": 60.0})
-    eventually(lambda: reachy.facts()["foreign_moves"] == 2, what="they are seen")
+    eventually(lambda: reachy.facts()["foreign_moves"] == 2, what="both moves are reported")
     assert reachy.halt("test").halted == ("moves of the daemon",)
     assert running(daemon) == []
 
 
-def test_a_new_move_stops_the_one_before_it(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_new_move_stops_the_one_before_it(daemon: Daemon, reachy: ReachyDriver) -> None:
     reachy.wake_up()
     first = reachy.motions.current
     assert first is not None
@@ -133,7 +133,7 @@ def test_a_new_move_stops_the_one_before_it(daemon: Daemon, reachy: ReachyDriver
     reachy.halt("test")
 
 
-def test_many_callers_at_once_leave_one_move(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_concurrent_callers_leave_at_most_one_move(daemon: Daemon, reachy: ReachyDriver) -> None:
     refused: list[str] = []
 
     def once(verb: Callable[[], object]) -> None:
@@ -149,37 +149,37 @@ def test_many_callers_at_once_leave_one_move(daemon: Daemon, reachy: ReachyDrive
     for caller in callers:
         caller.join(40)
         assert not caller.is_alive()
-    # On a busy machine a way to sleep may end, with the motors off, before the next caller has its turn.
-    assert all("motors are disabled" in why for why in refused)
+    # On a busy machine a sleep may end, with the motors off, before the next caller starts.
+    assert all("motors are disabled" in reason for reason in refused)
     assert len(running(daemon)) <= 1
     assert reachy.halt("test").stopped
     assert running(daemon) == []
 
 
-def test_a_recorded_move_plays_and_an_unknown_one_does_not(reachy: ReachyDriver) -> None:
+def test_recorded_move_plays_and_an_unknown_one_is_refused(reachy: ReachyDriver) -> None:
     assert sorted(reachy.catalogue.names("emotions")["moves"]) == ["no1", "yes1"]
     assert reachy.catalogue.play("yes1", "emotions")["move"] == "yes1"
     assert "no move 'nope'" in reachy.catalogue.play("nope", "emotions")["reason"]
     assert finished(reachy)["name"] == "yes1"
 
 
-def test_an_uncached_library_is_unknown_and_not_empty(reachy: ReachyDriver) -> None:
+def test_uncached_library_is_unknown_and_not_empty(reachy: ReachyDriver) -> None:
     answer = reachy.catalogue.names("dances")
     assert answer["status"] == "error"
     assert answer["reason"].startswith("The catalogue of dances is unknown")
     assert "moves" not in answer
 
 
-def test_an_uncached_library_is_not_asked_for_while_the_robot_moves(reachy: ReachyDriver) -> None:
+def test_uncached_library_is_not_requested_while_the_robot_moves(reachy: ReachyDriver) -> None:
     reachy.gesture("nod")
     assert "could freeze its daemon" in reachy.catalogue.play("x1", "dances")["reason"]
     assert finished(reachy)["state"] == "completed"
 
 
-def test_an_emergency_stop_holds_or_releases_and_says_which(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_emergency_stop_keeps_or_releases_torque_and_reports_which(daemon: Daemon, reachy: ReachyDriver) -> None:
     reachy.gesture("nod")
-    held = reachy.emergency_stop("test")
-    assert (held["stopped"], held["torque"], held["halted"]) == (True, "held", ["nod"])
+    kept = reachy.emergency_stop("test")
+    assert (kept["stopped"], kept["torque"], kept["halted"]) == (True, "held", ["nod"])
     released = reachy.emergency_stop("test", release=True)
     if daemon.kind.simulation == "mujoco":
         assert "Torque was not released" in released["reason"]
@@ -188,13 +188,13 @@ def test_an_emergency_stop_holds_or_releases_and_says_which(daemon: Daemon, reac
     assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
 
 
-def test_torque_of_single_motors_is_sent_and_said_to_be_unverified(reachy: ReachyDriver) -> None:
+def test_torque_of_single_motors_is_reported_as_unverified(reachy: ReachyDriver) -> None:
     answer = reachy.motors.torque(True, "17, stewart_1", "enableMotors")
     assert answer["motors"] == ["right_antenna", "stewart_1"]
     assert answer["verified"] is False
 
 
-def test_the_imu_is_there_on_a_wireless_and_said_to_be_missing_elsewhere(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_imu_is_read_on_a_wireless_and_reported_missing_elsewhere(daemon: Daemon, reachy: ReachyDriver) -> None:
     if not daemon.kind.wireless:
         assert reachy.get_imu()["reason"] == "This Reachy Mini has no IMU."
         return
@@ -204,7 +204,7 @@ def test_the_imu_is_there_on_a_wireless_and_said_to_be_missing_elsewhere(daemon:
     assert imu["age_s"] < 1.5
 
 
-def test_a_locked_robot_refuses_every_motion(reachy: ReachyDriver) -> None:
+def test_locked_robot_refuses_every_motion(reachy: ReachyDriver) -> None:
     class Locked:
         def refusal(self, verb: str) -> dict[str, object]:
             return {"status": "error", "reason": f"{verb} refused: locked"}
@@ -226,7 +226,7 @@ def test_a_locked_robot_refuses_every_motion(reachy: ReachyDriver) -> None:
 def test_two_drivers_on_one_robot_see_and_stop_one_another(
     daemon: Daemon, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Waking up takes less than two seconds; a driver that looks once a second may see the very end of it.
+    # Waking up takes less than two seconds; a driver that polls once a second may miss most of it.
     monkeypatch.setattr(connection, "POLL_EVERY_S", 0.1)
     one, two = connect(), connect()
 
@@ -240,11 +240,11 @@ def test_two_drivers_on_one_robot_see_and_stop_one_another(
     assert running(daemon) == []
     first = one.motions.current
     assert first is not None
-    eventually(first.done.is_set, what="the first driver learns it")
+    eventually(first.done.is_set, what="the first driver notices")
     assert (first.state, first.detail) == ("stopped", "another client stopped it")
 
 
-def test_after_disconnect_nothing_reaches_the_robot(reachy: ReachyDriver) -> None:
+def test_no_frame_is_sent_after_disconnect(reachy: ReachyDriver) -> None:
     reachy.gesture("shake")
     reachy.disconnect()
     sent = reachy.motions.frames_sent
@@ -254,14 +254,14 @@ def test_after_disconnect_nothing_reaches_the_robot(reachy: ReachyDriver) -> Non
     assert reachy.motions.frames_sent == sent
 
 
-def test_a_target_out_of_reach_never_leaves_the_driver(reachy: ReachyDriver) -> None:
+def test_target_out_of_reach_is_not_sent(reachy: ReachyDriver) -> None:
     before = reachy.motions.frames_sent
     with pytest.raises(ValueError, match="together be at most 60 degrees"):
         reachy.go(Target(HeadPose(pitch=math.radians(40), roll=math.radians(30))))
     assert reachy.motions.frames_sent == before
 
 
-def test_a_restarted_daemon_is_found_again_and_moves(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_driver_reconnects_to_a_restarted_daemon(daemon: Daemon, reachy: ReachyDriver) -> None:
     before = reachy.connection.connects
     daemon.request("POST", "/api/daemon/restart")
     if daemon.kind.zenoh:
@@ -276,11 +276,11 @@ def test_a_restarted_daemon_is_found_again_and_moves(daemon: Daemon, reachy: Rea
     assert finished(reachy)["state"] == "completed"
 
 
-def test_a_killed_daemon_is_unavailable_and_comes_back(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_killed_daemon_is_unavailable_until_it_starts_again(daemon: Daemon, reachy: ReachyDriver) -> None:
     reachy.gesture("shake")
     daemon.kill()
     try:
-        eventually(lambda: not reachy.is_connected, what="it is noticed")
+        eventually(lambda: not reachy.is_connected, what="the loss is noticed")
         with pytest.raises(MotionRefused):
             reachy.gesture("nod")
         assert reachy.get_joints()["status"] == "error"

@@ -1,4 +1,4 @@
-"""What goes wrong with a daemon, on the stand-in, where it goes wrong on demand."""
+"""Faults of a daemon, switched on in the stand-in."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def shared() -> Iterator[Daemon]:
         yield daemon
 
 
-def test_a_slow_daemon_still_moves_by_frames_and_a_stop_never_claims_what_it_does_not_know(
+def test_stop_on_a_slow_daemon_ends_frames_and_does_not_claim_that_moves_stopped(
     daemon: Daemon, reachy: ReachyDriver
 ) -> None:
     daemon.control(slow_s=2.0)
@@ -37,15 +37,13 @@ def test_a_slow_daemon_still_moves_by_frames_and_a_stop_never_claims_what_it_doe
     eventually(lambda: reachy.motions.frames_sent > 3, what="frames")
     verdict = reachy.halt("test")
     assert "shake" in verdict.halted
-    assert verdict.stopped is not True, "which moves the daemon runs was not answered in time"
+    assert verdict.stopped is not True, "the daemon did not list its moves in time"
     sent = reachy.motions.frames_sent
     time.sleep(0.1)
     assert reachy.motions.frames_sent == sent
 
 
-def test_a_hub_that_never_answers_freezes_the_daemon_and_the_driver_says_so(
-    daemon: Daemon, reachy: ReachyDriver
-) -> None:
+def test_hub_that_never_answers_makes_the_robot_unavailable(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.control(hub="frozen")
     asked = threading.Thread(target=lambda: reachy.catalogue.names("dances"))
     asked.start()
@@ -56,14 +54,14 @@ def test_a_hub_that_never_answers_freezes_the_daemon_and_the_driver_says_so(
         assert reachy.halt("test").stopped is not True
     finally:
         asked.join(20)
-    eventually(lambda: reachy.is_connected, what="it thaws")
+    eventually(lambda: reachy.is_connected, what="it answers again")
 
 
-def test_nan_in_the_stream_is_stale_joints_and_not_a_dead_link(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_nan_in_the_stream_makes_joints_stale_and_keeps_the_link(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.control(nan=True)
     eventually(lambda: reachy.get_joints()["status"] == "error", what="no usable numbers")
     assert reachy.is_connected
-    eventually(lambda: reachy.facts()["unusable_frames"] > 10, what="what is not usable, counted")
+    eventually(lambda: reachy.facts()["unusable_frames"] > 10, what="unusable frames are counted")
     with pytest.raises(DaemonUnreachableError, match="unusable numbers"):
         reachy.get_observation()
     reachy.go(Target(antennas=(0.0, 0.0)))
@@ -71,7 +69,7 @@ def test_nan_in_the_stream_is_stale_joints_and_not_a_dead_link(daemon: Daemon, r
     eventually(lambda: reachy.get_joints()["status"] == "success", what="numbers again")
 
 
-def test_a_robot_that_an_application_holds_is_not_moved(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_robot_held_by_an_application_refuses_motion(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.control(holder="dance_party")
     eventually(lambda: reachy.facts()["app"] == "dance_party", what="the lock is seen")
     for verb in (reachy.wake_up, lambda: reachy.gesture("nod"), lambda: reachy.send_action({"head_yaw": 0.1})):
@@ -83,7 +81,7 @@ def test_a_robot_that_an_application_holds_is_not_moved(daemon: Daemon, reachy: 
     reachy.gesture("nod")
 
 
-def test_a_daemon_that_is_stopped_says_so_and_one_that_is_started_is_used(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_stopped_daemon_is_reported_and_a_started_one_is_used(daemon: Daemon, reachy: ReachyDriver) -> None:
     daemon.request("POST", "/api/daemon/stop?goto_sleep=false")
     eventually(lambda: "the daemon is stopped" in reachy.facts()["unavailable"], what="the reason")
     with pytest.raises(MotionRefused, match="stopped"):
@@ -92,9 +90,7 @@ def test_a_daemon_that_is_stopped_says_so_and_one_that_is_started_is_used(daemon
     eventually(lambda: reachy.is_connected, what="it is used")
 
 
-def test_no_frame_that_reaches_the_daemon_jumps_or_comes_faster_than_50_a_second(
-    daemon: Daemon, reachy: ReachyDriver
-) -> None:
+def test_frames_at_the_daemon_never_jump_or_exceed_50_a_second(daemon: Daemon, reachy: ReachyDriver) -> None:
     before = len(daemon.frames())
     started = time.monotonic()
     for i in range(40):
@@ -105,7 +101,7 @@ def test_no_frame_that_reaches_the_daemon_jumps_or_comes_faster_than_50_a_second
     assert max(abs(a - b) for a, b in pairwise(yaws)) <= FRAME_STEP + 1e-6
 
 
-def test_a_thousand_bad_values_never_reach_the_wire(daemon: Daemon, reachy: ReachyDriver) -> None:
+def test_bad_values_never_reach_the_wire(daemon: Daemon, reachy: ReachyDriver) -> None:
     sent = reachy.send_action({"antenna_left": 0.1})["antenna_left"]
     # Frames reach the daemon by another connection than the question for them.
     eventually(lambda: daemon.frames()[-1].get("antennas", [0, 0])[1] == sent, what="the frame")
@@ -118,19 +114,19 @@ def test_a_thousand_bad_values_never_reach_the_wire(daemon: Daemon, reachy: Reac
     assert len(daemon.frames()) == before
 
 
-def test_a_whole_life_leaves_no_thread_behind(daemon: Daemon, connect: Callable[..., ReachyDriver]) -> None:
+def test_disconnect_leaves_no_thread_behind(daemon: Daemon, connect: Callable[..., ReachyDriver]) -> None:
     connect().disconnect()
-    before, mine = set(threading.enumerate()), ("reachy-", "Thread-")
+    before, own = set(threading.enumerate()), ("reachy-", "Thread-")
 
     def left() -> list[str]:
-        return [each.name for each in threading.enumerate() if each not in before and each.name.startswith(mine)]
+        return [each.name for each in threading.enumerate() if each not in before and each.name.startswith(own)]
 
     for _ in range(5):
         reachy = connect()
         reachy.gesture("nod")
         reachy.wake_up()
         reachy.disconnect()
-    eventually(lambda: not left(), what="the end of every thread of those lives")
+    eventually(lambda: not left(), what="the end of every thread of those drivers")
 
 
 def test_connect_eagerly_never_raises_and_connects_later(daemon: Daemon) -> None:
@@ -146,22 +142,22 @@ def test_connect_eagerly_never_raises_and_connects_later(daemon: Daemon) -> None
         ReachyDriver("127.0.0.1", api_port=free_port()).connect(within_s=3.0)
 
 
-def test_a_robot_that_announces_itself_is_found(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_announced_robot_is_discovered(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     here = ["127.0.0.1"]
-    # Another run of these tests on this machine announces a robot of its own.
+    # Another run of these tests on this machine may announce its own robot.
     name = f"lab_head_{daemon.port}"
     with Zeroconf(interfaces=here) as network:
         info = ServiceInfo(
             SERVICE, f"{name}.{SERVICE}", port=daemon.port, parsed_addresses=here, server="reachy-mini.local."
         )
         network.register_service(info)
-        found = [each for each in discover(1.5, interfaces=here) if each.name == name]
-        if not found:
+        daemons = [each for each in discover(1.5, interfaces=here) if each.name == name]
+        if not daemons:
             pytest.skip("multicast does not loop back on this machine")
-        assert [(each.name, each.host, each.port) for each in found] == [(name, "127.0.0.1", daemon.port)]
-    monkeypatch.setattr(discovery, "discover", lambda within_s: found)
+        assert [(each.name, each.host, each.port) for each in daemons] == [(name, "127.0.0.1", daemon.port)]
+    monkeypatch.setattr(discovery, "discover", lambda within_s: daemons)
     assert make_reachy().connection.port == daemon.port
-    monkeypatch.setattr(discovery, "discover", lambda within_s: found * 2)
+    monkeypatch.setattr(discovery, "discover", lambda within_s: daemons * 2)
     with pytest.raises(ValidationError, match=f"2 were found: {name} at"):
         make_reachy()
     monkeypatch.setattr(discovery, "discover", lambda within_s: [])

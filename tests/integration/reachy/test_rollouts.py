@@ -1,4 +1,4 @@
-"""A Reachy Mini under this package's own control loop, as any device with LeRobot's verbs: on every daemon."""
+"""Rollouts on a Reachy Mini, as on any device with LeRobot's verbs, on every daemon."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def running(daemon: Daemon) -> list[str]:
     return [move["uuid"] for move in daemon.request("GET", "/api/move/running").json()]
 
 
-def test_its_joints_ranges_and_lockout_are_those_of_the_driver(robot: HardwareRobot, reachy: ReachyDriver) -> None:
+def test_joints_ranges_and_lockout_key_are_those_of_the_driver(robot: HardwareRobot, reachy: ReachyDriver) -> None:
     assert set(robot.get_state()["joints"]) == set(ACTION_KEYS)
     assert robot.get_features()["ranges"] == {key: list(pair) for key, pair in BOUNDS.items()}
     assert robot.safety_key == reachy.safety_key
 
 
-def test_a_rollout_moves_it_and_holds_it_at_its_end(robot: HardwareRobot, reachy: ReachyDriver) -> None:
+def test_rollout_moves_the_robot_and_sends_nothing_after_its_end(robot: HardwareRobot, reachy: ReachyDriver) -> None:
     before = reachy.get_observation()
     sent = reachy.motions.frames_sent
     assert robot.start_task("wave", duration=2.0)["status"] == "success"
@@ -46,7 +46,7 @@ def test_a_rollout_moves_it_and_holds_it_at_its_end(robot: HardwareRobot, reachy
     assert reachy.motions.frames_sent == frames
 
 
-def test_a_halt_ends_a_rollout_and_no_frame_follows(robot: HardwareRobot, reachy: ReachyDriver) -> None:
+def test_halt_ends_a_rollout_and_no_frame_follows(robot: HardwareRobot, reachy: ReachyDriver) -> None:
     robot.start_task("wave", duration=30.0)
     eventually(lambda: robot.get_task_status()["step_count"] > 20, what="steps")
     verdict = robot.halt("test")
@@ -58,7 +58,7 @@ def test_a_halt_ends_a_rollout_and_no_frame_follows(robot: HardwareRobot, reachy
     assert robot.start_task("again", duration=0.2)["status"] == "success"
 
 
-def test_a_halt_of_the_robot_stops_what_its_daemon_plays(
+def test_halt_of_the_robot_stops_the_moves_of_its_daemon(
     daemon: Daemon, robot: HardwareRobot, reachy: ReachyDriver
 ) -> None:
     reachy.wake_up()

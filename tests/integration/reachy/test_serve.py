@@ -1,4 +1,4 @@
-"""From one command to a head on the network, and off it again."""
+"""A Reachy Mini served on the network by one command."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def shared() -> Iterator[Daemon]:
         yield daemon
 
 
-def test_the_factory_makes_a_reachy_that_connects_by_itself(daemon: Daemon) -> None:
+def test_factory_makes_a_reachy_that_connects_by_itself(daemon: Daemon) -> None:
     robot = Robot("reachy_mini", mode="real", host="127.0.0.1", api_port=daemon.port)
     try:
         eventually(lambda: robot.is_connected, what="joint data")
@@ -35,24 +35,24 @@ def test_the_factory_makes_a_reachy_that_connects_by_itself(daemon: Daemon) -> N
     assert not robot.is_connected
 
 
-def test_serve_puts_it_on_the_network_and_interrupt_stops_it_first(daemon: Daemon) -> None:
+def test_serve_puts_a_reachy_on_the_network_and_an_interrupt_stops_it(daemon: Daemon) -> None:
     port = free_port()
-    words = f"serve reachy_mini --host 127.0.0.1 --set api_port={daemon.port} --peer-id head --port {port}"
-    words += " --rpc-allow tester --command-allow shake --json"
+    arguments = f"serve reachy_mini --host 127.0.0.1 --set api_port={daemon.port} --peer-id head --port {port}"
+    arguments += " --rpc-allow tester --command-allow shake --json"
     serving = subprocess.Popen(
-        [sys.executable, "-m", "strands_robots.cli", *words.split()], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "strands_robots.cli", *arguments.split()], stdout=subprocess.PIPE, text=True
     )
     assert serving.stdout is not None
     try:
-        told = json.loads(serving.stdout.readline())
-        assert (told["event"], told["peer_id"]) == ("serving", "head")
+        line = json.loads(serving.stdout.readline())
+        assert (line["event"], line["peer_id"]) == ("serving", "head")
         with FleetClient(loopback_config(port), "tester") as fleet:
             eventually(lambda: fleet.call("head", "getStatus", {})["connected"], what="the daemon")
             assert fleet.call("head", "shake", {})["status"] == "success"
             eventually(lambda: len(daemon.frames()) > 5, what="frames")
             serving.send_signal(signal.SIGINT)
             serving.wait(60)
-        eventually(lambda: daemon.control()["sockets"] == 0, what="all that was sent, taken")
+        eventually(lambda: daemon.control()["sockets"] == 0, what="every frame that was sent, received")
         sent = len(daemon.frames())
         time.sleep(0.2)
         assert len(daemon.frames()) == sent
