@@ -107,7 +107,7 @@ def _bare_up(fleet: FleetClient, link: LinkConfig, backend: str, name: str) -> f
     thread = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
     thread.start()
     took = _until_known(fleet, name) - began
-    # It has to be up altogether before its stop is heard.
+    # It has to be up altogether before its stop is received.
     time.sleep(0.3)
     ends[0]()
     thread.join(10)
@@ -189,29 +189,29 @@ def _blocked_stop(repeats: int) -> Row:
 
 def _stream(seconds: float) -> Row:
     """A 50 Hz task from its first step to its last, as another connection hears it."""
-    robot, heard = ToyRobot("stream"), []
+    robot, received = ToyRobot("stream"), []
     link = LinkConfig(mode="peer", meet_port=free_port(), multicast=False)
     runtime = init_device_connect_sync(robot, peer_id="stream", link=link)
     try:
-        with FleetClient(link, "bench") as fleet, fleet.subscription("stream", heard.append):
+        with FleetClient(link, "bench") as fleet, fleet.subscription("stream", received.append):
             robot.start_task("stream", duration=seconds)
             deadline = time.monotonic() + seconds + 10
-            while not any(event.name == "taskComplete" for event in heard) and time.monotonic() < deadline:
+            while not any(event.name == "taskComplete" for event in received) and time.monotonic() < deadline:
                 time.sleep(0.1)
     finally:
         stop_device_connect(runtime)
         robot.close()
     steps = robot.rollouts["stream"].steps
-    told = [event.payload["step"] for event in heard if event.name == "streamStep"]
-    lost = steps - len(told)
-    updates = sum(event.name == "stateUpdate" for event in heard) / seconds
+    streamed = [event.payload["step"] for event in received if event.name == "streamStep"]
+    lost = steps - len(streamed)
+    updates = sum(event.name == "stateUpdate" for event in received) / seconds
     return Row(
         f"streamStep of a 50 Hz task over {seconds:.0f} s, lost",
-        f"{lost} of {steps}, in order: {told == sorted(told)}; stateUpdate {updates:.1f} Hz",
+        f"{lost} of {steps}, in order: {streamed == sorted(streamed)}; stateUpdate {updates:.1f} Hz",
         "",
         None,
         "0",
-        lost == 0 and told == sorted(told),
+        lost == 0 and streamed == sorted(streamed),
     )
 
 

@@ -48,13 +48,13 @@ def bare_runtime(driver: DeviceDriver, device_id: str) -> DeviceRuntime:
     return DeviceRuntime(driver=driver, device_id=device_id, allow_insecure=True)
 
 
-def things() -> dict[str, float]:
+def resources() -> dict[str, float]:
     """Memory in MB, threads and descriptors of this process."""
     me = psutil.Process()
     return {"mb": me.memory_info().rss / 1e6, "threads": me.num_threads(), "fds": me.num_fds()}
 
 
-def told(**facts: Any) -> None:
+def report(**facts: Any) -> None:
     print(json.dumps(facts), flush=True)
 
 
@@ -63,24 +63,24 @@ def fleet_ours(count: int, port: int) -> None:
     warm = init_device_connect_sync(ToyRobot(), peer_id="warm", link=loopback_config(port))
     stop_device_connect(warm)
     robots = [ToyRobot(f"arm-{number}") for number in range(count)]
-    before = things()
+    before = resources()
     runtimes = [init_device_connect_sync(r, peer_id=r.tool_name_str, link=loopback_config(port)) for r in robots]
     time.sleep(5.0)
-    told(before=before, after=things())
+    report(before=before, after=resources())
     for runtime in runtimes:
         stop_device_connect(runtime)
 
 
 def fleet_bare(count: int) -> None:
-    """``count`` stock runtimes in one loop, found by multicast or by what the environment says."""
+    """``count`` stock runtimes in one loop, on multicast or on what the environment says."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(8192, hard) if hard > 0 else 8192, hard))
 
     async def run() -> None:
-        before = things()
+        before = resources()
         tasks = [asyncio.create_task(bare_runtime(EchoDriver(), f"bare-{n}").run()) for n in range(count)]
         await asyncio.sleep(8.0 + count / 8)
-        told(before=before, after=things())
+        report(before=before, after=resources())
         os._exit(0)
         await asyncio.gather(*tasks)
 
@@ -93,14 +93,14 @@ def serve_blocking(kind: str, port: int) -> None:
         robot = ToyRobot("slow")
         robot.before["start_task"] = lambda: time.sleep(2.0)
         runtime = init_device_connect_sync(robot, peer_id="slow", link=loopback_config(port))
-        told(up=True)
+        report(up=True)
         sys.stdin.read()
         stop_device_connect(runtime)
         return
     device = bare_runtime(BlockingDriver(), "slow")
     threading.Thread(target=lambda: asyncio.run(device.run()), daemon=True).start()
     time.sleep(2.0)
-    told(up=True)
+    report(up=True)
     sys.stdin.read()
     os._exit(0)
 

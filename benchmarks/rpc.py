@@ -116,7 +116,7 @@ async def _in_flight(name: str, pair: Pair, effort: Effort) -> list[Row]:
                 f"{fast:,.0f}/s",
                 f"{slow:,.0f}/s",
                 ratio,
-                f"≥ {bound:g}" if decides else "told, the caller is the limit",
+                f"≥ {bound:g}" if decides else "for information, the caller is the limit",
                 ratio >= bound or not decides,
             )
         )
@@ -153,13 +153,13 @@ async def _events(name: str, pair: Pair, effort: Effort) -> list[Row]:
     count = round(EVENT_HZ * effort.event_seconds)
     lost = {}
     for caller, device in ((pair.ours, pair.device_ours), (pair.bare, pair.device_bare)):
-        heard = await caller.hears(device, "tick")
+        received = await caller.collect(device, "tick")
         await asyncio.sleep(0.5)
         await caller.call(device, "burst", {"count": count, "hz": EVENT_HZ})
         await asyncio.sleep(effort.event_seconds)
         with contextlib.suppress(AssertionError):  # the bare device has dropped the rest
-            await until(partial(_reached, heard, count), within=effort.event_seconds + 5)
-        lost[device] = count - len(heard)
+            await until(partial(_reached, received, count), within=effort.event_seconds + 5)
+        lost[device] = count - len(received)
     ours, bare = lost[pair.device_ours], lost[pair.device_bare]
     return [
         Row(
@@ -224,8 +224,8 @@ async def _met(pair: Pair) -> Pair:
     return pair
 
 
-def _reached(heard: list[dict[str, Any]], count: int) -> bool:
-    return len(heard) >= count
+def _reached(received: list[dict[str, Any]], count: int) -> bool:
+    return len(received) >= count
 
 
 async def _latencies(caller: Caller, device: str, calls: int) -> list[float]:

@@ -1,12 +1,181 @@
-"""The framework is still the one whose private members we lean on."""
+"""The framework is the pinned one, and our runtime answers commands as its own does."""
 
+import asyncio
 import hashlib
 import importlib.metadata
 import inspect
+import json
+import logging
 
 import pytest
+from device_connect_edge import DeviceRuntime
+from device_connect_edge.drivers import DeviceDriver, decorators, rpc
+from device_connect_edge.drivers.decorators import get_rpc_source_device
+from opentelemetry import trace
+from opentelemetry.sdk.trace import TracerProvider
 
 from strands_robots.device_connect import _compat
+from strands_robots.device_connect._compat import Runtime
+from strands_robots.device_connect.backends import LinkConfig, jsonrpc
+
+
+class Driver(DeviceDriver):
+    device_type = "toy"
+
+    @rpc()
+    async def whoAsks(self, value: str = "") -> dict:
+        """Return the value and the caller.
+
+        Args:
+            value: given back
+        """
+        return {"value": value, "caller": get_rpc_source_device()}
+
+    @rpc(name="renamed")
+    async def other(self) -> str:
+        """Have another name on the wire."""
+        return "renamed"
+
+    @rpc()
+    async def fail(self) -> dict:
+        """Fail."""
+        raise ValueError("the arm is off")
+
+    @rpc()
+    async def partly(self) -> dict:
+        """Tell of an error."""
+        return {"error": "half of it"}
+
+    @rpc()
+    async def opaque(self) -> object:
+        """Give what has no JSON."""
+        return object()
+
+    @rpc()
+    async def late(self) -> str | None:
+        """Return the caller, after a while."""
+        await asyncio.sleep(0.01)
+        return get_rpc_source_device()
+
+
+class Choosy(Driver):
+    async def invoke(self, function_name, /, **params):
+        if "value" in params:
+            return f"{function_name} refused"
+        return await super().invoke(function_name, **params)
+
+
+class Messaging:
+    """A client stand-in that hands commands to the runtime and keeps its answer."""
+
+    def __init__(self):
+        self.serve_command = None
+        self.serving = None
+        self.answer = None
+
+    async def serve(self, _subject, serve):
+        def answered(data):
+            self.answer = data
+
+        self.serve_command, self.serving = serve, lambda data: serve(jsonrpc.check(data), answered)
+
+    async def subscribe(self, _subject, callback):
+        self.serving = lambda data: callback(data, "reply")
+
+    async def publish(self, _subject, data):
+        self.answer = data
+
+    async def ask(self, data):
+        self.answer = None
+        await self.serving(data)
+        return json.loads(self.answer)
+
+
+async def served(runtime):
+    runtime.messaging = Messaging()
+    runtime._driver.set_device(runtime)
+    await runtime._cmd_subscription()
+    return runtime.messaging
+
+
+def ours(driver):
+    return Runtime(driver=driver, device_id="toy-1", link=LinkConfig(), allow_insecure=True)
+
+
+def stock(driver):
+    return DeviceRuntime(driver=driver, device_id="toy-1", messaging_urls=["zenoh://"], allow_insecure=True)
+
+
+COMMANDS = {
+    "a call": ("whoAsks", {"value": "x"}),
+    "a named caller": ("whoAsks", {"_dc_meta": {"source_device": "agent-1", "traceparent": "00-1-2-03"}}),
+    "a caller named among the parameters": ("whoAsks", {"source_device": "agent-2"}),
+    "both": ("whoAsks", {"source_device": "agent-2", "_dc_meta": {"source_device": "agent-1"}}),
+    "an empty caller": ("whoAsks", {"_dc_meta": {"source_device": ""}}),
+    "a caller that still counts after a wait": ("late", {"_dc_meta": {"source_device": "agent-1"}}),
+    "another name": ("renamed", {}),
+    "a method's own name that is not its name": ("other", {}),
+    "unknown": ("nope", {}),
+    "private": ("_collect_functions", {}),
+    "a failure": ("fail", {}),
+    "a partial failure": ("partly", {}),
+    "no JSON": ("opaque", {}),
+    "a parameter too many": ("whoAsks", {"nope": 1}),
+    "registration": ("requestRegistration", {}),
+}
+
+
+@pytest.mark.parametrize("kind", [Driver, Choosy])
+@pytest.mark.parametrize("what", COMMANDS)
+async def test_command_gets_the_frameworks_own_answer(what, kind):
+    method, params = COMMANDS[what]
+    data = json.dumps({"jsonrpc": "2.0", "id": "c-1", "method": method, "params": params}).encode()
+    mine, theirs = await served(ours(kind())), await served(stock(kind()))
+    answer, expected = await mine.ask(data), await theirs.ask(data)
+    if method == "opaque":
+        assert "not JSON serializable" in answer["error"]["message"]
+    elif method == "requestRegistration":
+        assert answer["result"].keys() == expected["result"].keys()
+        return
+    assert answer == expected
+    assert get_rpc_source_device() is None
+
+
+async def test_concurrent_calls_keep_their_callers_apart():
+    messaging = await served(ours(Driver()))
+    answers = []
+
+    async def ask(number):
+        command = jsonrpc.Command("late", number, {"_dc_meta": {"source_device": f"agent-{number}"}})
+        await messaging.serve_command(command, lambda data: answers.append(json.loads(data)))
+
+    await asyncio.gather(*(ask(number) for number in range(20)))
+    assert all(each["result"] == f"agent-{each['id']}" for each in answers)
+
+
+@pytest.mark.parametrize(("method", "line"), [("fail", "the arm is off"), ("partly", "half of it")])
+async def test_failures_are_logged(method, line, caplog):
+    messaging = await served(ours(Driver()))
+    with caplog.at_level(logging.WARNING, decorators.logger.name):
+        await messaging.ask(json.dumps({"id": 1, "method": method}).encode())
+    assert line in caplog.text
+
+
+async def test_calls_are_logged_at_info_level(caplog):
+    messaging = await served(ours(Driver()))
+    with caplog.at_level(logging.INFO, decorators.logger.name):
+        await messaging.ask(json.dumps({"id": 1, "method": "whoAsks"}).encode())
+    assert ">>> RPC EXEC" in caplog.text
+
+
+async def test_framework_serves_when_a_tracer_is_configured(monkeypatch):
+    monkeypatch.setattr(trace, "get_tracer_provider", TracerProvider)
+    driver = Driver()
+    messaging = await served(ours(driver))
+    assert (await messaging.ask(b'{"id": 1, "method": "whoAsks"}'))["result"]["value"] == ""
+    assert messaging.serve_command is None
+    assert driver._get_functions()["whoAsks"] == driver.whoAsks
+
 
 SOURCE_HASHES = {
     "DeviceDriver._get_functions": "7dc82c18974d7295",
@@ -35,10 +204,10 @@ def digest(function):
     return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()[:16]
 
 
-def test_the_framework_has_the_version_that_was_read():
+def test_framework_has_the_pinned_version():
     assert importlib.metadata.version("device-connect-edge") == _compat.FRAMEWORK_VERSION
 
 
 @pytest.mark.parametrize("name", sorted(_compat.sources()))
-def test_what_is_leaned_on_has_not_changed(name):
+def test_framework_member_has_not_changed(name):
     assert digest(_compat.sources()[name]) == SOURCE_HASHES[name], f"read {name} again before trusting _compat.py"

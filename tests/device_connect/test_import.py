@@ -1,4 +1,4 @@
-"""What importing the package costs and needs: next to nothing."""
+"""Importing the package loads nothing heavy and needs no extra."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def run(program: str) -> str:
         "strands_robots.drivers.reachy_transport",
     ],
 )
-def test_importing_loads_nothing_heavy(module: str) -> None:
+def test_import_loads_no_heavy_package(module: str) -> None:
     assert run(f"import sys, {module}; print([m for m in {HEAVY!r} if m in sys.modules])") == "[]"
 
 
-def test_every_exported_name_is_there() -> None:
+def test_every_exported_name_exists() -> None:
     for name in device_connect.__all__:
         assert getattr(device_connect, name) is not None
         assert name in dir(device_connect)
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
+def test_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="nothing_like_it"):
         _ = device_connect.nothing_like_it
 
@@ -52,6 +52,6 @@ try:
 except ImportError as exc:
     print(exc)
 """
-    said = run(program)
-    assert "[device-connect]" in said
-    assert "\n" not in said
+    message = run(program)
+    assert "[device-connect]" in message
+    assert "\n" not in message

@@ -1,4 +1,4 @@
-"""Which link a device gets, and whether it may be used without authentication."""
+"""Choice of a device's link, and the opt-in to an unauthenticated one."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def test_zenoh_without_a_url_finds_peers_by_multicast() -> None:
         ("tcp/127.0.0.1:7447", "zenoh", "zenoh"),
     ],
 )
-def test_a_url_names_its_transport(url: str, backend: str | None, transport: str) -> None:
+def test_url_names_its_transport(url: str, backend: str | None, transport: str) -> None:
     link = link_for(url, backend, "lab", None)
     assert link.transport == transport
     assert link.tenant == "lab"
     assert len(link.connect) == 1
 
 
-def test_an_explicit_url_outranks_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_explicit_url_outranks_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/10.0.0.1:7447")
     assert link_for("tcp/127.0.0.1:1", None, "default", None).connect == ("tcp/127.0.0.1:1",)
     assert link_for(None, None, "default", None).connect == ("tcp/10.0.0.1:7447",)
@@ -61,12 +61,12 @@ def test_nats_without_a_server_is_refused() -> None:
         (("nats://x", None, "default", LinkConfig()), "link"),
     ],
 )
-def test_an_argument_out_of_its_domain_is_refused_by_name(arguments: tuple[Any, ...], named: str) -> None:
+def test_argument_out_of_its_domain_is_refused_by_name(arguments: tuple[Any, ...], named: str) -> None:
     with pytest.raises(ValidationError, match=named):
         link_for(*arguments)
 
 
-def test_without_an_opt_in_an_open_transport_is_refused_with_both_ways_out() -> None:
+def test_unauthenticated_transport_is_refused_with_both_remedies() -> None:
     with pytest.raises(ValidationError) as refused:
         insecure_opt_in(None, LinkConfig(), stated=False)
     for way in ("allow_insecure=True", "DEVICE_CONNECT_ALLOW_INSECURE=true", "MESSAGING_TLS_CA_FILE", "CREDENTIALS"):
@@ -74,12 +74,12 @@ def test_without_an_opt_in_an_open_transport_is_refused_with_both_ways_out() -> 
 
 
 @pytest.mark.parametrize("word", ["true", "false", "", 1, 0, 1.0, []])
-def test_only_a_boolean_or_none_opts_in(word: Any) -> None:
+def test_opt_in_must_be_a_boolean_or_none(word: Any) -> None:
     with pytest.raises(ValidationError, match="allow_insecure"):
         insecure_opt_in(word, LinkConfig(), stated=False)
 
 
-def test_an_opt_in_is_a_prominent_warning(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opt_in_is_a_prominent_warning(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     with caplog.at_level(logging.WARNING):
         assert insecure_opt_in(True, LinkConfig(), stated=False)
     assert "INSECURE" in caplog.text
@@ -89,13 +89,13 @@ def test_an_opt_in_is_a_prominent_warning(caplog: pytest.LogCaptureFixture, monk
         insecure_opt_in(False, LinkConfig(), stated=False)
 
 
-def test_an_unknown_spelling_is_the_safe_side(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_spelling_is_no_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEVICE_CONNECT_ALLOW_INSECURE", "yepp")
     with pytest.raises(ValidationError):
         insecure_opt_in(None, LinkConfig(), stated=False)
 
 
-def test_a_stated_link_that_stays_on_this_machine_is_the_opt_in_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_stated_loopback_link_is_an_opt_in_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     assert insecure_opt_in(None, loopback_config(7000), stated=True)
     assert "127.0.0.1" in caplog.text
     with pytest.raises(ValidationError):

@@ -14,10 +14,10 @@ from strands_robots.device_connect.shutdown import StopSignal
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_ends_the_wait_and_restores_the_handlers(number: signal.Signals) -> None:
     before = [signal.getsignal(each) for each in StopSignal.SIGNALS]
-    with StopSignal() as asked:
-        assert asked.wait(0.01) is None
+    with StopSignal() as stop:
+        assert stop.wait(0.01) is None
         threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
-        assert asked.wait(20) == number
+        assert stop.wait(20) == number
         assert [signal.getsignal(each) for each in StopSignal.SIGNALS] == before
 
 

@@ -1,4 +1,4 @@
-"""From a robot's control thread to events: at their rate, in order, and nothing forgotten."""
+"""Telemetry: rate, order and completeness of the events of a rollout."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def event(kind: str, step: int = 0, robot: str = "arm") -> RolloutEvent:
 
 
 @given(st.lists(st.floats(0, 0.5), max_size=200), st.floats(1, 200))
-def test_no_more_pass_than_the_rate_and_one_burst(gaps: list[float], hz: float) -> None:
+def test_throttle_passes_the_rate_and_one_catch_up(gaps: list[float], hz: float) -> None:
     clock = Clock()
     throttle = Throttle(hz, clock)
     passed = 0
@@ -40,7 +40,7 @@ def test_no_more_pass_than_the_rate_and_one_burst(gaps: list[float], hz: float) 
     assert passed <= CATCH_UP + clock.now * hz + 1
 
 
-def test_a_steady_loop_at_the_rate_loses_nothing_though_it_is_held_up() -> None:
+def test_steady_loop_that_was_held_up_loses_no_step() -> None:
     clock = Clock()
     throttle = Throttle(50.0, clock)
     passed = 0
@@ -53,7 +53,7 @@ def test_a_steady_loop_at_the_rate_loses_nothing_though_it_is_held_up() -> None:
     assert passed == 1000
 
 
-def test_a_fast_loop_passes_at_the_rate_from_its_start() -> None:
+def test_fast_loop_passes_at_the_rate_from_its_start() -> None:
     clock = Clock()
     throttle = Throttle(50.0, clock)
     passed = 0
@@ -63,13 +63,13 @@ def test_a_fast_loop_passes_at_the_rate_from_its_start() -> None:
     assert 50 <= passed <= 53
 
 
-async def test_starts_and_ends_are_never_dropped_however_far_behind_the_loop_is() -> None:
-    told: list[RolloutEvent] = []
+async def test_starts_and_ends_are_never_dropped() -> None:
+    delivered: list[RolloutEvent] = []
 
     over = asyncio.Event()
 
     async def deliver(each: RolloutEvent) -> None:
-        told.append(each)
+        delivered.append(each)
         if each.kind == "finished":
             over.set()
 
@@ -86,25 +86,32 @@ async def test_starts_and_ends_are_never_dropped_however_far_behind_the_loop_is(
     running = asyncio.create_task(pump.run())
     await over.wait()
     running.cancel()
-    steps = [each.step for each in told if each.kind == "step"]
+    steps = [each.step for each in delivered if each.kind == "step"]
     assert steps == list(range(telemetry.PENDING_MAX))
 
 
-async def test_robots_do_not_take_each_others_rate() -> None:
-    pump = RolloutPump(_nothing, 50.0)
+async def test_each_robot_has_its_own_rate() -> None:
+    delivered: list[RolloutEvent] = []
+
+    async def deliver(each: RolloutEvent) -> None:
+        delivered.append(each)
+
+    pump = RolloutPump(deliver, 50.0)
     for number in range(100):
         pump.observe(event("step", number, robot=f"arm-{number}"))
-    assert len(pump._waiting) == 100
+    running = asyncio.create_task(pump.run())
+    await until(lambda: len(delivered) == 100)
+    running.cancel()
 
 
-def test_an_observer_never_raises_after_the_loop_is_gone() -> None:
+def test_observer_never_raises_after_the_loop_is_gone() -> None:
     async def make() -> RolloutPump:
         return RolloutPump(_nothing, 50.0)
 
     asyncio.run(make()).observe(event("started"))
 
 
-async def test_a_beat_is_kept_and_missed_beats_are_not_made_up_for() -> None:
+async def test_paced_keeps_its_rate_and_skips_missed_turns() -> None:
     beats: list[float] = []
 
     async def act() -> None:
@@ -120,7 +127,7 @@ async def test_a_beat_is_kept_and_missed_beats_are_not_made_up_for() -> None:
     assert len(beats) <= (beats[-1] - began - 0.2) * 50.0 + 2.01
 
 
-async def test_a_wake_comes_at_once_and_a_cancel_is_never_forgotten() -> None:
+async def test_paced_wakes_at_once_and_always_honours_a_cancel() -> None:
     beats = 0
 
     async def act() -> None:

@@ -1,6 +1,7 @@
 """Commands side by side and bounded, events in order, one wake-up for many messages."""
 
 import asyncio
+import contextvars
 import json
 import logging
 import threading
@@ -10,6 +11,7 @@ import pytest
 from fixtures.waiting import until
 
 from strands_robots.device_connect.backends import dispatch, jsonrpc
+from strands_robots.device_connect.backends.dispatch import start_now
 
 
 def command(method="move", rpc_id=1):
@@ -59,7 +61,7 @@ async def server():
     await made.server.close()
 
 
-async def test_a_command_does_not_wait_for_another(server):
+async def test_command_does_not_wait_for_another(server):
     server.receive(command("move"), "a")
     server.receive(command("getStatus"), "b")
     await until(lambda: server.served == ["move", "getStatus"])
@@ -97,7 +99,7 @@ async def test_command_with_too_many_bytes_is_refused_unread(server):
 
 
 @pytest.mark.parametrize("method", ["forget", "fail"])
-async def test_a_handler_that_leaves_its_caller_without_an_answer_is_answered_for(server, method):
+async def test_caller_gets_an_error_when_the_handler_gives_no_answer(server, method):
     server.open.set()
     server.receive(command(method, 7), "a")
     await until(lambda: "a" in server.answers)
@@ -130,7 +132,7 @@ async def test_server_answers_for_a_serve_function_that_fails():
     assert codes == {1: jsonrpc.INTERNAL_ERROR, None: jsonrpc.PARSE_ERROR}
 
 
-async def test_a_handler_that_fails_after_its_answer_is_not_answered_for(server):
+async def test_caller_gets_no_second_answer_when_the_handler_fails_after_its_own(server):
     server.open.set()
     server.receive(command("answer and fail"), "a")
     await until(lambda: 1 in server.replied)
@@ -150,7 +152,7 @@ async def test_ten_thousand_bad_messages_cost_one_log_line(server, caplog):
     assert 1 <= len(lines) <= 1 + (time.monotonic() - began), "one line a second"
 
 
-async def test_closing_the_desk_cancels_what_runs(server):
+async def test_close_cancels_running_commands(server):
     server.receive(command("move"), "a")
     await until(lambda: server.served)
     await server.server.close()
@@ -174,7 +176,7 @@ async def test_events_are_handled_in_the_order_of_their_arrival_even_when_one_fa
     assert seen == list(range(1_000))
 
 
-async def test_a_feed_whose_handler_hangs_keeps_the_newest(monkeypatch):
+async def test_feed_keeps_the_newest_messages_while_its_handler_hangs(monkeypatch):
     monkeypatch.setattr(dispatch, "MAX_EVENTS", 10)
     gate, seen = asyncio.Event(), []
 
@@ -219,7 +221,7 @@ async def test_backlog_keeps_the_order_of_each_thread_with_few_wake_ups():
         assert [number for each, number in seen if each == name] == list(range(2_000))
 
 
-async def test_a_feed_keeps_no_more_bytes_than_it_may(monkeypatch):
+async def test_feed_keeps_no_more_bytes_than_it_may(monkeypatch):
     monkeypatch.setattr(dispatch, "MAX_WAITING_BYTES", 1_000)
     seen = []
 
@@ -235,7 +237,7 @@ async def test_a_feed_keeps_no_more_bytes_than_it_may(monkeypatch):
     assert seen == [5_000]
 
 
-async def test_a_feed_takes_messages_from_threads_in_their_order():
+async def test_feed_takes_messages_from_threads_in_their_order():
     loop, seen = asyncio.get_running_loop(), []
 
     async def handler(_data, number):
@@ -267,3 +269,142 @@ def test_replies_expire_and_are_taken_once():
     assert replies.take(old) is None
     assert replies.take(command) is replies.take(recent) is print
     assert replies.take(command) is None
+
+
+VARIABLE_OF_A_TASK = contextvars.ContextVar("VARIABLE_OF_A_TASK", default="")
+
+
+def at_once(work):
+    """Start ``work`` from a plain callback, where no task runs."""
+    started = asyncio.get_running_loop().create_future()
+
+    def start():
+        task = start_now(work)
+        started.set_result((task, seen_at_start()))
+
+    seen = []
+
+    def seen_at_start():
+        return list(seen)
+
+    asyncio.get_running_loop().call_soon(start)
+    return started, seen
+
+
+async def test_work_that_does_not_wait_is_done_when_start_returns():
+    async def work():
+        seen.append("done")
+
+    started, seen = at_once(coroutine := work())
+    task, at_start = await started
+    assert at_start == ["done"]
+    assert await task is None
+    assert coroutine.cr_frame is None
+
+
+async def test_work_that_waits_continues_later():
+    gate = asyncio.Event()
+
+    async def work():
+        seen.append(1)
+        await gate.wait()
+        seen.append(2)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0.001)
+        seen.append(3)
+
+    started, seen = at_once(work())
+    task, at_start = await started
+    assert at_start == [1]
+    gate.set()
+    await task
+    assert seen == [1, 2, 3]
+
+
+async def test_bare_yield_comes_first():
+    async def work():
+        await asyncio.sleep(0)
+        seen.append(1)
+
+    started, seen = at_once(work())
+    await (await started)[0]
+    assert seen == [1]
+
+
+async def test_task_is_current_from_its_first_step_so_timeouts_work():
+    async def work():
+        first = asyncio.current_task()
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.01):
+                await asyncio.sleep(5)
+        seen.extend((first, asyncio.current_task()))
+
+    started, seen = at_once(work())
+    task, _ = await started
+    await task
+    assert seen == [task, task]
+
+
+@pytest.mark.parametrize("wait_first", [False, True])
+async def test_exception_is_the_tasks_outcome(wait_first):
+    async def work():
+        if wait_first:
+            await asyncio.sleep(0.001)
+        raise ValueError("broken")
+
+    started, _ = at_once(work())
+    task, _ = await started
+    with pytest.raises(ValueError, match="broken"):
+        await task
+
+
+@pytest.mark.parametrize("let_it_run", [False, True])
+async def test_cancelled_task_cleans_up_and_cancels_its_future(let_it_run):
+    loop, seen = asyncio.get_running_loop(), []
+    inner = loop.create_future()
+
+    async def work():
+        try:
+            await inner
+        finally:
+            seen.append("cleaned up")
+
+    def start():
+        task = start_now(work())
+        if let_it_run:
+            loop.call_soon(loop.call_soon, task.cancel)
+        else:
+            task.cancel()
+        seen.append(task)
+
+    loop.call_soon(start)
+    await until(lambda: "cleaned up" in seen)
+    task = seen[0]
+    await asyncio.wait({task})
+    assert task.cancelled()
+    assert inner.cancelled()
+
+
+async def test_context_variable_set_inside_stays_inside_and_lasts():
+    async def work():
+        token = VARIABLE_OF_A_TASK.set("inside")
+        await asyncio.sleep(0.001)
+        seen.append(VARIABLE_OF_A_TASK.get())
+        VARIABLE_OF_A_TASK.reset(token)
+
+    started, seen = at_once(work())
+    await (await started)[0]
+    assert seen == ["inside"]
+    assert VARIABLE_OF_A_TASK.get() == ""
+
+
+async def test_work_started_inside_a_task_begins_in_the_next_turn():
+    seen = []
+
+    async def work():
+        seen.append(asyncio.current_task())
+
+    task = start_now(work())
+    assert not seen
+    await task
+    assert seen == [task]

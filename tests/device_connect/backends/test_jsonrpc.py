@@ -12,17 +12,17 @@ GOOD = {"jsonrpc": "2.0", "id": "1", "method": "getStatus", "params": {}}
 
 
 def code_for(payload):
-    found = jsonrpc.check(payload if isinstance(payload, bytes) else json.dumps(payload).encode())
-    return found.code if isinstance(found, jsonrpc.Refusal) else None
+    checked = jsonrpc.check(payload if isinstance(payload, bytes) else json.dumps(payload).encode())
+    return checked.code if isinstance(checked, jsonrpc.Refusal) else None
 
 
 @pytest.mark.parametrize("rpc_id", ["1", "", 7, 1.5, None])
-def test_a_command_with_any_id_of_the_specification_is_one(rpc_id):
-    found = jsonrpc.check(json.dumps({**GOOD, "id": rpc_id}).encode())
-    assert found == jsonrpc.Command("getStatus", rpc_id)
+def test_command_with_any_id_of_the_specification_is_one(rpc_id):
+    checked = jsonrpc.check(json.dumps({**GOOD, "id": rpc_id}).encode())
+    assert checked == jsonrpc.Command("getStatus", rpc_id)
 
 
-def test_a_command_needs_no_params_and_no_version():
+def test_command_needs_no_params_and_no_version():
     assert code_for({"id": 1, "method": "getStatus"}) is None
 
 
@@ -30,7 +30,7 @@ def test_a_command_needs_no_params_and_no_version():
     "payload",
     [b"", b"x", b"{", b"\xff\xfe", b"[" * 10_000, b'{"id":' + b"9" * 5_000 + b"}", b'{"id":1,"x":NaN}', b"-Infinity"],
 )
-def test_what_is_no_json_is_a_parse_error(payload):
+def test_malformed_json_is_a_parse_error(payload):
     assert code_for(payload) == -32700
 
 
@@ -54,7 +54,7 @@ def test_what_is_no_json_is_a_parse_error(payload):
         {**GOOD, "params": {"deep": json.loads("[" * 100 + "]" * 100)}},
     ],
 )
-def test_what_is_no_request_is_an_invalid_one(payload):
+def test_json_that_is_no_request_is_an_invalid_request(payload):
     assert code_for(payload) == -32600
 
 
@@ -75,11 +75,11 @@ def test_what_is_no_request_is_an_invalid_one(payload):
         {"source_device": ["x"]},
     ],
 )
-def test_params_that_no_function_could_take_are_invalid_params(params):
+def test_params_that_no_function_takes_are_invalid_params(params):
     assert code_for({**GOOD, "params": params}) == -32602
 
 
-def test_a_refusal_carries_the_id_as_soon_as_it_was_read():
+def test_refusal_carries_the_id_as_soon_as_it_was_read():
     refusal = jsonrpc.check(json.dumps({**GOOD, "id": "call-7", "params": 3}).encode())
     assert json.loads(refusal.encoded())["id"] == "call-7"
 
@@ -89,10 +89,10 @@ def test_many_brackets_side_by_side_are_not_deep():
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_raise(data):
-    found = jsonrpc.check(data)
-    if isinstance(found, jsonrpc.Refusal):
-        assert json.loads(found.encoded())["error"]["code"] in (-32700, -32600, -32602)
+def test_check_never_raises(data):
+    checked = jsonrpc.check(data)
+    if isinstance(checked, jsonrpc.Refusal):
+        assert json.loads(checked.encoded())["error"]["code"] in (-32700, -32600, -32602)
 
 
 JSON = st.recursive(
@@ -104,19 +104,19 @@ JSON = st.recursive(
 
 @given(st.fixed_dictionaries({}, optional={"id": JSON, "method": JSON, "params": JSON, "jsonrpc": JSON}))
 def test_every_object_is_a_command_or_has_a_code(request_):
-    found = jsonrpc.check(json.dumps(request_).encode())
-    assert isinstance(found, jsonrpc.Command) or found.code in (-32600, -32602)
+    checked = jsonrpc.check(json.dumps(request_).encode())
+    assert isinstance(checked, jsonrpc.Command) or checked.code in (-32600, -32602)
 
 
 @given(JSON)
-def test_json_is_known_as_json(value):
+def test_valid_json_accepts_json(value):
     assert jsonrpc.valid_json(json.dumps(value).encode())
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_python_numbers_that_json_forbids_are_found(value):
+def test_valid_json_finds_nan_and_infinity(value):
     assert not jsonrpc.valid_json(json.dumps({"x": [value]}).encode())
 
 
-def test_the_word_nan_inside_a_text_is_fine():
+def test_valid_json_accepts_nan_in_a_text():
     assert jsonrpc.valid_json(b'{"text": "NaN and Infinity"}')

@@ -1,4 +1,4 @@
-"""Agents find, drive, hear and stop our devices with the framework's own tools, unchanged."""
+"""Agents find, drive, follow and stop our devices with the framework's own tools, unchanged."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def connected(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
     lab.still()
 
 
-def test_agents_discover_what_there_is(connected: Lab) -> None:
+def test_agents_discover_all_devices(connected: Lab) -> None:
     rows = {row["device_id"]: row for row in agent_tools.discover_devices()}
     assert set(rows) == {"arm-1", "arm-2", "metal-1"}
     assert [r["device_id"] for r in agent_tools.discover_devices(device_type="strands_robot")] == ["metal-1"]
@@ -91,7 +91,7 @@ def test_agents_drive_and_stop(connected: Lab) -> None:
     assert not world.rollouts["left"].running
 
 
-def test_an_agent_without_a_name_does_not_move_hardware_and_may_stop_it(connected: Lab) -> None:
+def test_agent_without_a_name_does_not_move_hardware_and_may_stop_it(connected: Lab) -> None:
     answer = agent_tools.invoke_device("metal-1", "execute", {"instruction": "wave"})["result"]
     assert answer["status"] == "error"
     assert "DEVICE_CONNECT_RPC_ALLOW" in answer["reason"]
@@ -99,7 +99,7 @@ def test_an_agent_without_a_name_does_not_move_hardware_and_may_stop_it(connecte
     assert agent_tools.invoke_device("metal-1", "getStatus")["result"]["task_status"] == "idle"
 
 
-def test_hardware_moves_for_the_unnamed_when_the_operator_says_so(
+def test_hardware_moves_for_an_unnamed_agent_with_the_operators_approval(
     connected: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "anonymous")
@@ -111,44 +111,44 @@ def test_hardware_moves_for_the_unnamed_when_the_operator_says_so(
     assert agent_tools.invoke_device("metal-1", "stop")["result"]["stopped"] is True
 
 
-def test_agents_hear_events(connected: Lab) -> None:
+def test_agents_receive_events(connected: Lab) -> None:
     world = connected.worlds["arm-2"]
     steps = agent_tools.subscribe("device(arm-2).event(streamStep)")
     ends = agent_tools.subscribe("device(arm-2).event(policyComplete)")
-    heard: list[Any] = []
+    received: list[Any] = []
 
     def both_heard() -> bool:
-        # A new subscription takes a moment to reach everybody.
+        # A new subscription takes a moment to reach all devices.
         agent_tools.invoke_device("arm-2", "execute", {"instruction": "wave", "duration": 0.2})
         eventually(lambda: not world.rollouts["left"].running)
-        heard.extend(ends.read())
-        return bool(heard and steps.read())
+        received.extend(ends.read())
+        return bool(received and steps.read())
 
     eventually(both_heard)
-    assert "wave" in json.dumps(heard)
+    assert "wave" in json.dumps(received)
     agent_tools.invoke_device("arm-2", "execute", {"instruction": "wave", "duration": 0.5})
     wave = world.rollouts["left"]
     eventually(lambda: not wave.running)
-    told: list[int] = []
+    numbers: list[int] = []
 
     def to_its_end() -> bool:
-        told.extend(each["params"]["step"] for each in steps.read())
-        return bool(told and told[-1] >= wave.steps - 1)
+        numbers.extend(each["params"]["step"] for each in steps.read())
+        return bool(numbers and numbers[-1] >= wave.steps - 1)
 
     eventually(to_its_end)
-    # What came late of the waves before is left out.
-    of_this = told[len(told) - 1 - told[::-1].index(1) :]
-    assert len(of_this) >= wave.steps - 1
+    # Late steps of the earlier tasks are left out.
+    of_this_task = numbers[len(numbers) - 1 - numbers[::-1].index(1) :]
+    assert len(of_this_task) >= wave.steps - 1
 
 
-def test_a_broadcast_stops_the_fleet(connected: Lab) -> None:
+def test_broadcast_stops_the_fleet(connected: Lab) -> None:
     for name in connected.worlds:
         agent_tools.invoke_device(name, "execute", {"instruction": "wave"})
     conn = agent_tools.get_connection()
     conn.subscribe_buffered(f"device-connect.{conn.zone}.*.event.async_reply.>", name="replies")
 
     def heard_of_both() -> bool:
-        # A new subscription takes a moment to reach everybody.
+        # A new subscription takes a moment to reach all devices.
         agent_tools.broadcast("device(*).function(getFeatures)")
         return all(name in json.dumps(conn.get_inbox("replies")) for name in connected.worlds)
 
@@ -158,7 +158,7 @@ def test_a_broadcast_stops_the_fleet(connected: Lab) -> None:
     eventually(lambda: json.dumps(conn.get_inbox("replies")).count('"text": "Stopped left.') == 2)
 
 
-def test_status_tells_the_truth_to_agents(connected: Lab) -> None:
+def test_agents_see_the_present_availability(connected: Lab) -> None:
     def availability() -> Any:
         rows = agent_tools.discover_devices(refresh=True)
         return next((r["status"]["availability"] for r in rows if r["device_id"] == "arm-1"), None)
@@ -177,7 +177,7 @@ def test_heartbeats_carry_the_state(connected: Lab) -> None:
     agent_tools.invoke_device("arm-1", "stop")
 
 
-def test_a_real_agent_with_a_scripted_model_drives_and_stops_an_arm(connected: Lab) -> None:
+def test_real_agent_with_a_scripted_model_drives_and_stops_an_arm(connected: Lab) -> None:
     model = ScriptedModel(
         [
             ("discover", {"selector": "device(*)"}),
@@ -191,14 +191,14 @@ def test_a_real_agent_with_a_scripted_model_drives_and_stops_an_arm(connected: L
         tools=[strands_tools.discover, strands_tools.invoke, strands_tools.broadcast],
         callback_handler=None,
     )
-    said = agent("Wave with the arm, then stop it.")
-    assert "stands still" in str(said)
-    told = json.dumps(model.seen[-1])
-    assert "Started 'wave' on left" in told
-    assert "Stopped left" in told
+    answer = agent("Wave with the arm, then stop it.")
+    assert "stands still" in str(answer)
+    results = json.dumps(model.seen[-1])
+    assert "Started 'wave' on left" in results
+    assert "Stopped left" in results
 
 
-def test_the_mcp_bridge_lists_calls_and_hears(lab: Lab) -> None:
+def test_mcp_bridge_lists_calls_and_receives_events(lab: Lab) -> None:
     from fastmcp import Client  # noqa: PLC0415 - heavy
     from fastmcp.client.transports import StdioTransport  # noqa: PLC0415
 

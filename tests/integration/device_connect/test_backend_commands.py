@@ -1,4 +1,4 @@
-"""What a caller meets on a command topic: an answer, at once, whatever was sent."""
+"""Every message on a command topic is answered at once."""
 
 import asyncio
 import contextlib
@@ -60,7 +60,7 @@ async def test_every_malformed_command_is_answered_at_once_with_its_code(transpo
         assert (await bare.call("echo-1", "getStatus", {"value": "alive"}))["result"]["value"] == "alive"
 
 
-async def test_a_command_of_ten_megabytes_is_refused_with_the_limit():
+async def test_command_of_ten_megabytes_is_refused_with_the_limit():
     async with over("zenoh") as (bare, device):
         before = device.memory_info().rss
         for _ in range(3):
@@ -70,7 +70,7 @@ async def test_a_command_of_ten_megabytes_is_refused_with_the_limit():
         assert (device.memory_info().rss - before) / 2**20 < GROWTH_MB
 
 
-async def test_a_result_of_two_megabytes_arrives_over_zenoh():
+async def test_result_of_two_megabytes_arrives_over_zenoh():
     async with over("zenoh") as (bare, _):
         assert len((await bare.call("echo-1", "large", {"size": 2_000_000}))["result"]["text"]) == 2_000_000
 
@@ -80,14 +80,14 @@ async def test_quick_calls_are_answered_while_slow_ones_run():
         # A caller on the framework's own client would wait in its four threads; this one is ours.
         async with Caller(client=await open_client(bare_link(bare))) as caller:
             slow = [asyncio.ensure_future(caller.call("echo-1", "hold", wait_s=60)) for _ in range(8)]
-            await caller.holds("echo-1", 8)
+            await caller.wait_held("echo-1", 8)
             assert (await caller.call("echo-1", "stop"))["result"] == {"stopped": True}
             assert not any(each.done() for each in slow)
             await caller.call("echo-1", "release")
             assert all(each["result"] == {"held": True} for each in await asyncio.gather(*slow))
 
 
-async def test_a_caller_that_gives_up_leaves_nothing_behind_at_the_device():
+async def test_device_serves_on_after_callers_gave_up():
     async with over("zenoh") as (bare, _):
         async with Caller(client=await open_client(bare_link(bare))) as caller:
             for _ in range(20):
@@ -101,7 +101,7 @@ async def test_a_caller_that_gives_up_leaves_nothing_behind_at_the_device():
 
 
 @pytest.mark.parametrize("transport", ["zenoh", "nats"])
-async def test_a_device_survives_twenty_thousand_random_messages(transport):
+async def test_device_survives_twenty_thousand_random_messages(transport):
     rng = random.Random(7)
     async with over(transport) as (bare, device):
         subject = "device-connect.default.echo-1.cmd"
@@ -125,7 +125,7 @@ def bare_link(bare):
 
 
 async def _flood(client, subject, rng, count):
-    """Messages of every malformed kind, mutated; four of five as requests, each of which gets a JSON answer."""
+    """Send mutated messages of every malformed kind; four of five as requests, each of which gets a JSON answer."""
     kinds = [payload for payload, _ in MALFORMED.values()] + [
         json.dumps({"jsonrpc": "2.0", "id": 1, "method": "getStatus", "params": {"value": "x"}}).encode()
     ]
@@ -134,14 +134,14 @@ async def _flood(client, subject, rng, count):
         json.loads(await client.request(subject, payload, timeout=20))
 
     for _ in range(count // 50):
-        asked = []
+        requests = []
         for number in range(50):
             payload = bytearray(rng.choice(kinds))
             for _ in range(rng.randrange(3)):
                 if payload:
                     payload[rng.randrange(len(payload))] = rng.randrange(256)
             if number % 5:
-                asked.append(ask(bytes(payload)))
+                requests.append(ask(bytes(payload)))
             else:
                 await client.publish(subject, bytes(payload))
-        await asyncio.gather(*asked)
+        await asyncio.gather(*requests)

@@ -1,4 +1,4 @@
-"""Processes of one machine meet without configuration, without multicast, and without anybody they depend on."""
+"""Processes of one machine meet without configuration, without multicast, and without a central process."""
 
 import os
 import signal
@@ -32,7 +32,7 @@ def port() -> int:
     return free_port()
 
 
-def test_a_bare_agent_finds_and_calls_every_process_at_the_meeting_port(port):
+def test_bare_agent_finds_and_calls_every_process_at_the_meeting_port(port):
     link = loopback_config(port)
     with EchoDevice("arm-1", link), EchoDevice("arm-2", link), EchoDevice("arm-3", link):
         environment = {
@@ -46,13 +46,13 @@ def test_a_bare_agent_finds_and_calls_every_process_at_the_meeting_port(port):
     assert "agent saw all" in done.stdout, done.stderr[-3000:]
 
 
-async def test_a_survivor_takes_the_meeting_port_over_when_its_holder_is_killed(port):
+async def test_another_process_takes_over_the_meeting_port_of_a_killed_one(port):
     link = loopback_config(port)
     with EchoDevice("arm-1", link) as holder, EchoDevice("arm-2", link), EchoDevice("arm-3", link):
         async with Caller(client=await open_client(link)) as caller:
             await caller.sees("arm-1", "arm-2", "arm-3")
             holder.kill()
-            eventually(lambda: accepts(port), what="somebody at the meeting port again")
+            eventually(lambda: accepts(port), what="a listener at the meeting port again")
             assert (await caller.call("arm-2", "getStatus"))["result"]
             with EchoDevice("arm-4", link):
                 await caller.sees("arm-2", "arm-3", "arm-4")
@@ -69,20 +69,20 @@ async def test_nothing_of_a_loopback_link_listens_beyond_this_machine(port):
         assert {each[0] for each in listeners} == {"127.0.0.1"}
 
 
-async def test_a_stopped_peer_does_not_hold_up_the_others(port):
+async def test_stopped_peer_does_not_hold_up_the_others(port):
     link = loopback_config(port)
     with EchoDevice("arm-1", link), EchoDevice("arm-2", link) as stopped:
         async with Caller(client=await open_client(link)) as caller:
             await caller.sees("arm-1", "arm-2")
-            heard = await caller.hears("arm-1", "tick")
+            received = await caller.collect("arm-1", "tick")
             stopped.send_signal(signal.SIGSTOP)
             try:
-                for told in range(200, 2001, 200):
+                for sent in range(200, 2001, 200):
                     # No more at once than a link holds for a peer that gets no turn to take them.
                     await caller.call("arm-1", "burst", {"count": 200, "hz": 4000, "size": 4000})
                     for _ in range(2):
                         assert (await caller.call("arm-1", "getStatus", wait_s=5.0))["result"]
-                    await until(lambda told=told: len(heard) == told, what="every event at a peer that runs")
+                    await until(lambda sent=sent: len(received) == sent, what="every event at a peer that runs")
             finally:
                 stopped.send_signal(signal.SIGCONT)
 

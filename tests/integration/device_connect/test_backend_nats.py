@@ -1,4 +1,4 @@
-"""Our NATS backend against the real server, with the bare framework at the far side."""
+"""Our NATS backend against the real server, with the bare framework at the other end."""
 
 import asyncio
 import contextlib
@@ -26,15 +26,15 @@ def server():
         yield running
 
 
-async def test_a_bare_agent_and_our_device_understand_each_other_over_nats(server):
+async def test_bare_agent_and_our_device_understand_each_other_over_nats(server):
     with EchoDevice("arm-1", link_to(server)):
         async with Caller("nats", servers=(server.url,)) as bare:
             await bare.sees("arm-1")
             assert (await bare.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
-            heard = await bare.hears("arm-1", "tick")
+            received = await bare.collect("arm-1", "tick")
             await bare.call("arm-1", "burst", {"count": 50, "hz": 1000})
-            await until(lambda: len(heard) == 50)
-            assert [each["n"] for each in heard] == list(range(50))
+            await until(lambda: len(received) == 50)
+            assert [each["n"] for each in received] == list(range(50))
 
 
 async def test_our_client_and_a_bare_device_understand_each_other_over_nats(server):
@@ -45,29 +45,29 @@ async def test_our_client_and_a_bare_device_understand_each_other_over_nats(serv
             assert (await caller.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
 
 
-async def test_a_quick_call_is_answered_while_a_slow_one_runs_on_nats(server):
+async def test_quick_call_is_answered_while_a_slow_one_runs_on_nats(server):
     with EchoDevice("arm-1", link_to(server)):
         async with Caller("nats", servers=(server.url,)) as bare:
             await bare.sees("arm-1")
             slow = asyncio.ensure_future(bare.call("arm-1", "hold", wait_s=60))
-            await bare.holds("arm-1", 1)
+            await bare.wait_held("arm-1", 1)
             assert (await bare.call("arm-1", "stop"))["result"] == {"stopped": True}
             assert not slow.done()
             await bare.call("arm-1", "release")
             assert (await slow)["result"] == {"held": True}
 
 
-async def test_an_event_the_server_would_refuse_is_dropped_and_the_next_ones_flow():
+async def test_event_the_server_would_refuse_is_dropped_and_the_next_ones_flow():
     with NatsServer(max_payload=20_000) as server, EchoDevice("arm-1", link_to(server)):
         async with Caller("nats", servers=(server.url,)) as bare:
             await bare.sees("arm-1")
-            heard = await bare.hears("arm-1", "tick")
+            received = await bare.collect("arm-1", "tick")
             await bare.call("arm-1", "burst", {"count": 1, "size": 30_000})
             await bare.call("arm-1", "burst", {"count": 3, "hz": 100})
-            await until(lambda: len(heard) == 3)
+            await until(lambda: len(received) == 3)
 
 
-async def test_a_result_the_server_would_refuse_is_answered_with_the_limit():
+async def test_result_the_server_would_refuse_is_answered_with_the_limit():
     with NatsServer(max_payload=20_000) as server, EchoDevice("arm-1", link_to(server)):
         async with Caller("nats", servers=(server.url,)) as bare:
             await bare.sees("arm-1")
@@ -76,7 +76,7 @@ async def test_a_result_the_server_would_refuse_is_answered_with_the_limit():
     assert "20000" in answer["error"]["message"]
 
 
-async def test_a_device_answers_when_a_killed_server_has_come_back(server):
+async def test_device_answers_when_a_killed_server_has_come_back(server):
     with EchoDevice("arm-1", link_to(server)):
         async with Caller("nats", servers=(server.url,)) as bare:
             await bare.sees("arm-1")
@@ -92,11 +92,11 @@ async def test_a_device_answers_when_a_killed_server_has_come_back(server):
             await eventually_async(answered, what="an answer after the restart")
 
 
-async def test_nobody_at_a_subject_is_told_at_once_on_nats(server):
+async def test_request_without_a_responder_fails_at_once_on_nats(server):
     async with Caller(client=await open_client(link_to(server))) as caller:
         started = asyncio.get_running_loop().time()
         with pytest.raises(MessagingError, match="no device answers"):
-            await caller.call("nobody", "getStatus", wait_s=60)
+            await caller.call("absent", "getStatus", wait_s=60)
         assert asyncio.get_running_loop().time() - started < 30
 
 
@@ -127,7 +127,7 @@ async def test_jwt_credentials_over_tls_admit_a_device_as_itself_alone(tmp_path,
             async with Caller("nats", servers=(server.url,), tls=tls, credentials=credentials) as bare:
                 await bare.sees("robot-a")
                 assert (await bare.call("robot-a", "getStatus"))["result"]
-                heard = await bare.hears("robot-a", "emergencyStop")
+                received = await bare.collect("robot-a", "emergencyStop")
 
                 intruder = accounts.device("robot-b")
                 client = await open_client(
@@ -138,13 +138,13 @@ async def test_jwt_credentials_over_tls_admit_a_device_as_itself_alone(tmp_path,
                     await other.client.publish("device-connect.default.robot-a.event.emergencyStop", spoofed)
                     with pytest.raises(MessagingError):
                         await other.call("robot-a", "getStatus", wait_s=0.5)
-                assert heard == []
+                assert received == []
 
         with pytest.raises(MessagingError):
             await open_client(link_to(server, ca=str(identity.ca), connect_timeout_s=1.0))
 
 
-async def test_a_server_of_another_authority_is_refused(tmp_path):
+async def test_server_of_another_authority_is_refused(tmp_path):
     ours, theirs = Authority(tmp_path / "ours"), Authority(tmp_path / "theirs")
     with NatsServer(theirs.issue("nats")) as server:
         with pytest.raises(MessagingError, match="no NATS connection"):

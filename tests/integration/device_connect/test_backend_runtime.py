@@ -1,4 +1,4 @@
-"""The framework's runtime on our backend: ready when it says so, honest when it fails, gone when it is told to go."""
+"""The framework's runtime on our backend: readiness, failures of the start, and the end."""
 
 import asyncio
 import json
@@ -22,10 +22,15 @@ def link():
     return loopback_config(free_port())
 
 
+def start(link, driver=None, allow_insecure=True):
+    """Start a runtime; return it and its task."""
+    runtime = Runtime(driver=driver or EchoDriver(), device_id="arm-1", link=link, allow_insecure=allow_insecure)
+    return runtime, asyncio.create_task(runtime.run())
+
+
 @pytest.fixture
 async def runtime(link):
-    made = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
-    task = asyncio.create_task(made.run())
+    made, task = start(link)
     await made.wait_ready(30)
     yield made
     await made.shutdown()
@@ -33,61 +38,59 @@ async def runtime(link):
     assert not zenoh_session.open_links()
 
 
-async def test_a_ready_device_is_callable_and_discoverable_at_once(runtime, link):
+async def test_ready_device_is_callable_and_discoverable_at_once(runtime, link):
     async with Caller(client=await open_client(link)) as caller:
         assert (await caller.call("arm-1", "getStatus", {"value": "x"}))["result"]["value"] == "x"
         await caller.sees("arm-1")
 
 
-async def test_the_status_that_presence_tells_is_the_live_one(runtime, link):
+async def test_presence_carries_the_present_status(runtime, link):
     async with Caller(client=await open_client(link)) as caller:
-        heard = []
+        received = []
 
         async def on_presence(data, _reply):
-            heard.append(json.loads(data)["status"].get("availability"))
+            received.append(json.loads(data)["status"].get("availability"))
 
         await caller.client.subscribe("device-connect.default.arm-1.presence", on_presence, subscribe_only=True)
         runtime.status["availability"] = "busy"
-        await until(lambda: "busy" in heard)
+        await until(lambda: "busy" in received)
 
 
-async def test_a_foreign_thread_may_emit(runtime, link):
+async def test_any_thread_may_emit(runtime, link):
     async with Caller(client=await open_client(link)) as caller:
-        heard = await caller.hears("arm-1", "tick")
+        received = await caller.collect("arm-1", "tick")
         thread = threading.Thread(target=lambda: [runtime.emit_from_thread("tick", {"n": n}) for n in range(100)])
         thread.start()
-        await until(lambda: len(heard) == 100)
+        await until(lambda: len(received) == 100)
         thread.join()
-        assert [each["n"] for each in heard] == list(range(100))
+        assert [each["n"] for each in received] == list(range(100))
 
 
-async def test_an_event_that_json_cannot_carry_is_dropped_and_the_next_one_flows(runtime, link, caplog):
+async def test_event_that_json_cannot_carry_is_dropped_and_the_next_one_flows(runtime, link, caplog):
     async with Caller(client=await open_client(link)) as caller:
-        heard = await caller.hears("arm-1", "tick")
+        received = await caller.collect("arm-1", "tick")
         await runtime.enqueue_event("tick", {"n": float("nan")})
         await runtime.enqueue_event("tick", {"n": 2})
-        await until(lambda: heard)
-        assert heard == [{"n": 2}]
+        await until(lambda: received)
+        assert received == [{"n": 2}]
         assert "NaN" in caplog.text
 
 
-async def test_a_driver_that_cannot_connect_is_reported_and_leaves_nothing_open(link):
+async def test_driver_that_cannot_connect_is_reported_and_leaves_nothing_open(link):
     class Broken(EchoDriver):
         async def connect(self):
             raise OSError("no motor answers")
 
-    runtime = Runtime(driver=Broken(), device_id="arm-1", link=link, allow_insecure=True)
-    task = asyncio.create_task(runtime.run())
+    runtime, task = start(link, Broken())
     with pytest.raises(OSError, match="no motor answers"):
         await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
     assert not zenoh_session.open_links()
 
 
-async def test_a_start_that_waits_for_a_router_can_be_ended():
+async def test_start_that_waits_for_a_router_can_be_ended():
     absent = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=0.3)
-    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=absent, allow_insecure=True)
-    task = asyncio.create_task(runtime.run())
+    runtime, task = start(absent)
     with pytest.raises(TimeoutError):
         await runtime.wait_ready(0.2)
     await runtime.shutdown()
@@ -95,10 +98,9 @@ async def test_a_start_that_waits_for_a_router_can_be_ended():
     await until(lambda: not zenoh_session.open_links())
 
 
-async def test_a_router_that_comes_late_is_found_soon():
+async def test_router_that_comes_late_is_found_soon():
     absent = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=0.2)
-    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=absent, allow_insecure=True)
-    task = asyncio.create_task(runtime.run())
+    runtime, task = start(absent)
     with pytest.raises(TimeoutError):
         await runtime.wait_ready(1.5)
     with ZenohRouter(port=int(absent.connect[0].rpartition(":")[2])):
@@ -113,16 +115,14 @@ async def test_a_router_that_comes_late_is_found_soon():
 async def test_credentials_that_a_server_refuses_end_the_start_with_its_reason():
     with NatsServer(accounts="authorization { token: right }") as server:
         link = LinkConfig("nats", connect=(server.url.replace("//", "//wrong@"),), connect_timeout_s=1)
-        runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
-        task = asyncio.create_task(runtime.run())
+        runtime, task = start(link)
         with pytest.raises(AuthenticationError):
             await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_a_link_on_which_nobody_proves_who_he_is_needs_the_opt_in(link):
-    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link)
-    task = asyncio.create_task(runtime.run())
+async def test_unauthenticated_link_needs_the_opt_in(link):
+    runtime, task = start(link, allow_insecure=False)
     with pytest.raises(ValueError, match="allow_insecure"):
         await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
@@ -132,15 +132,14 @@ async def test_a_link_on_which_nobody_proves_who_he_is_needs_the_opt_in(link):
 async def test_certificates_in_the_environment_do_not_change_an_explicit_link(link, monkeypatch):
     monkeypatch.setenv("MESSAGING_TLS_CA_FILE", "/nowhere/ca.pem")
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:1")
-    runtime = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
-    task = asyncio.create_task(runtime.run())
+    runtime, task = start(link)
     await runtime.wait_ready(30)
     assert runtime.messaging.link == link
     await runtime.shutdown()
     assert task.done()
 
 
-async def test_a_stock_runtime_may_use_the_backend_by_name(link):
+async def test_stock_runtime_may_use_the_backend_by_name(link):
     runtime = DeviceRuntime(
         driver=EchoDriver(), device_id="arm-1", messaging_backend=register(link), allow_insecure=True
     )
@@ -155,9 +154,8 @@ async def test_a_stock_runtime_may_use_the_backend_by_name(link):
     assert not zenoh_session.open_links()
 
 
-async def test_the_departure_is_told(link):
-    first = Runtime(driver=EchoDriver(), device_id="arm-1", link=link, allow_insecure=True)
-    task = asyncio.create_task(first.run())
+async def test_departure_is_announced(link):
+    first, task = start(link)
     await first.wait_ready(30)
     async with Caller(client=await open_client(link)) as caller:
         farewells = []

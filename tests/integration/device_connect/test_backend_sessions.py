@@ -1,4 +1,4 @@
-"""One session a process, whoever uses it, and nothing left when the last one goes."""
+"""All users of a process share one session, and the last one leaves nothing open."""
 
 import json
 import subprocess
@@ -146,11 +146,11 @@ def test_twenty_cycles_leave_no_thread_and_no_descriptor(mode):
     assert "nothing grew" in run(CYCLES, json.dumps(link))
 
 
-def test_a_process_that_forgets_to_shut_down_still_ends():
+def test_process_that_forgets_to_shut_down_still_ends():
     assert "leaves without a word" in run(FORGETFUL)
 
 
-def test_a_start_that_is_given_up_never_comes_online_later():
+def test_start_that_was_given_up_never_comes_online():
     absent = free_port()
     program = CYCLES.replace("await runtime.wait_ready(60)", "await give_up(runtime)").replace(
         "def cycle",
@@ -170,6 +170,6 @@ def test_a_start_that_is_given_up_never_comes_online_later():
     assert "nothing grew" in run(program, json.dumps(link))
 
 
-def test_two_links_that_differ_do_not_share():
+def test_links_that_differ_are_unequal():
     assert LinkConfig(tenant="red") != LinkConfig(tenant="blue")
     assert hash(LinkConfig()) == hash(LinkConfig())

@@ -1,4 +1,4 @@
-"""Our Zenoh backend between peers and through a router, with the bare framework at the far side."""
+"""Our Zenoh backend between peers and through a router, with the bare framework at the other end."""
 
 import asyncio
 import contextlib
@@ -44,7 +44,7 @@ async def test_peers_with_endpoints_and_no_multicast_find_and_call_each_other():
                 assert (await caller.call(name, "getStatus", {"value": name}))["result"]["value"] == name
 
 
-def test_of_two_peers_that_learn_of_each_other_one_dials_and_it_is_the_one_nobody_may_reach():
+def test_of_two_peers_that_meet_by_gossip_only_the_unreachable_one_dials():
     meeting, listening = f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
     links = (
         LinkConfig(mode="peer", listen=(meeting,), multicast=False),
@@ -60,18 +60,18 @@ def test_of_two_peers_that_learn_of_each_other_one_dials_and_it_is_the_one_nobod
         assert str(one.dst) == listening
 
 
-async def test_a_bare_device_is_found_and_called_by_our_client(router):
+async def test_bare_device_is_found_and_called_by_our_client(router):
     environment = {"ZENOH_CONNECT": router.endpoint, "DEVICE_CONNECT_DISCOVERY_MODE": "d2d"}
     with EchoDevice("arm-1", environment=environment):
         async with Caller(client=await open_client(LinkConfig(connect=(router.endpoint,)))) as caller:
             await caller.sees("arm-1")
             assert (await caller.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
-            heard = await caller.hears("arm-1", "tick")
+            received = await caller.collect("arm-1", "tick")
             await caller.call("arm-1", "burst", {"count": 50, "hz": 500})
-            await until(lambda: len(heard) == 50)
+            await until(lambda: len(received) == 50)
 
 
-async def test_a_device_behind_a_router_answers_soon_after_the_router_was_killed(router):
+async def test_device_behind_a_router_answers_soon_after_the_router_was_killed(router):
     link = LinkConfig(connect=(router.endpoint,))
     with EchoDevice("arm-1", link):
         async with Caller(client=await open_client(link)) as caller:
@@ -89,32 +89,32 @@ async def test_a_device_behind_a_router_answers_soon_after_the_router_was_killed
             await eventually_async(answered, what="an answer after the restart")
             async with Caller(servers=(router.endpoint,)) as bare:
                 await bare.sees("arm-1")
-                heard = await bare.hears("arm-1", "tick")
+                received = await bare.collect("arm-1", "tick")
                 await bare.call("arm-1", "burst", {"count": 3})
-                await until(lambda: len(heard) == 3)
+                await until(lambda: len(received) == 3)
 
 
-async def test_the_loss_and_the_return_of_a_router_are_told(router):
-    told = []
+async def test_client_reports_the_loss_and_the_return_of_a_router(router):
+    reported = []
 
     async def lost():
-        told.append("lost")
+        reported.append("lost")
 
     async def back():
-        told.append("back")
+        reported.append("back")
 
     client = backend_for(LinkConfig(connect=(router.endpoint,)))
     await client.connect(servers=[], disconnect_cb=lost, reconnect_cb=back)
     try:
         router.kill()
-        await until(lambda: told == ["lost"])
+        await until(lambda: reported == ["lost"])
         router.start()
-        await until(lambda: told == ["lost", "back"])
+        await until(lambda: reported == ["lost", "back"])
     finally:
         await client.close()
 
 
-async def test_an_absent_router_is_reported_within_the_deadline():
+async def test_absent_router_is_reported_within_the_deadline():
     link = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=1.0)
     with pytest.raises(MessagingError, match="no Zenoh link"):
         async with asyncio.timeout(30):
@@ -131,12 +131,12 @@ async def test_access_rules_admit_a_device_as_itself_alone(tmp_path):
             async with bare, Caller(client=await open_client(link["robot-b"])) as other:
                 await bare.sees("robot-a")
                 assert (await bare.call("robot-a", "getStatus"))["result"]
-                heard = await bare.hears("robot-a", "emergencyStop")
-                genuine = await bare.hears("robot-b", "emergencyStop")
+                received = await bare.collect("robot-a", "emergencyStop")
+                genuine = await bare.collect("robot-b", "emergencyStop")
                 stop = json.dumps({"jsonrpc": "2.0", "method": "emergencyStop", "params": {}}).encode()
 
                 async def own_is_heard() -> bool:
-                    # A new subscription takes a moment to reach everybody.
+                    # A new subscription takes a moment to reach all peers.
                     for name in ("robot-a", "robot-b"):
                         await other.client.publish(f"device-connect.default.{name}.event.emergencyStop", stop)
                     return len(genuine) >= 3
@@ -144,7 +144,7 @@ async def test_access_rules_admit_a_device_as_itself_alone(tmp_path):
                 await eventually_async(own_is_heard)
                 with pytest.raises(MessagingError):
                     await other.call("robot-a", "getStatus", wait_s=0.5)
-                assert heard == []
+                assert received == []
 
 
 async def test_peers_over_mutual_tls_admit_only_their_own_authority(tmp_path):

@@ -98,9 +98,7 @@ def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("device", "function", "name", "value"), CASES)
-def test_an_argument_out_of_its_domain_is_refused(
-    site: Site, device: str, function: str, name: str, value: Any
-) -> None:
+def test_argument_out_of_its_domain_is_refused(site: Site, device: str, function: str, name: str, value: Any) -> None:
     base = {"instruction": "wave"} if function == "execute" else {}
     answer = site.fleet.call(device, function, {**base, name: value})
     assert answer["status"] == "error"
@@ -109,7 +107,7 @@ def test_an_argument_out_of_its_domain_is_refused(
 
 
 @pytest.mark.parametrize("word", ["NaN", "Infinity", "-Infinity", "1e999", "[" * 10_000 + "]" * 10_000])
-def test_what_is_no_json_number_or_value_never_moves(site: Site, word: str) -> None:
+def test_value_that_is_not_json_never_moves_a_robot(site: Site, word: str) -> None:
     request = (
         '{"jsonrpc":"2.0","id":"1","method":"execute","params":{"instruction":"wave","duration":'
         + word
@@ -128,12 +126,12 @@ def test_extra_parameters_are_refused_on_every_function(site: Site, device: str,
     assert not site.moving
 
 
-def test_a_missing_parameter_is_refused_by_name(site: Site) -> None:
+def test_missing_parameter_is_refused_by_name(site: Site) -> None:
     assert "instruction" in site.fleet.call("sim-1", "execute")["reason"]
 
 
 @pytest.mark.parametrize("source", [None, "", 5, [], {}, {"name": "tester"}, "x" * 300, "tester\u0000"])
-def test_a_caller_whose_name_is_no_name_does_not_move(site: Site, source: Any) -> None:
+def test_caller_without_a_valid_name_moves_no_robot(site: Site, source: Any) -> None:
     request = {
         "jsonrpc": "2.0",
         "id": "1",
@@ -145,7 +143,7 @@ def test_a_caller_whose_name_is_no_name_does_not_move(site: Site, source: Any) -
     assert not site.moving
 
 
-def test_ten_megabytes_are_refused_and_given_back(site: Site) -> None:
+def test_command_of_ten_megabytes_is_refused_and_its_memory_freed(site: Site) -> None:
     me = psutil.Process()
 
     def refused_often() -> int:
@@ -159,7 +157,7 @@ def test_ten_megabytes_are_refused_and_given_back(site: Site) -> None:
     assert rounds[-1] < rounds[-3] + 80_000_000, rounds
 
 
-def test_the_devices_answer_and_move_after_all_that(site: Site) -> None:
+def test_devices_answer_and_move_after_bad_input(site: Site) -> None:
     for device in ("sim-1", "metal-1"):
         assert site.fleet.call(device, "execute", {"instruction": "wave", "duration": 5})["status"] == "success"
         assert site.fleet.stop(device)["status"] == "success"

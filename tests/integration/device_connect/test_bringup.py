@@ -1,4 +1,4 @@
-"""Going on the network and off again: found, refused, cancelled, and nothing left behind."""
+"""Bring-up and end of a device: discovered, refused, cancelled, and nothing left open."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ def settles(before: tuple[int, int], spare: int = 0) -> None:
     )
 
 
-def nobody_serves() -> None:
+def no_device_thread_is_left() -> None:
     eventually(lambda: not any(t.name == "device-connect" for t in threading.enumerate()))
 
 
-def test_a_simulation_is_found_called_and_gone(link: LinkConfig, world: ToyWorld) -> None:
+def test_simulation_is_found_called_and_departs(link: LinkConfig, world: ToyWorld) -> None:
     runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
     with FleetClient(link, "tester") as fleet:
         (peer,) = fleet.peers(20)
@@ -85,7 +85,7 @@ def test_a_simulation_is_found_called_and_gone(link: LinkConfig, world: ToyWorld
     stop_device_connect(runtime)
 
 
-def test_it_is_callable_when_the_call_returns(link: LinkConfig, world: ToyWorld) -> None:
+def test_device_is_callable_when_the_call_returns(link: LinkConfig, world: ToyWorld) -> None:
     with FleetClient(link) as fleet:
         for _ in range(3):
             runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
@@ -93,7 +93,7 @@ def test_it_is_callable_when_the_call_returns(link: LinkConfig, world: ToyWorld)
             stop_device_connect(runtime)
 
 
-async def test_it_lives_on_the_callers_loop_too(link: LinkConfig, world: ToyWorld) -> None:
+async def test_device_runs_on_the_callers_own_loop(link: LinkConfig, world: ToyWorld) -> None:
     runtime = await init_device_connect(world, link=link)
     assert runtime.device_id.startswith("toy_sim-")
     await asyncio.to_thread(call_status, link, runtime.device_id)
@@ -106,7 +106,7 @@ def call_status(link: LinkConfig, name: str) -> None:
         assert fleet.call(name, "getStatus")["status"] == "success"
 
 
-def test_the_object_decides_the_driver() -> None:
+def test_driver_follows_from_the_object() -> None:
     robot, world, ready = ToyRobot(), ToyWorld(), RobotDeviceDriver(ToyRobot())
     assert isinstance(bringup.driver_for(world, "robot"), SimulationDeviceDriver)
     assert isinstance(bringup.driver_for(robot, "robot"), RobotDeviceDriver)
@@ -134,7 +134,7 @@ def test_the_object_decides_the_driver() -> None:
         ({}, "allow_insecure=True"),
     ],
 )
-def test_what_is_out_of_domain_is_refused_before_anything_opens(
+def test_argument_out_of_domain_is_refused_before_anything_opens(
     world: ToyWorld, arguments: dict[str, Any], named: str
 ) -> None:
     before = open_things()
@@ -143,7 +143,7 @@ def test_what_is_out_of_domain_is_refused_before_anything_opens(
     settles(before)
 
 
-def test_a_second_device_of_an_id_refuses_to_go_live(link: LinkConfig, world: ToyWorld) -> None:
+def test_second_device_of_an_id_refuses_to_go_live(link: LinkConfig, world: ToyWorld) -> None:
     runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
     for _ in range(3):
         with pytest.raises(DuplicateDeviceError, match="arm-1"):
@@ -154,7 +154,7 @@ def test_a_second_device_of_an_id_refuses_to_go_live(link: LinkConfig, world: To
     stop_device_connect(init_device_connect_sync(world, peer_id="arm-1", link=link))
 
 
-def test_a_second_device_of_an_id_refuses_on_nats_and_in_another_process(nats: NatsServer, world: ToyWorld) -> None:
+def test_second_device_of_an_id_refuses_on_nats_and_in_another_process(nats: NatsServer, world: ToyWorld) -> None:
     link = LinkConfig(transport="nats", connect=(nats.url,))
     with served("arm-1", nats.url):
         with pytest.raises(DuplicateDeviceError):
@@ -165,7 +165,7 @@ def test_a_second_device_of_an_id_refuses_on_nats_and_in_another_process(nats: N
         stop_device_connect(runtime)
 
 
-def test_a_driver_that_cannot_be_announced_says_so(link: LinkConfig) -> None:
+def test_driver_that_cannot_be_announced_says_so(link: LinkConfig) -> None:
     class Colour(Enum):
         RED = 1
 
@@ -188,7 +188,7 @@ def test_a_driver_that_cannot_be_announced_says_so(link: LinkConfig) -> None:
         init_device_connect_sync(Box(), link=link)
 
 
-def test_a_bring_up_that_times_out_says_what_the_last_attempt_met(world: ToyWorld) -> None:
+def test_bring_up_that_times_out_reports_the_last_error(world: ToyWorld) -> None:
     taken = socket.create_server(("127.0.0.1", 0))
     with taken, pytest.raises(TimeoutError, match=r"arm-1 was not up on the network within 2 s: no Zenoh link at tcp/"):
         link = LinkConfig(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",))
@@ -205,11 +205,11 @@ def test_twenty_start_and_stop_cycles_leave_nothing(link: LinkConfig, world: Toy
     for _ in range(20):
         cycle()
     settles(before, spare=2)
-    nobody_serves()
+    no_device_thread_is_left()
 
 
 def test_twenty_failed_bring_ups_leave_nothing(world: ToyWorld) -> None:
-    nobody = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=0.2)
+    absent = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=0.2)
 
     class Broken(SimulationDeviceDriver):
         async def connect(self) -> None:
@@ -222,14 +222,14 @@ def test_twenty_failed_bring_ups_leave_nothing(world: ToyWorld) -> None:
     before = open_things()
     for _ in range(10):
         with pytest.raises(OSError):
-            init_device_connect_sync(world, link=nobody, bringup_timeout=1.0)
+            init_device_connect_sync(world, link=absent, bringup_timeout=1.0)
         with pytest.raises(OSError, match="no such bus"):
             init_device_connect_sync(Broken(world), link=link)
     settles(before, spare=2)
-    nobody_serves()
+    no_device_thread_is_left()
 
 
-def test_a_bring_up_that_timed_out_never_comes_online_later(world: ToyWorld) -> None:
+def test_bring_up_that_timed_out_never_comes_online_later(world: ToyWorld) -> None:
     class Slow(SimulationDeviceDriver):
         async def connect(self) -> None:
             await asyncio.sleep(1.0)
@@ -242,7 +242,7 @@ def test_a_bring_up_that_timed_out_never_comes_online_later(world: ToyWorld) -> 
         assert fleet.peers(0.5) == []
 
 
-def test_a_bring_up_that_gives_nothing_is_a_runtime_error(
+def test_bring_up_without_a_runtime_raises_runtime_error(
     link: LinkConfig, world: ToyWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def nothing(*_: object, **__: object) -> None:
@@ -251,7 +251,7 @@ def test_a_bring_up_that_gives_nothing_is_a_runtime_error(
     monkeypatch.setattr(bringup, "init_device_connect", nothing)
     with pytest.raises(RuntimeError, match="without a runtime"):
         init_device_connect_sync(world, link=link)
-    nobody_serves()
+    no_device_thread_is_left()
 
 
 SERVE = """
@@ -262,11 +262,11 @@ from strands_robots.device_connect import (
 name, where, end = sys.argv[1:]
 link = loopback_config(int(where)) if where.isdigit() else LinkConfig(transport="nats", connect=(where,))
 world = ToyWorld()
-with StopSignal() as asked:
+with StopSignal() as stop:
     runtime = init_device_connect_sync(world, peer_id=name, link=link)
     print("up", flush=True)
     if end == "signal":
-        asked.wait()
+        stop.wait()
         world.halt("signal")
         stop_device_connect(runtime)
     elif end == "exit":
@@ -301,7 +301,7 @@ class served:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_leaves_no_ghost(link: LinkConfig, number: signal.Signals) -> None:
+def test_device_departs_on_a_signal(link: LinkConfig, number: signal.Signals) -> None:
     with FleetClient(link) as fleet, served("arm-1", str(link.meet_port)) as process:
         eventually(lambda: [p.id for p in fleet.peers(0.6)] == ["arm-1"])
         process.send_signal(number)
@@ -309,7 +309,7 @@ def test_a_signal_leaves_no_ghost(link: LinkConfig, number: signal.Signals) -> N
         eventually(lambda: "arm-1" not in fleet.known())
 
 
-def test_the_end_of_the_program_leaves_no_ghost(link: LinkConfig) -> None:
+def test_device_departs_at_the_end_of_the_program(link: LinkConfig) -> None:
     with FleetClient(link) as fleet, served("arm-1", str(link.meet_port), "exit") as process:
         eventually(lambda: [p.id for p in fleet.peers(0.6)] == ["arm-1"])
         assert process.stdin is not None
@@ -318,7 +318,7 @@ def test_the_end_of_the_program_leaves_no_ghost(link: LinkConfig) -> None:
         eventually(lambda: "arm-1" not in fleet.known())
 
 
-def test_a_ghost_does_not_keep_its_id(nats: NatsServer, world: ToyWorld) -> None:
+def test_id_of_a_killed_device_is_free_again(nats: NatsServer, world: ToyWorld) -> None:
     with served("arm-7", nats.url) as process:
         process.kill()
         process.wait()
@@ -338,5 +338,5 @@ def test_two_tenants_do_not_see_each_other(world: ToyWorld) -> None:
     stop_device_connect(second)
 
 
-def test_the_public_constant_is_the_join_timeout() -> None:
+def test_public_constant_is_the_join_timeout() -> None:
     assert device_connect._LOOP_JOIN_TIMEOUT_S == 5.0

@@ -1,4 +1,4 @@
-"""The fleet as the command line sees it."""
+"""FleetClient: discovery, calls, events and stops on a real network."""
 
 from __future__ import annotations
 
@@ -76,13 +76,13 @@ class Head(DeviceDriver):  # type: ignore[misc]
         return {"status": "success"}
 
 
-def test_the_first_look_is_complete(link: LinkConfig, worlds: dict[str, ToyWorld]) -> None:
+def test_first_discovery_is_complete(link: LinkConfig, worlds: dict[str, ToyWorld]) -> None:
     for _ in range(3):
         with FleetClient(link) as fresh:
             assert [peer.id for peer in fresh.peers(20)] == ["arm-1", "arm-2", "arm-3"]
 
 
-def test_a_peer_says_what_it_is_and_what_it_can(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+def test_peer_describes_its_type_and_its_functions(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
     peer = fleet.peers(20)[0]
     assert (peer.id, peer.type, peer.model) == ("arm-1", "strands_sim", "arm-1")
     assert peer.status["availability"] == "idle"
@@ -90,14 +90,14 @@ def test_a_peer_says_what_it_is_and_what_it_can(fleet: FleetClient, worlds: dict
     assert "policyComplete" in peer.events
 
 
-def test_a_call_names_its_caller(fleet: FleetClient, worlds: dict[str, ToyWorld], monkeypatch: Any) -> None:
+def test_call_names_its_caller(fleet: FleetClient, worlds: dict[str, ToyWorld], monkeypatch: Any) -> None:
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
     assert fleet.call("arm-1", "execute", {"instruction": "wave"})["robot_name"] == "left"
-    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "somebody-else")
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "another-agent")
     assert "tester" in fleet.call("arm-1", "execute", {"instruction": "wave"})["reason"]
 
 
-def test_nobody_there_and_no_answer_are_two_things(fleet: FleetClient, link: LinkConfig) -> None:
+def test_absent_device_and_silent_device_raise_different_errors(fleet: FleetClient, link: LinkConfig) -> None:
     began = time.monotonic()
     with pytest.raises(NoSuchDeviceError, match="arm-9"):
         fleet.call("arm-9", "getStatus", timeout=60)
@@ -108,32 +108,32 @@ def test_nobody_there_and_no_answer_are_two_things(fleet: FleetClient, link: Lin
     stop_device_connect(runtime)
 
 
-def test_an_unknown_function_is_a_refusal_with_its_code(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+def test_unknown_function_is_a_refusal_with_its_code(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
     with pytest.raises(CallRefusedError) as refused:
         fleet.call("arm-1", "fly")
     assert refused.value.code == -32601
 
 
 @pytest.mark.parametrize("device", ["", "a.b", "*", "a/b", "x" * 200])
-def test_an_id_out_of_domain_is_refused_before_it_is_sent(fleet: FleetClient, device: str) -> None:
+def test_id_out_of_domain_is_refused_before_it_is_sent(fleet: FleetClient, device: str) -> None:
     with pytest.raises(ValidationError, match="device"):
         fleet.call(device, "getStatus")
 
 
-def test_events_come_as_they_happen(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
-    heard: list[DeviceEvent] = []
-    with fleet.subscription("arm-2", heard.append):
+def test_subscription_delivers_events_in_order_until_it_closes(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+    received: list[DeviceEvent] = []
+    with fleet.subscription("arm-2", received.append):
         fleet.call("arm-2", "execute", {"instruction": "wave", "duration": 0.3})
-        eventually(lambda: any(event.name == "policyComplete" for event in heard))
-    assert {event.device for event in heard} == {"arm-2"}
-    steps = [event.payload["step"] for event in heard if event.name == "streamStep"]
+        eventually(lambda: any(event.name == "policyComplete" for event in received))
+    assert {event.device for event in received} == {"arm-2"}
+    steps = [event.payload["step"] for event in received if event.name == "streamStep"]
     assert steps == sorted(steps)
-    count = len(heard)
+    count = len(received)
     time.sleep(0.3)
-    assert len(heard) == count
+    assert len(received) == count
 
 
-def test_events_of_the_fleet_can_be_walked_through(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
+def test_events_iterates_over_all_devices(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
     seen: set[str] = set()
     ready = threading.Event()
     for event in fleet.events("*", timeout=20, ready=ready):
@@ -156,7 +156,7 @@ def test_stop_is_true_only_for_an_affirmative_answer(
     ]
     assert fleet.stop("stubborn")["status"] == "error"
     assert fleet.stop("head")["status"] == "success"
-    assert fleet.stop("nobody")["status"] == "error"
+    assert fleet.stop("absent")["status"] == "error"
     fleet.call("arm-2", "execute", {"instruction": "wave"})
     answers = fleet.stop_all()
     assert set(answers) == {"arm-1", "arm-2", "arm-3", "stubborn", "head"}
@@ -167,16 +167,16 @@ def test_stop_is_true_only_for_an_affirmative_answer(
         stop_device_connect(runtime)
 
 
-def test_no_network_is_an_error_within_its_deadline() -> None:
-    nobody = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=0.5)
+def test_unreachable_network_raises_within_its_deadline() -> None:
+    absent = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=0.5)
     began = time.monotonic()
-    with pytest.raises(Exception, match=r"127\.0\.0\.1"), FleetClient(nobody):
+    with pytest.raises(Exception, match=r"127\.0\.0\.1"), FleetClient(absent):
         pass
     assert time.monotonic() - began < 30
     eventually(lambda: not any(t.name == "fleet-client" for t in threading.enumerate()))
 
 
-def test_the_same_over_nats() -> None:
+def test_fleet_client_works_over_nats() -> None:
     with NatsServer() as server:
         link = LinkConfig(transport="nats", connect=(server.url,))
         world = ToyWorld()

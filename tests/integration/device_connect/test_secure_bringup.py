@@ -48,7 +48,7 @@ def test_through_a_router_with_mutual_tls(authority: Authority, world: ToyWorld)
         stop_device_connect(runtime)
 
 
-def test_the_environment_is_enough(authority: Authority, world: ToyWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_is_enough(authority: Authority, world: ToyWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = authority.issue("arm-1")
     with ZenohRouter(authority.issue("router")) as router:
         monkeypatch.setenv("ZENOH_CONNECT", router.endpoint)
