@@ -13,7 +13,7 @@ import os
 import threading
 
 from fixtures import rclpy_stand_in
-from fixtures.nav2_process import nav2
+from fixtures.base_process import nav2
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot

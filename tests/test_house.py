@@ -40,7 +40,6 @@ FLOORS: list[set[str]] = [
 ]
 
 KNOWN_CIRCLES: list[set[str]] = [
-    {"drivers.ros.mobile_base", "drivers.ros.posed_base", "drivers.ros.ros_bridge", "drivers.ros.tools"},
     {"mesh.assembly", "mesh.children", "mesh.core", "mesh.input_receiver", "mesh.teleop"},
 ]
 """Circles of imports that are still to be cut. The list only ever gets shorter."""
@@ -48,7 +47,7 @@ KNOWN_CIRCLES: list[set[str]] = [
 SIBLING_NAMES: dict[str, str] = {}
 """Public class names that stand for the same idea in sibling backends."""
 
-KNOWN_TWINS: set[str] = {"Hold", "Lane", "Odometry", "Refused"}
+KNOWN_TWINS: set[str] = {"Lane", "Refused"}
 """Public class names that still stand for two ideas. The list only ever gets shorter."""
 
 FOREIGN_ROOTS: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""A real robot's joints and cameras on a ROS 2 graph, and its joint commands from it, over bare DDS."""
+"""Bridge of a real robot to a ROS 2 graph over bare DDS: its joints and cameras, and joint commands for it."""
 
 from __future__ import annotations
 
@@ -14,22 +14,20 @@ from strands_robots.utils import missing_extra
 class HardwareRtpsBridge(RosTelemetryBase):
     """Publishes joints and images, and forwards ``/<robot>/joint_command`` to ``robot.send_action``.
 
-    Commands are taken as :class:`~strands_robots.ros_telemetry.RosTelemetryBase` says.
+    Commands are taken as :class:`~strands_robots.ros_telemetry.RosTelemetryBase` describes.
 
     Args:
-        robot: the robot to drive; None for a bridge that only publishes.
+        robot: see :class:`~strands_robots.ros_telemetry.RosTelemetryBase`, as for ``enable_commands``,
+            ``command_robot_name`` and ``joint_limits``.
         domain_id: DDS domain, 0 to 232.
-        enable_commands: take commands, which needs a secured graph or the explicit opt-out.
-        command_robot_name: whose command topic is taken; the robot's own name by default.
         poll_period: seconds between two looks for a command, above 0.
-        joint_limits: ``{"<motor>.pos": (min, max)}`` in the robot's unit; what is not named is not limited here.
         dds_security_config: paths, ``file:`` or ``data:,`` URIs of ``identity_ca``, ``certificate``, ``private_key``,
             ``governance``, ``permissions`` and, where it is another, ``permissions_ca``. The participant presents them
             or does not come up. Commands need a governance that closes the command topic to strangers.
 
     Raises:
         ValidationError: an argument outside its domain, credentials that the installed library cannot honour, or
-            commands on a graph that nobody secured.
+            commands on an unsecured graph.
         MissingExtraError: the [ros2] extra is not installed.
         RosError: the domain cannot be joined, or the permissions do not grant the command topic.
     """
@@ -60,14 +58,7 @@ class HardwareRtpsBridge(RosTelemetryBase):
         link = DdsLink(self.domain_id, dds_security_config=dds_security_config)
         if self._takes_commands:
             refuse_unsecured(self._lacking(credentials))
-        try:
-            if credentials is not None:
-                # What the plugins refuse is told now, not at the first message.
-                link.open()
-            self._begin(link, "rtps-bridge")
-        except BaseException:
-            link.close()
-            raise
+        self._begin(link, "rtps-bridge", open_now=credentials is not None)
 
     def _lacking(self, credentials: DdsCredentials | None) -> str | None:
         if credentials is None:

@@ -1,4 +1,4 @@
-"""What every bridge of a joint robot to ROS shares: its topics, its refusals, and the way of a joint command."""
+"""Bridges of joint robots to ROS: their topics, their refusals, and the path of a joint command."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 from strands_robots import settings
 from strands_robots.envelope import is_error, text_of
-from strands_robots.ros.link import Message, OnMessage, Unwatch
+from strands_robots.ros.link import BroadcastLink, Message
+from strands_robots.ros.names import DOMAIN_MAX
 from strands_robots.ros.names import node_name as checked_node_name
 from strands_robots.ros.rclpy import MAX_QOS_HISTORY_DEPTH, RclpyLink
 from strands_robots.utils import ValidationError, flag, number, shown, text, whole
@@ -21,7 +23,6 @@ __all__ = ["MAX_QOS_HISTORY_DEPTH", "RosTelemetryBase", "RosTelemetryBridge", "c
 
 logger = logging.getLogger(__name__)
 
-DOMAIN_MAX = 232
 INSECURE = "STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 IMAGE = "sensor_msgs/msg/Image"
@@ -32,13 +33,13 @@ Limits = dict[str, tuple[float, float]]
 
 
 def segment(name: str) -> str:
-    """One word of a topic's name, made of whatever a robot or camera is called."""
+    """Return one word of a topic's name for the name of a robot or camera."""
     word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "robot"
     return f"_{word}" if word[0].isdigit() else word
 
 
 def checked_limits(limits: object) -> Limits:
-    """``{"<motor>.pos": (min, max)}`` of finite numbers. Raises :class:`ValidationError` naming the joint."""
+    """Check ``{"<motor>.pos": (min, max)}`` of finite numbers. Raises :class:`ValidationError` naming the joint."""
     if limits is None:
         return {}
     if not isinstance(limits, dict):
@@ -55,48 +56,35 @@ def checked_limits(limits: object) -> Limits:
     return checked
 
 
-class TelemetryLink(Protocol):
-    """What a bridge asks of the road to its graph."""
-
-    def broadcast(self, topic: str, kind: str, fields: Message) -> None:
-        """Publish for whoever cares."""
-
-    def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
-        """Tell ``heard`` of every message."""
-
-    def close(self) -> None:
-        """Leave the graph."""
-
-
 def refuse_unsecured(why: str | None) -> None:
-    """Refuse commands from a graph on which anybody could drive the robot, unless somebody insists.
+    """Refuse commands from a graph on which anyone could drive the robot, unless the operator opted out.
 
     Args:
-        why: what the graph lacks; None where it is secured.
+        why: reason why the graph is not secured; None where it is.
 
     Raises:
         ValidationError: it is not secured, and ``STRANDS_ROS2_BRIDGE_I_KNOW_THIS_IS_INSECURE`` is not set.
     """
     if why is not None and not settings.boolean(INSECURE):
         raise ValidationError(
-            f"enable_commands must be false on an unsecured ROS 2 graph, where anybody could drive the robot: {why} "
+            f"enable_commands must be false on an unsecured ROS 2 graph, where anyone could drive the robot: {why} "
             f"Set {INSECURE}=1 to take commands all the same."
         )
 
 
 class RosTelemetryBase:
-    """The transport-independent half of a bridge.
+    """Transport-independent part of a bridge.
 
-    The newest command is taken once a period; older ones are dropped. A command is dropped whole when a joint is out of
-    its range, when lengths differ, when a joint is named twice, or when a value is no number.
+    It takes the newest command once a period and drops older ones. It drops a command whole when a joint is out of its
+    range, when lengths differ, when a joint is named twice, or when a value is no number.
 
     Args:
-        robot: drives on inbound commands by its ``send_action``; None for a bridge that only publishes.
+        robot: takes inbound commands by its ``send_action``; None for a bridge that only publishes.
         domain_id: ROS 2 domain, 0 to 232.
-        enable_commands: whether inbound commands are taken at all.
-        command_robot_name: whose ``joint_command`` is taken; the robot's own name by default.
-        period: seconds between two looks for a command, above 0; ``period_name`` is the caller's word for it.
-        joint_limits: ``{"<motor>.pos": (min, max)}`` in the robot's unit; what is not named is not limited here.
+        enable_commands: take inbound commands, which needs a secured graph or the explicit opt-out.
+        command_robot_name: name in the command topic; the robot's own by default.
+        period: seconds between two looks for a command, above 0; refusals call it ``period_name``.
+        joint_limits: ``{"<motor>.pos": (min, max)}`` in the robot's unit; others are not limited here.
 
     Raises:
         ValidationError: an argument outside its domain, before anything else has happened.
@@ -122,17 +110,17 @@ class RosTelemetryBase:
         own = str(getattr(robot, "tool_name_str", "") or "robot")
         self.command_topic = f"/{segment(own if command_robot_name is None else command_robot_name)}/joint_command"
         self._limits = checked_limits(joint_limits)
-        # One place: a newer command takes it, and none gets lost between a look and the next.
+        # One place: a newer command replaces an older one.
         self._latest: deque[Message] = deque(maxlen=1)
         self._done = threading.Event()
         self._thread: threading.Thread | None = None
-        self._link: TelemetryLink | None = None
-        self._teller: threading.Thread | None = None
+        self._link: BroadcastLink | None = None
+        self._publisher: threading.Thread | None = None
 
     def publish(self, cameras: Sequence[str] = ()) -> None:
-        """Tell the robot's joints once, and the newest picture of each of these cameras of it.
+        """Publish the robot's joints once, and the newest picture of each of these cameras of it.
 
-        Joints that could not be read are not told: nobody can see that a message of now holds the past.
+        Joints that could not be read are not published: a message of now would hold positions of the past.
 
         Raises:
             ValidationError: the bridge has no robot, or the robot no such camera.
@@ -159,12 +147,12 @@ class RosTelemetryBase:
         """
         period_s = 1 / number("rate_hz", rate_hz, above=0, high=RATE_MAX_HZ)
         names = [text("cameras", each) for each in cameras]
-        if self._teller is not None:
+        if self._publisher is not None:
             raise ValidationError("start was called before; shutdown ends it.")
         self.publish(names)
         name = "ros-telemetry"
-        self._teller = threading.Thread(target=self._publish_on, args=(period_s, names), name=name, daemon=True)
-        self._teller.start()
+        self._publisher = threading.Thread(target=self._publish_on, args=(period_s, names), name=name, daemon=True)
+        self._publisher.start()
 
     def publish_joint_states(self, robot: str, names: list[str], positions: list[float]) -> None:
         """Publish joint positions in the robot's own unit; lists of different length are dropped with a warning."""
@@ -172,7 +160,7 @@ class RosTelemetryBase:
             logger.warning("%d names and %d positions of %s are not published.", len(names), len(positions), robot)
             return
         fields = {"header": _header(), "name": list(names), "position": [float(each) for each in positions]}
-        self._tell(self.joint_states_topic(robot), JOINT_STATE, fields)
+        self._send(self.joint_states_topic(robot), JOINT_STATE, fields)
 
     def publish_image(self, robot: str, camera: str, image: Any) -> None:
         """Publish one RGB picture of shape (height, width, 3) and type uint8; any other is dropped with a warning."""
@@ -188,12 +176,12 @@ class RosTelemetryBase:
             "step": 3 * int(shape[1]),
             "data": image.tobytes(),
         }
-        self._tell(self.image_topic(robot, camera), IMAGE, fields)
+        self._send(self.image_topic(robot, camera), IMAGE, fields)
 
     def shutdown(self) -> None:
         """Take no more commands, publish no more and leave the graph. A second call does nothing."""
         self._done.set()
-        for thread in (self._thread, self._teller):
+        for thread in (self._thread, self._publisher):
             if thread is not None and thread is not threading.current_thread():
                 thread.join(2.0)
         link, self._link = self._link, None
@@ -202,16 +190,16 @@ class RosTelemetryBase:
 
     @staticmethod
     def joint_states_topic(robot: str) -> str:
-        """Where a robot's joints are told."""
+        """Return the topic of a robot's joints."""
         return f"/{segment(robot)}/joint_states"
 
     @staticmethod
     def image_topic(robot: str, camera: str) -> str:
-        """Where a camera's pictures are told."""
+        """Return the topic of a camera's pictures."""
         return f"/{segment(robot)}/{segment(camera)}/image_raw"
 
     def command_error(self, names: Sequence[Any], positions: Sequence[Any]) -> str | None:
-        """Why a joint command is dropped whole, or None."""
+        """Return why a joint command is dropped whole, or None."""
         if not names or len(names) != len(positions):
             return f"{len(names)} names and {len(positions)} positions"
         if len(set(names)) != len(names):
@@ -227,14 +215,14 @@ class RosTelemetryBase:
         return None
 
     def apply(self, command: Mapping[str, Any]) -> bool:
-        """Hand a ``JointState`` as a command to the robot, whole or not at all; whether the robot took it."""
+        """Hand a ``JointState`` to the robot as a command, whole or not at all; return whether the robot took it."""
         names, positions = list(command.get("name", ())), list(command.get("position", ()))
         problem = self.command_error(names, positions)
         if problem is not None:
             logger.warning("A command on %s is dropped whole: %s.", self.command_topic, problem)
             return False
         try:
-            # The robot's own verb asks its own gate: a locked robot refuses here as on every other road.
+            # The robot's own verb asks its own gate: a locked robot refuses here as on every other path.
             answer = self._robot.send_action({str(n): float(p) for n, p in zip(names, positions, strict=True)})
         except Exception:
             logger.exception("%s did not take a command.", self.command_topic)
@@ -244,15 +232,27 @@ class RosTelemetryBase:
             return False
         return True
 
-    def _begin(self, link: TelemetryLink, name: str) -> None:
-        """Use this link from now on, and take commands from it on a thread of this name where that is wanted."""
-        self._link = link
-        if self._takes_commands:
-            link.watch(self.command_topic, JOINT_STATE, self._keep)
-            self._thread = threading.Thread(target=self._poll, name=name, daemon=True)
-            self._thread.start()
+    def _begin(self, link: BroadcastLink, name: str, *, open_now: bool = False) -> None:
+        """Use this link from now on, and take commands from it on a thread of this name where they are enabled.
 
-    def _tell(self, topic: str, kind: str, fields: Message) -> None:
+        Args:
+            link: closed again where this raises.
+            name: of the thread.
+            open_now: join the graph at once, so that a refusal is raised here and not by the first message.
+        """
+        try:
+            if open_now:
+                link.open()
+            self._link = link
+            if self._takes_commands:
+                link.watch(self.command_topic, JOINT_STATE, self._latest.append)
+                self._thread = threading.Thread(target=self._poll, name=name, daemon=True)
+                self._thread.start()
+        except BaseException:
+            link.close()
+            raise
+
+    def _send(self, topic: str, kind: str, fields: Message) -> None:
         link = self._link
         if link is None:
             logger.warning("Nothing is published on %s: the bridge was shut down.", topic)
@@ -266,10 +266,7 @@ class RosTelemetryBase:
             try:
                 self.publish(cameras)
             except Exception as exc:  # noqa: BLE001 - whatever a device raises, the next sample is tried
-                logger.warning("%s was not told to the graph: %s", type(self).__name__, exc)
-
-    def _keep(self, command: Message) -> None:
-        self._latest.append(command)
+                logger.warning("%s was not published: %s", type(self).__name__, exc)
 
     def _poll(self) -> None:
         while not self._done.wait(min(self._period_s, threading.TIMEOUT_MAX)):
@@ -278,15 +275,17 @@ class RosTelemetryBase:
 
 
 class RosTelemetryBridge(RosTelemetryBase):
-    """Publishes joints and images through rclpy; the base of the bridges of real robots and of simulations.
+    """Bridge through rclpy, for real robots and for simulations.
 
     Args:
+        robot: see :class:`RosTelemetryBase`, as for ``enable_commands``, ``command_robot_name`` and ``joint_limits``.
         domain_id: ROS 2 domain, 0 to 232. The node has a context of its own, so no environment variable is written.
-        node_name: of the node; each subclass has its own default.
+        node_name: name of the node; each subclass has its own default.
         qos_depth: KEEP_LAST history of each endpoint, 1 to :data:`MAX_QOS_HISTORY_DEPTH`.
+        spin_period: seconds between two looks for a command, above 0.
 
     Raises:
-        ValidationError: an argument outside its domain, before anything else has happened.
+        ValidationError: an argument outside its domain, or commands on an unsecured graph; no node was made.
         RosError: no ROS 2 is sourced, or it did not start.
     """
 
@@ -299,7 +298,7 @@ class RosTelemetryBridge(RosTelemetryBase):
         domain_id: int = 0,
         node_name: str | None = None,
         qos_depth: int = 10,
-        enable_commands: bool = False,
+        enable_commands: bool = True,
         command_robot_name: str | None = None,
         spin_period: float = 0.02,
         joint_limits: dict[str, tuple[float, float]] | None = None,
@@ -316,18 +315,23 @@ class RosTelemetryBridge(RosTelemetryBase):
         depth = whole("qos_depth", qos_depth, low=1, high=MAX_QOS_HISTORY_DEPTH)
         name = checked_node_name("node_name", self.default_node_name if node_name is None else node_name)
         if self._takes_commands:
-            refuse_unsecured(self.lacking_security())
-        link = RclpyLink(self.domain_id, name=name, depth=depth)
-        try:
-            link.open()
-            self._begin(link, f"{name}-commands")
-        except BaseException:
-            link.close()
-            raise
+            refuse_unsecured(rclpy_security_gap())
+        self._begin(RclpyLink(self.domain_id, name=name, depth=depth), f"{name}-commands", open_now=True)
 
-    def lacking_security(self) -> str | None:
-        """What the graph lacks to be one whose commands are taken, a sentence; None where it is secured."""
-        return None
+
+def rclpy_security_gap() -> str | None:
+    """Return in a sentence why the graph that rclpy joins is not secured, or None: it is.
+
+    ROS 2 compares the two values letter by letter and falls back to an open graph on any other, so this does too.
+    """
+    if settings.verbatim("ROS_SECURITY_ENABLE") != "true":
+        return "ROS_SECURITY_ENABLE is not true."
+    if settings.verbatim("ROS_SECURITY_STRATEGY") != "Enforce":
+        return "ROS_SECURITY_STRATEGY is not Enforce."
+    keystore = settings.verbatim("ROS_SECURITY_KEYSTORE")
+    if not keystore or not Path(keystore).is_dir():
+        return "ROS_SECURITY_KEYSTORE names no folder."
+    return None
 
 
 def _header(frame_id: str = "") -> dict[str, Any]:

@@ -60,6 +60,16 @@ class RosLink(Protocol):
         """Leave the graph. A later use opens the link anew."""
 
 
+class BroadcastLink(RosLink, Protocol):
+    """A link that can publish without waiting for a subscription, and that can be opened ahead of its first use."""
+
+    def open(self) -> Any:
+        """Join the graph now. Raises :class:`RosError` where that fails."""
+
+    def broadcast(self, topic: str, kind: str, fields: Message) -> None:
+        """Publish, such as telemetry, whether or not there is a subscription."""
+
+
 @runtime_checkable
 class UrgentLink(Protocol):
     """A link with a second connection, for zeros alone, which the traffic of the first cannot hold up."""

@@ -31,6 +31,9 @@ class MemoryLink:
         self._watchers: dict[str, list[OnMessage]] = {}
         self._lock = threading.Lock()
 
+    def open(self) -> None:
+        """Do nothing: there is no connection."""
+
     def offer(self, service: str, answer: Callable[[Message], dict[str, Any]]) -> None:
         """Offer a service from now on."""
         self._services[service] = answer

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.base_process import base_process
+from fixtures.base_process import BaseProcess, base_process
 from fixtures.waiting import eventually
 from tests.integration.ros.conftest import obeyed
 
@@ -26,7 +26,7 @@ TWIST = "geometry_msgs/msg/Twist"
 
 
 @pytest.fixture
-def base() -> Iterator[subprocess.Popen[str]]:
+def base() -> Iterator[BaseProcess]:
     with base_process(DOMAIN) as process:
         yield process
 
@@ -70,14 +70,12 @@ def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: None, rover: Rtp
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(
-    base: subprocess.Popen[str], rover: RtpsRobot
-) -> None:
+def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(base: BaseProcess, rover: RtpsRobot) -> None:
     obeyed(rover, lambda: x_of(rover))
     began = x_of(rover)
     assert rover.start_drive(0.5, 0.0, 30.0)["status"] == "success"
     eventually(lambda: x_of(rover) > began + 0.05)
-    base.communicate(timeout=40)
+    base.end()
     eventually(lambda: rover.get_task_status()["task_status"] == "error")
     verdict = rover.halt()
     assert verdict.stopped is False

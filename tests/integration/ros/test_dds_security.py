@@ -41,15 +41,15 @@ OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 Peer = Callable[[dict[str, str] | None], Child]
 
 
-def until_heard(speaker: Child, listener: Child, fields: dict[str, Any]) -> None:
-    """A first message may go out before the far end has the keys to read it."""
-    began = len(listener.ask("heard"))
+def publish_until_received(speaker: Child, listener: Child, fields: dict[str, Any]) -> None:
+    """Publish again and again: a first message may go out before the other participant has the keys to read it."""
+    began = len(listener.ask("received"))
 
-    def heard() -> bool:
-        speaker.ask("say", CMD, TWIST, fields)
-        return len(listener.ask("heard")) > began
+    def received() -> bool:
+        speaker.ask("publish", CMD, TWIST, fields)
+        return len(listener.ask("received")) > began
 
-    eventually(heard)
+    eventually(received)
 
 
 @pytest.fixture(scope="module")
@@ -59,19 +59,19 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> DdsPki:
 
 @pytest.fixture(scope="module")
 def alice(pki: DdsPki) -> dict[str, str]:
-    """May say where to drive and listen to what she said."""
+    """May publish velocities and joint commands, and read velocities."""
     return pki.member("alice", publish=("rt/cmd_vel", "rt/my_arm/joint_command"), subscribe=("rt/cmd_vel",))
 
 
 @pytest.fixture(scope="module")
 def bob(pki: DdsPki) -> dict[str, str]:
-    """May listen to where to drive and tell where it is."""
+    """May read velocities and joint commands, and publish odometry."""
     return pki.member("bob", publish=("rt/odom_of_ours",), subscribe=("rt/cmd_vel", "rt/my_arm/joint_command"))
 
 
 @pytest.fixture(scope="module")
 def mallory(pki: DdsPki) -> dict[str, str]:
-    """Has a copy of the graph's documents and a certificate of an authority that nobody there knows."""
+    """Has a copy of the graph's documents and a certificate of an authority that is unknown there."""
     rogue = Authority(pki.folder, "rogue")
     return pki.member("alice", publish=("rt/cmd_vel",), subscribe=("rt/cmd_vel", "rt/odom_of_ours"), identities=rogue)
 
@@ -95,46 +95,46 @@ def us(pki: DdsPki) -> dict[str, str]:
     return pki.member("us", publish=("rt/cmd_vel",), subscribe=("rt/my_arm/joint_command",))
 
 
-def test_who_is_granted_a_topic_is_heard_on_it(peer: Peer, alice: dict[str, str], bob: dict[str, str]) -> None:
+def test_a_granted_topic_can_be_published(peer: Peer, alice: dict[str, str], bob: dict[str, str]) -> None:
     listener, speaker = peer(bob), peer(alice)
-    listener.ask("listen", CMD, TWIST)
-    until_heard(speaker, listener, SPEED)
-    assert listener.ask("heard")[0]["linear"]["x"] == 0.25
+    listener.ask("watch", CMD, TWIST)
+    publish_until_received(speaker, listener, SPEED)
+    assert listener.ask("received")[0]["linear"]["x"] == 0.25
 
 
-def test_who_is_not_granted_a_topic_can_neither_write_nor_read_it(
+def test_a_topic_that_is_not_granted_can_be_neither_published_nor_read(
     peer: Peer, alice: dict[str, str], bob: dict[str, str]
 ) -> None:
     speaker, listener = peer(alice), peer(bob)
     with pytest.raises(RuntimeError, match=r"/odom_of_ours cannot be published.*NOT_ALLOWED_BY_SECURITY"):
-        speaker.ask("say", ODOM, ODOMETRY, {})
+        speaker.ask("publish", ODOM, ODOMETRY, {})
     with pytest.raises(RuntimeError, match=r"/odom_of_ours cannot be read.*NOT_ALLOWED_BY_SECURITY"):
-        speaker.ask("listen", ODOM, ODOMETRY)
+        speaker.ask("watch", ODOM, ODOMETRY)
     with pytest.raises(RuntimeError, match=r"/cmd_vel cannot be published.*NOT_ALLOWED_BY_SECURITY"):
-        listener.ask("say", CMD, TWIST, SPEED)
+        listener.ask("publish", CMD, TWIST, SPEED)
 
 
-@pytest.mark.parametrize("who", ["mallory", "nobody"])
-def test_a_stranger_is_neither_heard_nor_told(
-    who: str, request: pytest.FixtureRequest, peer: Peer, alice: dict[str, str], bob: dict[str, str]
+@pytest.mark.parametrize("stranger_is", ["mallory", "without credentials"])
+def test_a_stranger_can_neither_publish_nor_read(
+    stranger_is: str, request: pytest.FixtureRequest, peer: Peer, alice: dict[str, str], bob: dict[str, str]
 ) -> None:
     listener, speaker = peer(bob), peer(alice)
-    stranger = peer(request.getfixturevalue(who) if who == "mallory" else None)
-    listener.ask("listen", CMD, TWIST)
-    until_heard(speaker, listener, SPEED)
-    # It waits for somebody to subscribe, for as long as the others took several times over.
+    stranger = peer(request.getfixturevalue("mallory") if stranger_is == "mallory" else None)
+    listener.ask("watch", CMD, TWIST)
+    publish_until_received(speaker, listener, SPEED)
+    # It waits for a subscription, several times as long as the members took.
     with pytest.raises(RuntimeError, match="Nobody subscribes to /cmd_vel"):
-        stranger.ask("say", CMD, TWIST, {"linear": {"x": 9.0}})
+        stranger.ask("publish", CMD, TWIST, {"linear": {"x": 9.0}})
     for _ in range(20):
-        stranger.ask("tell", CMD, TWIST, {"linear": {"x": 9.0}})
-    stranger.ask("listen", CMD, TWIST)
-    until_heard(speaker, listener, {"linear": {"x": 0.5}})
-    assert {each["linear"]["x"] for each in listener.ask("heard")} == {0.25, 0.5}
-    assert stranger.ask("heard") == []
+        stranger.ask("broadcast", CMD, TWIST, {"linear": {"x": 9.0}})
+    stranger.ask("watch", CMD, TWIST)
+    publish_until_received(speaker, listener, {"linear": {"x": 0.5}})
+    assert {each["linear"]["x"] for each in listener.ask("received")} == {0.25, 0.5}
+    assert stranger.ask("received") == []
 
 
 @pytest.mark.parametrize("secured", [True, False])
-def test_a_listener_on_the_wire_reads_an_unsecured_graph_and_not_a_secured_one(
+def test_a_packet_sniffer_reads_an_unsecured_graph_but_not_a_secured_one(
     secured: bool, peer: Peer, pki: DdsPki, bob: dict[str, str]
 ) -> None:
     try:
@@ -159,35 +159,35 @@ def test_a_listener_on_the_wire_reads_an_unsecured_graph_and_not_a_secured_one(
         thread = threading.Thread(target=sniff, name="sniffer")
         thread.start()
         try:
-            listener.ask("listen", ODOM, ODOMETRY)
+            listener.ask("watch", ODOM, ODOMETRY)
 
-            def told() -> bool:
-                base.ask("say", ODOM, ODOMETRY, {"child_frame_id": SECRET})
-                return len(listener.ask("heard")) >= 10
+            def received() -> bool:
+                base.ask("publish", ODOM, ODOMETRY, {"child_frame_id": SECRET})
+                return len(listener.ask("received")) >= 10
 
-            eventually(told)
+            eventually(received)
         finally:
             done.set()
             thread.join(40)
-    # Permissions are shown in the handshake, before there are keys; nothing else names the topic.
+    # The handshake shows permissions before there are keys; nothing else names the topic.
     rtps = [packet.replace(b"<topic>rt/odom_of_ours</topic>", b"") for packet in seen if b"RTPS" in packet]
     assert len(rtps) > 10
     assert any(SECRET.encode() in packet for packet in rtps) is not secured
     assert any(b"rt/odom_of_ours" in packet for packet in rtps) is not secured
 
 
-@pytest.mark.parametrize("harmed", ["governance", "permissions", "certificate", "identity_ca", "permissions_ca"])
-def test_credentials_that_do_not_hold_leave_no_participant(
-    harmed: str, peer: Peer, alice: dict[str, str], bob: dict[str, str], mallory: dict[str, str], tmp_path: Path
+@pytest.mark.parametrize("damaged", ["governance", "permissions", "certificate", "identity_ca", "permissions_ca"])
+def test_invalid_credentials_prevent_joining_the_domain(
+    damaged: str, peer: Peer, alice: dict[str, str], bob: dict[str, str], mallory: dict[str, str], tmp_path: Path
 ) -> None:
-    config = {**alice, harmed: mallory["identity_ca"]}
-    if harmed in ("governance", "permissions"):
-        document = Path(alice[harmed].removeprefix("file:")).read_bytes()
+    config = {**alice, damaged: mallory["identity_ca"]}
+    if damaged in ("governance", "permissions"):
+        document = Path(alice[damaged].removeprefix("file:")).read_bytes()
         tampered = tmp_path / "tampered"
         tampered.write_bytes(document.replace(b"true", b"false").replace(b"rt/cmd_vel", b"*"))
-        config[harmed] = str(tampered)
-    if harmed == "certificate":
-        # Another member's, whom these permissions do not name.
+        config[damaged] = str(tampered)
+    if damaged == "certificate":
+        # The certificate of another member, which these permissions do not name.
         config |= {key: bob[key] for key in ("certificate", "private_key")}
     member = peer(config)
     for _ in range(2):
@@ -207,32 +207,32 @@ def test_a_process_presents_one_set_of_credentials_in_a_domain(us: dict[str, str
         again.close()
 
 
-def test_credentials_may_be_given_as_data(alice: dict[str, str], peer: Peer, bob: dict[str, str]) -> None:
-    given = {key: f"data:,{Path(value.removeprefix('file:')).read_text()}" for key, value in alice.items()}
-    listener, speaker = peer(bob), peer(given)
-    listener.ask("listen", CMD, TWIST)
-    until_heard(speaker, listener, SPEED)
+def test_credentials_may_be_data_uris(alice: dict[str, str], peer: Peer, bob: dict[str, str]) -> None:
+    as_data = {key: f"data:,{Path(value.removeprefix('file:')).read_text()}" for key, value in alice.items()}
+    listener, speaker = peer(bob), peer(as_data)
+    listener.ask("watch", CMD, TWIST)
+    publish_until_received(speaker, listener, SPEED)
 
 
 def test_a_base_on_a_secured_graph_is_driven_and_stopped(peer: Peer, us: dict[str, str], bob: dict[str, str]) -> None:
     base = peer(bob)
-    base.ask("listen", CMD, TWIST)
+    base.ask("watch", CMD, TWIST)
     rover = RtpsRobot("rover", CMD, domain_id=DOMAIN, publish_rate=20, command_gate=OPEN, dds_security_config=us)
     try:
         assert rover.advertise()["status"] == "success"
 
         def driven() -> bool:
             rover.drive(0.3, 0.0, duration=0.2)
-            return any(each["linear"]["x"] == 0.3 for each in base.ask("heard"))
+            return any(each["linear"]["x"] == 0.3 for each in base.ask("received"))
 
         eventually(driven)
         assert rover.stop()["status"] == "success"
-        eventually(lambda: base.ask("heard")[-1]["linear"]["x"] == 0.0)
+        eventually(lambda: base.ask("received")[-1]["linear"]["x"] == 0.0)
     finally:
         rover.disconnect()
 
 
-def test_an_arm_on_a_secured_graph_takes_commands_of_members_only(
+def test_an_arm_on_a_secured_graph_takes_commands_from_members_only(
     peer: Peer, us: dict[str, str], alice: dict[str, str]
 ) -> None:
     arm = TakingArm()
@@ -240,15 +240,15 @@ def test_an_arm_on_a_secured_graph_takes_commands_of_members_only(
     bridge = HardwareRtpsBridge(arm, domain_id=DOMAIN, poll_period=0.005, dds_security_config=us)
     try:
         with pytest.raises(RuntimeError, match="Nobody subscribes"):
-            peer(None).ask("say", ARM, JOINTS, {"name": ["a.pos"], "position": [9.0]})
+            peer(None).ask("publish", ARM, JOINTS, {"name": ["a.pos"], "position": [9.0]})
         member = peer(alice)
-        eventually(lambda: member.ask("say", ARM, JOINTS, command) or arm.taken)
+        eventually(lambda: member.ask("publish", ARM, JOINTS, command) or arm.taken)
         assert all(each == {"a.pos": 0.5} for each in arm.taken)
     finally:
         bridge.shutdown()
 
 
-def test_an_arm_whose_permissions_do_not_grant_the_command_topic_is_not_put_on_the_graph(us: dict[str, str]) -> None:
+def test_bridge_without_permission_for_its_command_topic_is_refused(us: dict[str, str]) -> None:
     before = set(threading.enumerate())
     with pytest.raises(RosError, match="/another/joint_command cannot be read"):
         HardwareRtpsBridge(TakingArm(), domain_id=DOMAIN, command_robot_name="another", dds_security_config=us)
@@ -264,13 +264,15 @@ def test_an_arm_whose_permissions_do_not_grant_the_command_topic_is_not_put_on_t
         (governance(DOMAIN + 1), f"no rule for domain {DOMAIN}"),
     ],
 )
-def test_commands_are_refused_where_the_governance_leaves_them_open(pki: DdsPki, laws: str, open_because: str) -> None:
+def test_bridge_is_refused_where_the_governance_leaves_its_command_topic_open(
+    pki: DdsPki, laws: str, open_because: str
+) -> None:
     config = pki.member("lax", subscribe=("rt/my_arm/joint_command",), laws=laws)
     with pytest.raises(ValidationError, match=open_because):
         HardwareRtpsBridge(TakingArm(), domain_id=DOMAIN, dds_security_config=config)
 
 
-def test_the_keys_of_the_documentation_secure_an_arm(tmp_path: Path) -> None:
+def test_the_documented_key_script_secures_an_arm(tmp_path: Path) -> None:
     for member in ("arm", "controller"):
         subprocess.run([ROOT / "examples/dds_security/make-keys.sh", tmp_path, member], check=True)
 
@@ -285,10 +287,10 @@ def test_the_keys_of_the_documentation_secure_an_arm(tmp_path: Path) -> None:
     command = {"name": ["a.pos"], "position": [0.5]}
     try:
         with Child("fixtures.dds_member", {"domain_id": 0, "security": config("controller")}) as controller:
-            eventually(lambda: controller.ask("say", "/arm/joint_command", JOINTS, command) or arm.taken)
-            controller.ask("listen", "/arm/joint_states", JOINTS)
-            eventually(lambda: bridge.publish_joint_states("arm", ["a.pos"], [0.5]) or controller.ask("heard"))
+            eventually(lambda: controller.ask("publish", "/arm/joint_command", JOINTS, command) or arm.taken)
+            controller.ask("watch", "/arm/joint_states", JOINTS)
+            eventually(lambda: bridge.publish_joint_states("arm", ["a.pos"], [0.5]) or controller.ask("received"))
             with pytest.raises(RuntimeError, match="NOT_ALLOWED_BY_SECURITY"):
-                controller.ask("say", "/arm/joint_states", JOINTS, command)
+                controller.ask("publish", "/arm/joint_states", JOINTS, command)
     finally:
         bridge.shutdown()

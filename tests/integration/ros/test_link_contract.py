@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from fixtures import rclpy_stand_in
-from fixtures.nav2_process import nav2
+from fixtures.base_process import nav2
 from fixtures.waiting import eventually
 
 from strands_robots.ros.dds import DdsLink

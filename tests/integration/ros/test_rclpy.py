@@ -14,9 +14,8 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from fixtures import rclpy_stand_in
-from fixtures.base_process import base_process
+from fixtures.base_process import base_process, nav2
 from fixtures.dds_nav2 import RELIABLE, Service
-from fixtures.nav2_process import nav2
 from fixtures.rclpy_stand_in.idl import SERVICES, ServoCtrlMsg
 from fixtures.waiting import eventually
 
@@ -174,7 +173,7 @@ def test_a_graph_is_looked_at_read_and_asked_through_ros_action(sourced: None, m
 
 @pytest.fixture
 def car() -> Iterator[list[Any]]:
-    """A DeepRacer's graph on plain DDS: it notes each service that it was asked, and each servo message."""
+    """A DeepRacer's graph on plain DDS: it notes each service request and each servo message."""
     confine(domain, DOMAIN)
     participant = DomainParticipant(DOMAIN)
     asked: list[Any] = []
@@ -188,7 +187,7 @@ def car() -> Iterator[list[Any]]:
     def serve() -> None:
         while not done.wait(0.002):
             for name, service in services.items():
-                for request in service.asked():
+                for request in service.requests():
                     asked.append(name)
                     service.answer(request, error=0)
             told = [each for each in servo.take(N=100) if each.sample_info.valid_data]
