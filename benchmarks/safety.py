@@ -239,7 +239,7 @@ def _crowds(transport: str, url: str, name: str, stops: int) -> Iterator[Row]:
         yield row(f"{name}: {what}, the last one still", ours, bare, bound)
     with Fleet("ours", transport, url, 1, 32, {"STRANDS_DC_STREAM_HZ": "50"}) as fleet:
         told = fleet.stops(stops).text()
-    yield Row(f"{name}: 32 robots in one process, each telling 50 steps a second", told, "", None, "", ok=True)
+    yield Row(f"{name}: 32 robots in one process, each publishing 50 steps a second", told, "", None, "", ok=True)
 
 
 def _held_up(transport: str, url: str, name: str, stops: int) -> Iterator[Row]:
