@@ -11,7 +11,7 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout, RolloutObservers
-from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, Waiting
+from strands_robots.safety.gate import MotionGate, Permit, Waiting, answered
 from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
 
@@ -40,6 +40,7 @@ class TeleopMixin:
     def occupied(self, robot: str) -> str:
         """Return the task that drives the body of that name, for a refusal; empty when none does."""
 
+    @answered
     def attach_teleop(
         self,
         leader: Any,
@@ -63,18 +64,15 @@ class TeleopMixin:
         reason = teleoperator_contract_error(leader)
         if reason is not None:
             return error(reason)
-        try:
-            robot = self.body(robot_name).name
-            policy = partial(
-                LeaderPolicy,
-                leader,
-                device=identifier("name", name),
-                method=choice("method", method, METHODS),
-                keys=dict(keys or {}),
-                max_speed=number("max_speed", max_speed, above=0, high=20),
-            )
-        except ValidationError as exc:
-            return error(str(exc))
+        robot = self.body(robot_name).name
+        policy = partial(
+            LeaderPolicy,
+            leader,
+            device=identifier("name", name),
+            method=choice("method", method, METHODS),
+            keys=dict(keys or {}),
+            max_speed=number("max_speed", max_speed, above=0, high=20),
+        )
         with self.starting:
             if name in self.teleoperating():
                 return error(
@@ -83,6 +81,7 @@ class TeleopMixin:
             self._teleop_leaders[name] = (robot, policy)
         return success(f"{name} will lead {robot}.", name=name, robot=robot)
 
+    @answered
     def teleoperate(
         self,
         name: str = "leader",
@@ -98,18 +97,13 @@ class TeleopMixin:
             hz: frames a second, 1 to 1000.
             publish: also carry the leader's frames on the network.
         """
-        try:
-            seconds = None if duration is None else number("duration", duration, above=0, high=3600)
-            rate = number("hz", hz, low=1, high=1000)
-            sink = self._teleop_sink(flag("publish", publish))
-            permit = self.gate.permit("teleoperate")
-            with self._teleop_waiting.until_begun(permit, identifier("name", name)), self.starting:
-                permit.check()
-                session = self._lead(name, seconds, rate, sink, permit)
-        except MotionRefused as refused:
-            return refused.envelope
-        except ValidationError as exc:
-            return error(str(exc))
+        seconds = None if duration is None else number("duration", duration, above=0, high=3600)
+        rate = number("hz", hz, low=1, high=1000)
+        sink = self._teleop_sink(flag("publish", publish))
+        permit = self.gate.permit("teleoperate")
+        with self._teleop_waiting.until_begun(permit, identifier("name", name)), self.starting:
+            permit.check()
+            session = self._lead(name, seconds, rate, sink, permit)
         return success(f"{name} leads {session.robot}.", name=name, robot=session.robot, hz=rate)
 
     def stop_teleoperate(self, name: str | None = None, timeout: float = STOP_JOIN_S) -> Envelope:

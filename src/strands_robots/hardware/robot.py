@@ -22,13 +22,13 @@ from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
 from strands_robots.recording.cameras import LazyFrames
-from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, PermitVoidError, Waiting
+from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, PermitVoidError, Waiting, answered
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.safety.stopping import stop_level as configured_level
 from strands_robots.teleop_mixin import TeleopMixin
-from strands_robots.utils import MissingExtraError, ValidationError, choice, number, text
+from strands_robots.utils import ValidationError, choice, number, text
 
 logger = logging.getLogger(__name__)
 
@@ -209,6 +209,7 @@ class HardwareRobot(TeleopMixin):
         """Tell ``observer`` of every task event until the returned callable is called."""
         return self.observers.subscribe(observer)
 
+    @answered
     def start_task(
         self,
         instruction: str,
@@ -228,8 +229,6 @@ class HardwareRobot(TeleopMixin):
                 and ``n_steps`` (actions after which it ends).
         """
         task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
-        if isinstance(task, dict):
-            return task
         return success(
             f"{self.tool_name_str} started: {task.instruction}",
             task_status="running",
@@ -238,6 +237,7 @@ class HardwareRobot(TeleopMixin):
             duration=task.duration,
         )
 
+    @answered
     def run_task(
         self,
         instruction: str,
@@ -248,8 +248,6 @@ class HardwareRobot(TeleopMixin):
     ) -> Envelope:
         """The same, but wait for the end; an error when the policy failed or did not end in its time."""
         task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
-        if isinstance(task, dict):
-            return task
         if not task.join((task.duration or 0.0) + WIND_DOWN_S):
             task.request_stop()
             return error(f"The task was still running {WIND_DOWN_S:g} s after its time.", **self._task_fields())
@@ -359,15 +357,7 @@ class HardwareRobot(TeleopMixin):
             ends["task"] = partial(task.ended_by, deadline)
         return ends | self.teleop_stops(deadline)
 
-    def _start(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout | Envelope:
-        try:
-            return self._begin(instruction, provider, duration, options)
-        except MotionRefused as refused:
-            return refused.envelope
-        except (ValidationError, MissingExtraError) as exc:
-            return error(str(exc))
-
-    def _begin(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
+    def _start(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
         chosen = rollout_options(instruction, duration, options, self.control_hz)
         name = resolve_provider(provider)
         # Before the line for the robot: a stop that comes while this waits, connects or loads is newer.

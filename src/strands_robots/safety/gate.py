@@ -8,13 +8,17 @@ action reaches the device. Revoking is one assignment: it takes no lock and cann
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from itertools import count
-from typing import Protocol
+from typing import ParamSpec, Protocol
 
 from strands_robots.envelope import Envelope, error
+from strands_robots.utils import MissingExtraError, ValidationError
+
+P = ParamSpec("P")
 
 
 class Latch(Protocol):
@@ -34,6 +38,23 @@ class MotionRefused(RuntimeError):  # noqa: N818 - a refusal, not a fault
 
 class PermitVoidError(RuntimeError):
     """The permit was void when the write came: the motion was stopped in between, and nothing was written."""
+
+
+def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
+    """Answer a refusal that ``verb`` raises with its envelope."""
+
+    @functools.wraps(verb)
+    def answering(*args: P.args, **kwargs: P.kwargs) -> Envelope:
+        try:
+            return verb(*args, **kwargs)
+        except MotionRefused as refused:
+            return refused.envelope
+        except PermitVoidError as void:
+            return error(f"{verb.__name__} was overtaken by a stop: {void}.")
+        except (ValidationError, MissingExtraError) as refused:
+            return error(str(refused))
+
+    return answering
 
 
 class Asked:

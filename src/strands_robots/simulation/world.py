@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import threading
 import time
@@ -10,14 +9,14 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, ParamSpec
+from typing import Any, Literal
 
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies import create_policy
 from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options
-from strands_robots.safety.gate import MotionGate, MotionRefused, PermitVoidError, Waiting
+from strands_robots.safety.gate import MotionGate, Waiting, answered
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.simulation import projection
 from strands_robots.simulation.body import RobotBody
@@ -37,7 +36,7 @@ from strands_robots.simulation.rendering import (
 )
 from strands_robots.simulation.stage import compile_stage
 from strands_robots.teleop_mixin import TeleopMixin
-from strands_robots.utils import MissingExtraError, ValidationError, flag, identifier, shown, text, whole
+from strands_robots.utils import ValidationError, flag, identifier, shown, text, whole
 
 logger = logging.getLogger(__name__)
 
@@ -46,23 +45,6 @@ STEPS_MAX = 1_000_000
 
 TEARDOWN_S = 5.0
 """How much longer than its duration :meth:`Simulation.run_policy` waits for a rollout to end."""
-
-P = ParamSpec("P")
-
-
-def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
-    """Turn a refusal that ``verb`` raises into an envelope."""
-
-    @functools.wraps(verb)
-    def answering(*args: P.args, **kwargs: P.kwargs) -> Envelope:
-        try:
-            return verb(*args, **kwargs)
-        except ValidationError as refused:
-            return error(str(refused))
-        except MotionRefused as refused:
-            return refused.envelope
-
-    return answering
 
 
 class _CleanedUp:
@@ -337,10 +319,7 @@ class Simulation(TeleopMixin):
         permit = self.gate.permit("send_action")
         with self._waiting.until_begun(permit, body.name):
             self._require_undriven(body.name)
-            try:
-                sent = body.send_action(action, permit)
-            except PermitVoidError as void:
-                raise ValidationError(f"send_action was overtaken by a stop: {void}.") from None
+            sent = body.send_action(action, permit)
         return success(f"Sent {len(sent)} targets to {body.name}.", robot=body.name, sent=sent)
 
     @answered
@@ -531,10 +510,7 @@ class Simulation(TeleopMixin):
         chosen = rollout_options(instruction, duration, options, settings.number("STRANDS_CONTROL_HZ"))
         permit = self.gate.permit("start_policy")
         with self._waiting.until_begun(permit, self.body(robot_name).name):
-            try:
-                policy = create_policy(provider, **options)
-            except MissingExtraError as missing:
-                raise ValidationError(str(missing)) from missing
+            policy = create_policy(provider, **options)
             with self.starting:
                 self._require_open()
                 body = self.body(robot_name)
