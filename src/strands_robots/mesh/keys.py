@@ -17,7 +17,8 @@ from typing import Any
 from strands_robots.mesh import topics
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.transport.zenoh_config import MESSAGES, TlsCredentials
-from strands_robots.utils import ValidationError, missing_extra, text, whole
+from strands_robots.mesh.wire_identity import cryptography
+from strands_robots.utils import ValidationError, text, whole
 
 AUTHORITY_DAYS = 3650
 PEER_DAYS = 397
@@ -32,19 +33,20 @@ def init(folder: Path, name: str = "strands-robots mesh", days: int = AUTHORITY_
         ValidationError: a blank name, or ``days`` not from 1 to 36500.
         FileExistsError: there is an authority in ``folder`` already.
     """
-    x509, hashes, serialization, ec = _cryptography()
+    modules = cryptography()
+    x509 = modules.x509
     text("name", name, longest=64)
-    key = ec.generate_private_key(ec.SECP256R1())
+    key = modules.ec.generate_private_key(modules.ec.SECP256R1())
     subject = _subject(name)
     certificate = (
         _builder(subject, subject, key.public_key(), whole("days", days, low=1, high=36_500))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(authority=True), critical=True)
-        .sign(key, hashes.SHA256())
+        .sign(key, modules.hashes.SHA256())
     )
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     _write(folder / CA_KEY, _pem(key), 0o600)
-    _write(folder / CA_CERT, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    _write(folder / CA_CERT, certificate.public_bytes(modules.serialization.Encoding.PEM), 0o644)
     return folder / CA_CERT
 
 
@@ -56,13 +58,14 @@ def issue(folder: Path, peer_id: str, hosts: Sequence[str] = (), days: int = PEE
         FileNotFoundError: there is no authority in ``folder``.
         FileExistsError: this peer has a certificate already.
     """
-    x509, hashes, serialization, ec = _cryptography()
+    modules = cryptography()
+    x509 = modules.x509
     name = validate_peer_id(peer_id)
     if len(name) > 64:
         raise ValidationError(f"peer_id must have at most 64 characters to stand in a certificate, not {len(name)}.")
     authority = x509.load_pem_x509_certificate((folder / CA_CERT).read_bytes())
-    signing: Any = serialization.load_pem_private_key((folder / CA_KEY).read_bytes(), None)
-    key = ec.generate_private_key(ec.SECP256R1())
+    signing: Any = modules.serialization.load_pem_private_key((folder / CA_KEY).read_bytes(), None)
+    key = modules.ec.generate_private_key(modules.ec.SECP256R1())
     usages = [x509.ExtendedKeyUsageOID.SERVER_AUTH, x509.ExtendedKeyUsageOID.CLIENT_AUTH]
     alternatives = [_alternative(host) for host in (*LOOPBACK_HOSTS, *(text("host", h, longest=253) for h in hosts))]
     certificate = (
@@ -71,11 +74,11 @@ def issue(folder: Path, peer_id: str, hosts: Sequence[str] = (), days: int = PEE
         .add_extension(_usage(authority=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
         .add_extension(x509.SubjectAlternativeName(alternatives), critical=False)
-        .sign(signing, hashes.SHA256())
+        .sign(signing, modules.hashes.SHA256())
     )
     issued = TlsCredentials(folder / CA_CERT, folder / f"{name}.pem", folder / f"{name}.key")
     _write(issued.key, _pem(key), 0o600)
-    _write(issued.cert, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    _write(issued.cert, certificate.public_bytes(modules.serialization.Encoding.PEM), 0o644)
     return issued
 
 
@@ -132,23 +135,13 @@ def _rule(name: str, messages: list[str], flows: list[str], keys: list[str]) -> 
     return {"id": name, "permission": "allow", "messages": messages, "flows": flows, "key_exprs": keys}
 
 
-def _cryptography() -> tuple[Any, Any, Any, Any]:
-    try:
-        from cryptography import x509  # noqa: PLC0415 - optional, loaded when used
-        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415 - optional, loaded when used
-        from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - optional, loaded when used
-    except ImportError:
-        raise missing_extra("Making certificates", "mesh") from None
-    return x509, hashes, serialization, ec
-
-
 def _subject(name: str) -> Any:
-    x509, *_ = _cryptography()
+    x509 = cryptography().x509
     return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
 
 
 def _alternative(host: str) -> Any:
-    x509, *_ = _cryptography()
+    x509 = cryptography().x509
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
@@ -156,7 +149,7 @@ def _alternative(host: str) -> Any:
 
 
 def _builder(subject: Any, issuer: Any, public: Any, days: int) -> Any:
-    x509, *_ = _cryptography()
+    x509 = cryptography().x509
     now = datetime.datetime.now(datetime.UTC)
     return (
         x509.CertificateBuilder()
@@ -172,7 +165,7 @@ def _builder(subject: Any, issuer: Any, public: Any, days: int) -> Any:
 
 
 def _usage(*, authority: bool) -> Any:
-    x509, *_ = _cryptography()
+    x509 = cryptography().x509
     return x509.KeyUsage(
         digital_signature=True,
         content_commitment=False,
@@ -187,7 +180,7 @@ def _usage(*, authority: bool) -> Any:
 
 
 def _pem(key: Any) -> bytes:
-    _, _, serialization, _ = _cryptography()
+    serialization = cryptography().serialization
     pem: bytes = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )

@@ -287,10 +287,7 @@ class FleetSafety:
         issued = order.issued if order.issued is not None else context.clock()
         counts = {**counts, "lockout_engaged": True}
         notice = wire.EstopNotice(context.peer_id, issued, order.epoch, context.session_id(), counts)
-        try:
-            context.put(topics.estop(), notice.to_wire())
-        except (TransportError, wire.WireError) as exc:
-            logger.critical("Emergency stop %s was not published: %s", order.epoch, exc)
+        self._publish(topics.estop(), notice.to_wire(), f"Emergency stop {order.epoch}", logging.CRITICAL)
 
     # Receiving.
 
@@ -339,10 +336,13 @@ class FleetSafety:
             "reason": event,
             "estop_id": epoch,
         }
+        self._publish(topics.safety_event(context.peer_id), body, "The safety event", logging.WARNING)
+
+    def _publish(self, key: str, body: dict[str, Any], subject: str, level: int) -> None:
         try:
-            context.put(topics.safety_event(context.peer_id), body)
+            self._context.put(key, body)
         except (TransportError, wire.WireError) as exc:
-            logger.warning("The safety event was not published: %s", exc)
+            logger.log(level, "%s was not published: %s", subject, exc)
 
     # Resume.
 
@@ -424,10 +424,7 @@ class FleetSafety:
     def _relay(self, assertion: Any) -> None:
         context = self._context
         relay = wire.ResumeRelay(context.peer_id, context.clock(), assertion, context.session_id())
-        try:
-            context.put(topics.resume(), relay.to_wire())
-        except (TransportError, wire.WireError) as exc:
-            logger.error("A resume was not relayed: %s", exc)  # noqa: TRY400 - one sentence, no trace
+        self._publish(topics.resume(), relay.to_wire(), "A resume", logging.ERROR)
 
     def _denied(self, why: str) -> dict[str, Any]:
         self._context.audit("resume_denied", reason=why)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.resume import is_epoch
 from strands_robots.utils import ValidationError, identifier, shown
 
 FRESH_S = 60.0
@@ -60,11 +61,6 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise WireError(f"not an object but a {type(value).__name__}")
     return value
-
-
-def canonical(value: object) -> bytes:
-    """Return sorted compact JSON: the bytes that signatures cover."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def finite(value: object) -> float | None:
@@ -214,7 +210,7 @@ class EstopNotice:
         return cls(
             issuer,
             _time(body, "t"),
-            epoch if isinstance(epoch, str) and is_hex(epoch, 32) else None,
+            epoch if is_epoch(epoch) else None,
             zid if isinstance(zid, str) else None,
         )
 
@@ -242,11 +238,6 @@ class ResumeRelay:
             body.get("assertion"),
             zid if isinstance(zid, str) else None,
         )
-
-
-def is_hex(text: str, length: int) -> bool:
-    """True for lower-case hexadecimal of exactly ``length`` digits."""
-    return len(text) == length and all(c in "0123456789abcdef" for c in text)
 
 
 def _identifier(body: Mapping[str, Any], name: str) -> str:

@@ -19,12 +19,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
 from strands_robots.mesh.transport.zenoh_config import TlsCredentials
+from strands_robots.safety.ed25519 import canonical
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
 
 if TYPE_CHECKING:
@@ -65,7 +67,7 @@ class Signer:
     """
 
     def __init__(self, cert: Path, key: Path, clock: Callable[[], float] = time.time) -> None:
-        x509, serialization = _cryptography()
+        x509, serialization = cryptography().x509, cryptography().serialization
         certificate = x509.load_pem_x509_certificate(cert.read_bytes())
         self._key: Any = serialization.load_pem_private_key(key.read_bytes(), None)
         if self._key.public_key() != certificate.public_key():
@@ -83,7 +85,7 @@ class Signer:
         """Return ``body`` with its ``sig``."""
         bare = {key: value for key, value in body.items() if key != "sig"}
         head = {"v": VERSION, "alg": self._algorithm, "t": self._clock(), "nonce": secrets.token_hex(16)}
-        signature = _make(self._key, self._algorithm, _signed_bytes(bare, head, self._digest))
+        signature = self._key.sign(_signed_bytes(bare, head, self._digest), *_parameters(self._algorithm))
         encoded = base64.urlsafe_b64encode(signature).decode().rstrip("=")
         return {**bare, "sig": {**head, "cert": self._encoded, "sig": encoded}}
 
@@ -103,8 +105,7 @@ class Verifier:
         clock: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        x509, _ = _cryptography()
-        self._roots: list[Any] = list(x509.load_pem_x509_certificates(roots)) if roots.strip() else []
+        self._roots: list[Any] = list(cryptography().x509.load_pem_x509_certificates(roots)) if roots.strip() else []
         self._clock = clock
         self._monotonic = monotonic
         self._used: dict[tuple[str, str], float] = {}
@@ -137,7 +138,10 @@ class Verifier:
             covered = _signed_bytes(bare, head, digest)
         except (ValueError, TypeError, RecursionError):
             raise IdentityError("the message has no canonical form") from None
-        _check(public, sig["alg"], signature, covered)
+        try:
+            public.verify(signature, covered, *_parameters(sig["alg"]))
+        except cryptography().exceptions.InvalidSignature:
+            raise IdentityError("the signature does not fit the message") from None
         self._use(digest, sig["nonce"])
         return Verified(digest, name)
 
@@ -237,13 +241,21 @@ def _unknown_policy(stated: str) -> str:
     return "1"
 
 
-def _cryptography() -> tuple[Any, Any]:
+@lru_cache(maxsize=1)
+def cryptography() -> SimpleNamespace:
+    """Load the parts of the ``cryptography`` package that certificates and signatures need.
+
+    Raises:
+        MissingExtraError: the package is not installed.
+    """
     try:
-        from cryptography import x509  # noqa: PLC0415 - optional, loaded when used
-        from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - optional, loaded when used
+        from cryptography import exceptions, x509  # noqa: PLC0415 - optional, loaded when used
+        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415 - as above
+        from cryptography.hazmat.primitives.asymmetric import ec, ed25519, padding, rsa  # noqa: PLC0415 - as above
     except ImportError:
-        raise missing_extra("A signed identity", "mesh") from None
-    return x509, serialization
+        raise missing_extra("A certificate of the mesh", "mesh") from None
+    modules = (exceptions, x509, hashes, serialization, ec, ed25519, padding, rsa)
+    return SimpleNamespace(**{module.__name__.rpartition(".")[2]: module for module in modules})
 
 
 def _shape(sig: object) -> dict[str, Any]:
@@ -271,9 +283,8 @@ def _decode(text: object, most: int, *, url: bool = False) -> bytes:
 
 
 def _parse(der: bytes) -> Any:
-    x509, _ = _cryptography()
     try:
-        certificate = x509.load_der_x509_certificate(der)
+        certificate = cryptography().x509.load_der_x509_certificate(der)
         # The parser reads some parts lazily and finds them broken only then.
         certificate.public_key()
         certificate.subject, certificate.issuer, certificate.extensions  # noqa: B018 - parsed, not used
@@ -283,8 +294,7 @@ def _parse(der: bytes) -> Any:
 
 
 def _common_name(certificate: x509.Certificate) -> str:
-    x509, _ = _cryptography()
-    names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
+    names = certificate.subject.get_attributes_for_oid(cryptography().x509.NameOID.COMMON_NAME)
     if len(names) != 1:
         raise IdentityError("the certificate must have exactly one common name")
     try:
@@ -294,52 +304,27 @@ def _common_name(certificate: x509.Certificate) -> str:
 
 
 def _algorithm_of(public: Any) -> str:
-    from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa  # noqa: PLC0415 - optional, loaded when used
-
-    if isinstance(public, ed25519.Ed25519PublicKey):
+    modules = cryptography()
+    if isinstance(public, modules.ed25519.Ed25519PublicKey):
         return "ed25519"
-    if isinstance(public, ec.EllipticCurvePublicKey):
+    if isinstance(public, modules.ec.EllipticCurvePublicKey):
         return "ecdsa-sha256"
-    if isinstance(public, rsa.RSAPublicKey):
+    if isinstance(public, modules.rsa.RSAPublicKey):
         return "rsa-pss-sha256"
     raise IdentityError("the certificate's key is of no known kind")
 
 
 def _signed_bytes(body: Mapping[str, Any], head: Mapping[str, Any], digest: str) -> bytes:
-    return wire.canonical({"body": body, "sig": {**head, "cert_sha256": digest}})
+    return canonical({"body": body, "sig": {**head, "cert_sha256": digest}})
 
 
-def _make(key: Any, algorithm: str, message: bytes) -> bytes:
-    from cryptography.hazmat.primitives import hashes  # noqa: PLC0415 - optional, loaded when used
-    from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - optional, loaded when used
-
+@lru_cache(maxsize=len(ALGORITHMS))
+def _parameters(algorithm: str) -> tuple[Any, ...]:
+    """Return the arguments besides the message that signing and verifying take."""
+    modules = cryptography()
+    sha256 = modules.hashes.SHA256()
     if algorithm == "ed25519":
-        signature: bytes = key.sign(message)
-    elif algorithm == "ecdsa-sha256":
-        signature = key.sign(message, ec.ECDSA(hashes.SHA256()))
-    else:
-        signature = key.sign(message, _pss(), hashes.SHA256())
-    return signature
-
-
-def _check(public: Any, algorithm: str, signature: bytes, message: bytes) -> None:
-    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - optional, loaded when used
-    from cryptography.hazmat.primitives import hashes  # noqa: PLC0415 - optional, loaded when used
-    from cryptography.hazmat.primitives.asymmetric import ec  # noqa: PLC0415 - optional, loaded when used
-
-    try:
-        if algorithm == "ed25519":
-            public.verify(signature, message)
-        elif algorithm == "ecdsa-sha256":
-            public.verify(signature, message, ec.ECDSA(hashes.SHA256()))
-        else:
-            public.verify(signature, message, _pss(), hashes.SHA256())
-    except InvalidSignature:
-        raise IdentityError("the signature does not fit the message") from None
-
-
-def _pss() -> Any:
-    from cryptography.hazmat.primitives import hashes  # noqa: PLC0415 - optional, loaded when used
-    from cryptography.hazmat.primitives.asymmetric import padding  # noqa: PLC0415 - optional, loaded when used
-
-    return padding.PSS(mgf=padding.MGF1(hashes.SHA256()), salt_length=SALT_BYTES)
+        return ()
+    if algorithm == "ecdsa-sha256":
+        return (modules.ec.ECDSA(sha256),)
+    return (modules.padding.PSS(mgf=modules.padding.MGF1(sha256), salt_length=SALT_BYTES), sha256)

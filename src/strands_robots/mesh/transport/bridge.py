@@ -22,6 +22,7 @@ from strands_robots.mesh.transport import (
     Transport,
     TransportError,
 )
+from strands_robots.mesh.transport.factory import make_transport
 
 logger = logging.getLogger(__name__)
 
@@ -141,8 +142,8 @@ class BridgeTransport:
     """The broker's policy keeps a peer to topics of its own name."""
 
     def __init__(self, local: Transport | None = None, cloud: Transport | None = None) -> None:
-        self._local = local or _zenoh()
-        self._cloud = cloud or _iot()
+        self._local = local or make_transport("zenoh")
+        self._cloud = cloud or make_transport("iot")
         self._seen = SeenCommands()
         self._local_peers = LocalPeers()
         self._bridged = _bridged_names()
@@ -373,15 +374,3 @@ def _try(verb: Callable[..., Any], *args: Any) -> str | None:
     except (TransportError, ImportError) as exc:
         return str(exc)
     return None
-
-
-def _zenoh() -> Transport:
-    from strands_robots.mesh.transport.zenoh import ZenohTransport  # noqa: PLC0415 - loaded when it is a leg
-
-    return ZenohTransport()
-
-
-def _iot() -> Transport:
-    from strands_robots.mesh.transport.iot import IotMqttTransport  # noqa: PLC0415 - loaded when it is a leg
-
-    return IotMqttTransport()

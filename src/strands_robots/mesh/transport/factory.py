@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from strands_robots import settings
-from strands_robots.mesh.transport import Transport, TransportError
+from strands_robots.mesh import transport
 
-BACKENDS = ("zenoh", "iot", "bridge", "memory")
+CLASSES = {
+    "zenoh": "ZenohTransport",
+    "iot": "IotMqttTransport",
+    "bridge": "BridgeTransport",
+    "memory": "MemoryTransport",
+}
+"""The class of each backend; it is loaded when it is used."""
 
 
-def make_transport(backend: str | None = None) -> Transport:
+def make_transport(backend: str | None = None) -> transport.Transport:
     """Return a transport, not yet connected.
 
     Raises:
@@ -16,20 +22,7 @@ def make_transport(backend: str | None = None) -> Transport:
         MissingExtraError: its extra is not installed.
     """
     name = (backend or settings.raw("STRANDS_MESH_BACKEND")).lower()
-    if name == "zenoh":
-        from strands_robots.mesh.transport.zenoh import ZenohTransport  # noqa: PLC0415 - each backend loads alone
-
-        return ZenohTransport()
-    if name == "memory":
-        from strands_robots.mesh.transport.memory import SHARED, MemoryTransport  # noqa: PLC0415 - likewise
-
-        return MemoryTransport(SHARED)
-    if name == "iot":
-        from strands_robots.mesh.transport.iot import IotMqttTransport  # noqa: PLC0415 - likewise
-
-        return IotMqttTransport()
-    if name == "bridge":
-        from strands_robots.mesh.transport.bridge import BridgeTransport  # noqa: PLC0415 - likewise
-
-        return BridgeTransport()
-    raise TransportError(f"STRANDS_MESH_BACKEND must be one of {', '.join(BACKENDS)}, not {name!r}.")
+    if name not in CLASSES:
+        raise transport.TransportError(f"STRANDS_MESH_BACKEND must be one of {', '.join(CLASSES)}, not {name!r}.")
+    made: transport.Transport = getattr(transport, CLASSES[name])()
+    return made

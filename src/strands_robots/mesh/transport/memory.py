@@ -99,17 +99,21 @@ class MemoryBus:
                     watcher.on_token(token.key, alive)
 
 
+SHARED = MemoryBus()
+"""The bus of ``STRANDS_MESH_BACKEND=memory``."""
+
+
 class MemoryTransport:
     """One session on a :class:`MemoryBus`.
 
     Args:
-        bus: shared by all sessions that receive each other's messages.
+        bus: shared by all sessions that receive each other's messages; the process's own by default.
         session: its id, random by default.
         sessionless: publish without a session, as MQTT does.
     """
 
-    def __init__(self, bus: MemoryBus, session: str | None = None, *, sessionless: bool = False) -> None:
-        self.bus = bus
+    def __init__(self, bus: MemoryBus | None = None, session: str | None = None, *, sessionless: bool = False) -> None:
+        self.bus = bus or SHARED
         self._id = session or secrets.token_hex(16)
         self._sessionless = sessionless
         self._open = False
@@ -150,7 +154,3 @@ class MemoryTransport:
     def _require_open(self) -> None:
         if not self._open:
             raise TransportError("the in-memory session is closed.")
-
-
-SHARED = MemoryBus()
-"""The bus of ``STRANDS_MESH_BACKEND=memory``."""
