@@ -28,7 +28,7 @@ from benchmarks.table import Row
 from strands_robots.device_connect import LinkConfig, init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.robot import Robot
-from strands_robots.safety.lane import lane
+from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.plane import plane
 
 ROOT = Path(__file__).parents[1]
@@ -143,7 +143,7 @@ def last_write(stops: int) -> Row:
         controller = safety_controller("safety-1", link)
         try:
             assert controller.wait_link(10)
-            eventually(lambda: all(seat.link.up for seat in lane().seats), within=10)
+            eventually(lambda: all(each.link.up for each in estop_listener().registrations), within=10)
             for _ in range(stops):
                 plane().clear_local("the benchmark")
                 robot.start_task("wave", duration=30.0)

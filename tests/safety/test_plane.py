@@ -135,18 +135,18 @@ def test_each_answer_of_a_halt_is_graded(plane: SafetyPlane, add: Add, answer: o
     assert robot.refuses()
 
 
-def test_the_second_road_is_a_no_op_that_answers_the_same(plane: SafetyPlane, add: Add) -> None:
+def test_second_arrival_of_a_stop_halts_nothing_and_answers_the_same(plane: SafetyPlane, add: Add) -> None:
     robot = add()
     first, epoch = [], new_epoch()
-    plane.emergency_stop(order(epoch, road="lane"), first.append)
+    plane.emergency_stop(order(epoch, path="lane"), first.append)
     again: list[RobotReport] = []
-    assert plane.begin(order(epoch, road="runtime"), again.append) is None
+    assert plane.begin(order(epoch, path="runtime"), again.append) is None
     assert len(robot.halts) == 1
     assert (again[0].repeated, again[0].stopped) == (True, True)
     assert again[0].elapsed_ms == first[0].elapsed_ms
 
 
-def test_roads_that_meet_at_the_same_moment_halt_once(plane: SafetyPlane, add: Add) -> None:
+def test_arrivals_at_the_same_moment_halt_once(plane: SafetyPlane, add: Add) -> None:
     robot, epoch = add(), new_epoch()
     threads = [threading.Thread(target=plane.emergency_stop, args=(order(epoch),)) for _ in range(8)]
     for thread in threads:
@@ -158,7 +158,7 @@ def test_roads_that_meet_at_the_same_moment_halt_once(plane: SafetyPlane, add: A
 
 def test_a_robot_is_not_stopped_by_its_own_event_but_its_neighbours_are(plane: SafetyPlane, add: Add) -> None:
     own, other = add("arm-1"), add("arm-2")
-    plane.emergency_stop(order(source="arm-1", heard=True))
+    plane.emergency_stop(order(source="arm-1", remote=True))
     assert not own.refuses()
     assert other.refuses()
 
@@ -180,7 +180,7 @@ def test_each_stop_is_in_the_audit_with_its_verdict_and_its_timing(plane: Safety
     add(key=hardware_key("so101", "usb-1"))
     now = time.time()
     for issued in (None, now, now - 3600, now + 3600):
-        plane.emergency_stop(order(heard=True, road="lane", issued=issued))
+        plane.emergency_stop(order(remote=True, path="lane", issued=issued))
     records = eventually(lambda: len(all_ := read_audit_log()) == 4 and all_)
     assert {each["event"] for each in records} == {"remote_estop_engaged"}
     assert [each["payload"]["timing"] for each in records] == ["untimed", "on time", "late", "ahead"]
@@ -343,7 +343,7 @@ def test_a_silent_controller_stops_the_robot_which_says_who(
     assert "no safety controller" in robot.reasons[1]
 
 
-def test_the_epoch_of_a_stop_is_its_id_or_derived_the_same_on_every_road() -> None:
+def test_the_epoch_of_a_stop_is_its_id_or_derived_the_same_on_every_path() -> None:
     epoch = new_epoch()
     assert epoch_of("s", {"estop_id": epoch, "event_id": "e"}, b"") == epoch
     derived = epoch_of("s", {"estop_id": epoch.upper()[:31] + "X", "event_id": "e"}, b"one")

@@ -13,8 +13,8 @@ from strands_robots.contract import Haltable
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope
+from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.lane import Seat, lane
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 
@@ -57,7 +57,9 @@ class SafetySeat:
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
         self._held: Registered | None = self.entry
         try:
-            self._seat: Seat = lane().join(name, ("device-connect", link), lambda: stop_link(link))
+            self._seat: ListenerRegistration = estop_listener().register(
+                name, ("device-connect", link), lambda: stop_link(link)
+            )
         except BaseException:
             self.entry.close()
             raise
@@ -70,7 +72,7 @@ class SafetySeat:
     def second_road(self, source: object, params: object) -> None:
         """An emergency stop that came by the runtime's own handler; returns at once, halts nothing twice."""
         if isinstance(source, str):
-            lane().hear_params(source, params if isinstance(params, Mapping) else {}, "runtime")
+            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime")
 
     def resume(self, assertion: object) -> Envelope:
         """Check a signed resume; its signature is its authorization."""
@@ -88,7 +90,7 @@ class SafetySeat:
 
     def leave(self) -> None:
         """Leave lane and plane; the lockout on disk stays. Blocks while a link closes; safe to call twice."""
-        self._seat.leave()
+        self._seat.close()
         entry, self._held = self._held, None
         if entry is not None:
             entry.close()

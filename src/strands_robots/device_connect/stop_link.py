@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig, backend_for
-from strands_robots.safety.links import Hear, OnState, StopLink
+from strands_robots.safety.estop_listener import OnEvent, OnState, StopLink
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends.zenoh_session import LinkedSession
@@ -90,7 +90,7 @@ class ZenohStopLink:
         self._state = _State(lambda up: None)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._subscribed: tuple[Collection[str], Hear] = ((), lambda event, source, payload: None)
+        self._subscribed: tuple[Collection[str], OnEvent] = ((), lambda event, source, payload: None)
         self._put_options: dict[str, Any] = {}
 
     @property
@@ -102,7 +102,7 @@ class ZenohStopLink:
         """The Zenoh ids of the sessions it is linked to."""
         return {zid for each in self._sessions for zid in tuple(each.remotes)}
 
-    def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
+    def open(self, events: Collection[str], hear: OnEvent, on_state: OnState) -> None:
         self._state = _State(on_state)
         self._subscribed = (events, hear)
         with self._starting:
@@ -227,7 +227,7 @@ class NatsStopLink:
     def up(self) -> bool:
         return self._state.up
 
-    def open(self, events: Collection[str], hear: Hear, on_state: OnState) -> None:
+    def open(self, events: Collection[str], hear: OnEvent, on_state: OnState) -> None:
         self._state = _State(on_state)
         self._thread = threading.Thread(target=self._run, args=(events, hear), name="stop-link", daemon=True)
         self._thread.start()
@@ -250,7 +250,7 @@ class NatsStopLink:
         thread.join(CLOSE_S)
         _OPEN.discard(self)
 
-    def _run(self, events: Collection[str], hear: Hear) -> None:
+    def _run(self, events: Collection[str], hear: OnEvent) -> None:
         try:
             with asyncio.Runner() as runner:
                 self._loop, self._end = runner.get_loop(), asyncio.Event()
@@ -262,7 +262,7 @@ class NatsStopLink:
             self._started.set()
             self._state.set(False)
 
-    async def _serve(self, events: Collection[str], hear: Hear, end: asyncio.Event) -> None:
+    async def _serve(self, events: Collection[str], hear: OnEvent, end: asyncio.Event) -> None:
         async def on_message(data: bytes, subject: str, reply: str | None) -> None:
             parts = subject.split(".")
             if len(parts) == 5:

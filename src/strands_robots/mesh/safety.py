@@ -22,9 +22,8 @@ from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
-from strands_robots.safety.decision import Decision
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.orders import StopOrder, derived_epoch, new_epoch
+from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, sign
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain
@@ -83,7 +82,7 @@ class SafetyAdapter:
         self._robot = robot or NoRobot()
         self._key = key
         self._entry: Registered | None = None
-        self._decision = Decision()
+        self._decision = StopRules()
         self.open()
 
     def open(self) -> None:

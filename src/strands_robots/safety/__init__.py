@@ -12,17 +12,17 @@ How a robot and its network enter it::
 ``robot`` needs ``halt(reason)`` and a ``gate``; registering attaches the robot's lockout to the gate, so that every
 ``gate.permit`` is refused while it is locked. ``key`` is None for a simulation that was given no peer id.
 
-How an emergency stop enters it, from whatever road::
+How an emergency stop enters it, by any path::
 
-    from strands_robots.safety.decision import Decision
+    from strands_robots.safety.orders import StopRules
 
-    order = Decision().order(source_device_id, params, road="runtime")     # StopOrder, or a Refused that says why
+    order = StopRules().order(source_device_id, params, "runtime")     # StopOrder, or a StopRefused that says why
     if isinstance(order, StopOrder):
         reports = await asyncio.to_thread(plane().emergency_stop, order)   # waits for every verdict
 
     plane().emergency_stop(StopOrder(new_epoch(), "arm-1", "button"))      # this process's own stop
 
-``begin`` is the same without the wait. The same epoch by a second road halts nothing twice. A resume is
+``begin`` is the same without the wait. The same epoch by a second path halts nothing twice. A resume is
 ``entry.resume(assertion)``; ``plane().lockouts()`` says who is locked; ``plane().checkin.fields(time.monotonic())``
 is what ``getStatus`` shows of the dead-man check-in.
 """

@@ -16,9 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.safety import ed25519
-from strands_robots.safety.decision import signed_fields
-from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, RenewableLink, StopLink, notification
-from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, RenewableLink, StopLink, notification
+from strands_robots.safety.orders import new_epoch, signed_fields
 from strands_robots.utils import ValidationError, device_id, number
 
 logger = logging.getLogger(__name__)

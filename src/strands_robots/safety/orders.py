@@ -1,19 +1,31 @@
-"""What asks a robot to stop, and what is answered for it: plain values that the roads and the plane share."""
+"""Emergency stops as values: the order, the rules by which one counts, and the report of each robot.
+
+The e-stop listener, the runtime's handler, the mesh and the command line share them with the plane.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from strands_robots import settings
+from strands_robots.safety import ed25519
+from strands_robots.safety.authorization import estop_refusal
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.stopping import StopVerdict
 
 LATE_S = 60.0
 AHEAD_S = 5.0
+
+PARSED_MAX_BYTES = 64 * 2**10
+"""A message longer than this is not read; from a source that may stop, it stops all the same."""
+
+REASON_MAX = 200
 
 
 def new_epoch() -> str:
@@ -22,7 +34,7 @@ def new_epoch() -> str:
 
 
 def derived_epoch(source: str, distinct: bytes) -> str:
-    """The epoch of a stop that brings no id of its own: 32 hex of SHA-256(source NUL what tells it apart)."""
+    """The epoch of a stop that brings no id of its own: 32 hex of SHA-256(source NUL what identifies it)."""
     return hashlib.sha256(source.encode("utf-8", "replace") + b"\0" + distinct).hexdigest()[:32]
 
 
@@ -31,10 +43,10 @@ class StopOrder:
     """One emergency stop, decided to count.
 
     Attributes:
-        epoch: 32 hex digits; the same on every road by which this stop arrives.
+        epoch: 32 hex digits; the same on every path by which this stop arrives.
         source: who stops, as declared.
-        road: lane, runtime, mesh, local or check-in.
-        heard: it came over a network, so the robot named as its source is left alone.
+        path: lane (the e-stop listener), runtime, mesh, local or check-in.
+        remote: it came over a network, so the robot named as its source is left alone.
         issued: the issuer's wall-clock seconds, or None; decides only what the audit says.
         received: this process's monotonic seconds at receipt; latencies count from here.
     """
@@ -42,8 +54,8 @@ class StopOrder:
     epoch: str
     source: str
     reason: str = ""
-    road: str = "local"
-    heard: bool = False
+    path: str = "local"
+    remote: bool = False
     issued: float | None = None
     received: float = field(default_factory=time.monotonic)
 
@@ -58,7 +70,7 @@ class StopOrder:
 
 @dataclass(frozen=True, slots=True)
 class RobotReport:
-    """What one robot answers to one emergency stop.
+    """Answer of one robot to one emergency stop.
 
     ``elapsed_ms`` is from receipt to the halt's answer. ``persisted`` is None for a robot whose lockout is not
     kept. ``repeated``: this stop was known already; ``late``: the halt answered after it was reported missing.
@@ -75,7 +87,7 @@ class RobotReport:
 
     @property
     def stopped(self) -> bool | None:
-        """True, False, or None where nobody knows."""
+        """True, False, or None where it is unknown."""
         return self.verdict.stopped
 
     def fields(self) -> dict[str, Any]:
@@ -106,3 +118,120 @@ def epoch_of(source: str, params: Mapping[str, Any], raw: bytes) -> str:
     if isinstance(event_id, str) and event_id:
         return derived_epoch(source, event_id.encode("utf-8", "replace"))
     return derived_epoch(source, raw)
+
+
+@dataclass(frozen=True, slots=True)
+class StopRefused:
+    """A message of ``source`` that does not count, and the reason for the log and the audit."""
+
+    source: str
+    why: str
+
+
+def signed_fields(estop_id: object, source: str, t: object, nonce: object) -> bytes:
+    """The bytes that an emergency stop or a check-in is signed over: id, source, wall-clock seconds, nonce."""
+    return ed25519.canonical({"estop_id": estop_id, "nonce": nonce, "source": source, "t": t})
+
+
+def estop_keys() -> tuple[bytes, ...]:
+    """The public keys of ``DEVICE_CONNECT_ESTOP_PUBLIC_KEYS``."""
+    name = "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS"
+    return ed25519.public_keys(settings.items(name), name)
+
+
+class StopRules:
+    """The rules by which an emergency stop counts: its source may stop and, where keys are configured, it is signed.
+
+    Nothing else refuses a stop: not its age, not its shape, not its size. The settings are read when this is made, so
+    that a flood meets no environment and no parsing. Each robot asks for itself if it has seen a stop before.
+
+    Args:
+        allow: sources that may stop, as globs; ``DEVICE_CONNECT_ESTOP_ALLOW`` by default.
+        keys: public keys of which one must have signed; empty: none is required. A configured list without one
+            usable key is empty too, and in the log: a mistyped key must not make a fleet unstoppable.
+    """
+
+    def __init__(
+        self,
+        allow: Sequence[str] | None = None,
+        keys: Sequence[bytes] | None = None,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._allow = tuple(settings.items("DEVICE_CONNECT_ESTOP_ALLOW") if allow is None else allow)
+        self._keys = tuple(estop_keys() if keys is None else keys)
+        self._clock = clock
+
+    @property
+    def signed(self) -> bool:
+        """True when a stop needs a signature; else its source is what it says it is."""
+        return bool(self._keys)
+
+    def source_refusal(self, source: str) -> str | None:
+        """Return the reason why this source may not stop, or None; costs next to nothing."""
+        return estop_refusal(source, self._allow)
+
+    def order_of(self, source: str, payload: bytes, received: float | None = None) -> StopOrder | StopRefused:
+        """Decide on the bytes of an ``emergencyStop`` event that the e-stop listener received."""
+        return self.order(source, params_of(payload), "lane", payload, received)
+
+    def order(
+        self,
+        source: str,
+        params: Mapping[str, Any],
+        path: str,
+        raw: bytes | None = None,
+        received: float | None = None,
+    ) -> StopOrder | StopRefused:
+        """Decide on the parameters of an ``emergencyStop``; ``raw`` identifies it where they do not."""
+        why = self.source_refusal(source) or self.signature_refusal(source, params)
+        if why is not None:
+            return StopRefused(source, why)
+        distinct = raw if raw is not None and not params else _text(params)
+        t, reason = params.get("t"), params.get("reason")
+        return StopOrder(
+            epoch_of(source, params, distinct),
+            source,
+            reason[:REASON_MAX] if isinstance(reason, str) and reason.isprintable() else "",
+            path,
+            remote=True,
+            issued=_seconds(t),
+            received=time.monotonic() if received is None else received,
+        )
+
+    def signature_refusal(self, source: str, params: Mapping[str, Any]) -> str | None:
+        """Return the reason why the signature is not valid, or None; always None where no key is configured."""
+        if not self._keys:
+            return None
+        estop_id, nonce, t = params.get("estop_id"), params.get("nonce"), params.get("t")
+        signature = ed25519.decode(params.get("sig"), 64)
+        if signature is None or not is_epoch(estop_id) or not is_epoch(nonce) or _seconds(t) is None:
+            return "it is not signed, and DEVICE_CONNECT_ESTOP_PUBLIC_KEYS asks for a signature"
+        if not ed25519.signed_by_one_of(self._keys, signature, signed_fields(estop_id, source, t, nonce)):
+            return "none of DEVICE_CONNECT_ESTOP_PUBLIC_KEYS made its signature"
+        return None
+
+
+def params_of(payload: bytes) -> dict[str, Any]:
+    """Return the parameters of a JSON-RPC notification; empty for anything else."""
+    if len(payload) > PARSED_MAX_BYTES:
+        return {}
+    try:
+        message = json.loads(payload)
+    except (ValueError, RecursionError):
+        return {}
+    params = message.get("params") if isinstance(message, dict) else None
+    return params if isinstance(params, dict) else {}
+
+
+def _seconds(t: object) -> float | None:
+    """A finite number that a float holds, else None."""
+    if isinstance(t, bool) or not isinstance(t, int | float) or not abs(t) < 1e18:
+        return None
+    return float(t)
+
+
+def _text(params: Mapping[str, Any]) -> bytes:
+    try:
+        return json.dumps(params, sort_keys=True, separators=(",", ":"), default=repr).encode()
+    except (TypeError, ValueError, RecursionError):
+        return repr(sorted(map(str, params))).encode()

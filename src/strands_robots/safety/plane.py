@@ -75,9 +75,9 @@ class Registered:
         """The epochs held, oldest first."""
         return self.latch.state.epochs
 
-    def resume(self, assertion: object, road: str = "local") -> Envelope:
+    def resume(self, assertion: object, path: str = "local") -> Envelope:
         """Clear the epoch that a signed assertion names, or refuse without saying why."""
-        return self._plane.resume(self.robot_id, assertion, road)
+        return self._plane.resume(self.robot_id, assertion, path)
 
     def close(self) -> None:
         """Take the robot out of the plane."""
@@ -252,7 +252,7 @@ class SafetyPlane:
         A robot that has seen this stop is not halted again; ``on_report`` gets at once its report of then while this
         stop still holds it, and ``stopped`` None once it was resumed. None when no robot had anything to do.
         """
-        robots = [each for each in self._robots.values() if not (order.heard and each.wire_id == order.source)]
+        robots = [each for each in self._robots.values() if not (order.remote and each.wire_id == order.source)]
         fresh: list[Registered] = []
         for entry in robots:
             if entry.latch.engage(order.epoch, order.source, order.reason) is not None:
@@ -314,21 +314,21 @@ class SafetyPlane:
             run.wait(run.deadline_s + 2.0)
         return dict(answers)
 
-    def resume(self, robot_id: str, assertion: object, road: str) -> Envelope:
+    def resume(self, robot_id: str, assertion: object, path: str) -> Envelope:
         """Check a signed resume for one robot; the wire's answer never says why it was rejected."""
         entry = self._robots.get(robot_id)
         if entry is None:
             return error(REJECTED)
         verdict = entry.verifier.check(assertion, entry.latch.state.resumable)
         if not isinstance(verdict, Admitted):
-            log_safety_event("resume_denied", robot_id, {"why": verdict.value, "road": road})
+            log_safety_event("resume_denied", robot_id, {"why": verdict.value, "road": path})
             return error(REJECTED)
         entry.latch.resume(verdict.epoch)
         persisted = self._kept([entry])
         log_safety_event(
             "resume_ok",
             robot_id,
-            {"epoch": verdict.epoch, "road": road, "still_held": list(entry.epochs), "persisted": persisted},
+            {"epoch": verdict.epoch, "road": path, "still_held": list(entry.epochs), "persisted": persisted},
         )
         self._freed()
         left = f"; {len(entry.epochs)} more stops hold it" if entry.locked else " and may move when told to"
@@ -395,13 +395,13 @@ class SafetyPlane:
 
     def _record(self, run: StopRun) -> None:
         order, now = run.order, time.time()
-        event = "remote_estop_engaged" if order.heard else "emergency_stop"
+        event = "remote_estop_engaged" if order.remote else "emergency_stop"
         for report in run.reports.values():
             facts: dict[str, Any] = {
                 **report.fields(),
                 "source": order.source,
                 "reason": order.reason,
-                "road": order.road,
+                "road": order.path,
                 "issued": order.issued,
                 "timing": order.timing(now),
             }
@@ -420,7 +420,7 @@ class SafetyPlane:
         if silent is not None:
             names = ", ".join(silent) or "no safety controller was ever heard"
             reason = f"check-in lost: {names}, {self.checkin.timeout_s:g} s"
-            self.begin(StopOrder(new_epoch(), "check-in", reason, road="check-in"))
+            self.begin(StopOrder(new_epoch(), "check-in", reason, path="check-in"))
 
     def _look(self) -> None:
         if any(entry.locked for entry in self._robots.values()):

@@ -24,7 +24,7 @@ from strands_robots.device_connect import (
 )
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.robot import Robot
-from strands_robots.safety.lane import lane
+from strands_robots.safety.estop_listener import estop_listener
 
 pytestmark = pytest.mark.system
 
@@ -60,7 +60,7 @@ class Bench:
             self.robots.append(robot)
             self.runtimes.append(init_device_connect_sync(robot, peer_id=f"arm-{number}", link=link))
         assert self.controller.wait_link(40)
-        eventually(lambda: all(seat.link.up for seat in lane().seats))
+        eventually(lambda: all(each.link.up for each in estop_listener().registrations))
 
     def move(self) -> None:
         for name in ("arm-1", "arm-2"):

@@ -22,7 +22,7 @@ from strands_robots.device_connect.client import DeviceEvent
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.safety import ed25519
-from strands_robots.safety.lane import lane
+from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.resume import sign
 
 Call = Callable[..., dict[str, Any]]
@@ -189,7 +189,9 @@ def test_emergency_stop_halts_and_locks_until_a_signed_resume(
     monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", ed25519.encode(ed25519.public_half(operator)))
     controller = safety_controller("safety-1", fleet.link)
     try:
-        eventually(lambda: controller.link_up and all(seat.link.up for seat in lane().seats), what="the lane")
+        eventually(
+            lambda: controller.link_up and all(each.link.up for each in estop_listener().registrations), what="the lane"
+        )
         call("wakeUp")
         report = controller.stop(["head-1"], "test")
         assert report.ok, report

@@ -31,7 +31,7 @@ from strands_robots.mesh import init_mesh
 from strands_robots.ros.dds import DdsLink
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.lane import lane
+from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.plane import plane
 from strands_robots.safety.resume import sign
 
@@ -116,7 +116,7 @@ class Site:
         self._agent = self._stack.enter_context(FleetClient(link, "tester"))
         self.controller: SafetyController = safety_controller("safety-1", link)
         self._stack.callback(self.controller.close)
-        eventually(lambda: self.controller.link_up and all(seat.link.up for seat in lane().seats))
+        eventually(lambda: self.controller.link_up and all(each.link.up for each in estop_listener().registrations))
 
     def call(self, verb: str, arguments: dict[str, Any]) -> dict[str, Any]:
         answer: dict[str, Any] = self._agent.call("base-1", verb, arguments)

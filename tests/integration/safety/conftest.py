@@ -42,10 +42,10 @@ class Stage:
         self._stack = ExitStack()
 
     def robots(self, *ids: str, **settings: str) -> Child:
-        """Robots that are on the network and on the lane."""
+        """Robots that are on the network and reached by the e-stop listener."""
         state = {"STRANDS_STATE_DIR": str(self.folder), **settings}
         child = self._stack.enter_context(robots(self.link, *ids, environment=state, within=self._here))
-        eventually(lambda: child.ask("ready"), what="the robots' stop lane")
+        eventually(lambda: child.ask("ready"), what="the robots' e-stop links")
         return child
 
     def controller(self, controller_id: str = "safety-1", seed: str = "") -> Child:

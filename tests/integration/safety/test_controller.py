@@ -20,7 +20,7 @@ from strands_robots.device_connect.safety_controller import SafetyControllerDriv
 from strands_robots.envelope import is_error
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import Progress, SafetyController
-from strands_robots.safety.decision import Decision
+from strands_robots.safety.orders import StopRules
 from strands_robots.utils import ValidationError
 
 Broker = ZenohRouter | NatsServer
@@ -185,7 +185,7 @@ def test_only_the_signed_stop_of_a_key_holder_counts_where_keys_are_asked_for(
     network: Network, site_of: Callable[..., Site]
 ) -> None:
     key = Ed25519PrivateKey.generate()
-    site = site_of("arm-1", decide=lambda: Decision(allow=(), keys=(ed25519.public_half(key),)))
+    site = site_of("arm-1", rules=lambda: StopRules(allow=(), keys=(ed25519.public_half(key),)))
     unsigned = safety_controller("safety-1", network[0])
     signed = safety_controller("safety-1", network[0], signing_key=key)
     assert unsigned.wait_link(20)

@@ -1,4 +1,4 @@
-"""Real devices under the safety plane: stopped by the lane whatever their loop does, locked, and lawfully resumed."""
+"""Real devices under the safety plane: stopped while their loop is blocked, locked, and resumed by a signature."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ from strands_robots.device_connect.simulation_driver import SimulationDeviceDriv
 from strands_robots.envelope import Envelope
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.lane import lane
-from strands_robots.safety.links import ESTOP, notification
+from strands_robots.safety.estop_listener import ESTOP, estop_listener, notification
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.plane import plane
 from strands_robots.safety.resume import sign
@@ -88,7 +87,7 @@ class Floor:
         self.controller: SafetyController = safety_controller("safety-1", link)
 
     def ready(self) -> bool:
-        up = self.controller.link_up and all(seat.link.up for seat in lane().seats)
+        up = self.controller.link_up and all(each.link.up for each in estop_listener().registrations)
         return up and all(self.asked(device, "getStatus").get("status") == "success" for device in ("sim-1", "arm-1"))
 
     def asked(self, device: str, function: str, **params: object) -> Envelope:
@@ -128,7 +127,7 @@ def floor(link: LinkConfig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Floor]:
         yield made
     finally:
         made.close()
-    assert lane().seats == ()
+    assert estop_listener().registrations == ()
     assert plane().robots == {}
 
 
@@ -181,7 +180,7 @@ def test_a_blocked_event_loop_of_every_device_does_not_hold_up_the_stop(floor: F
         release.set()
 
 
-def test_the_frameworks_own_road_and_the_lane_meet_and_halt_once(floor: Floor) -> None:
+def test_stop_by_the_runtime_and_by_the_listener_halts_once(floor: Floor) -> None:
     floor.move()
 
     async def emit() -> None:

@@ -15,9 +15,8 @@ from tests.integration.safety.conftest import Stage
 from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
-from strands_robots.safety.decision import signed_fields
-from strands_robots.safety.links import ESTOP, StopLink, notification
-from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.estop_listener import ESTOP, StopLink, notification
+from strands_robots.safety.orders import new_epoch, signed_fields
 from strands_robots.safety.resume import sign
 
 Send = Callable[..., bool]

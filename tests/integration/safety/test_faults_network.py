@@ -55,7 +55,7 @@ def moving(far: Stage, **settings: str) -> tuple[Child, Child]:
     robots, hand = far.robots("arm-1", **settings), far.controller()
     hand.ask("check_in", 0.2)
     far.meet(hand, "arm-1")
-    eventually(lambda: robots.ask("checked_in") == ["safety-1"], what="a check-in on the lane")
+    eventually(lambda: robots.ask("checked_in") == ["safety-1"], what="a check-in at the listener")
     robots.ask("clear")
     robots.ask("move")
     return robots, hand
@@ -82,7 +82,7 @@ def test_a_partition_is_told_and_the_stop_arrives_when_it_heals(far: Stage, lab:
     age_ms, unconfirmed, _ = eventually(lambda: (told := hand.ask("unconfirmed"))[1] and told)
     assert unconfirmed == ["arm-1"]
     assert age_ms >= 100
-    # The length of the fault, not a wait for its end: the longer one outlasts the lane's lease of 4 s.
+    # The length of the fault, not a wait for its end: the longer one outlasts the e-stop link's lease of 4 s.
     time.sleep(parted_s)
     assert lab.dropped > 0
     assert facts(robots)["moving"]

@@ -9,8 +9,7 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.device_connect.stop_link import ZenohStopLink
-from strands_robots.safety.lane import lane
-from strands_robots.safety.links import RenewableLink, StopLink, notification
+from strands_robots.safety.estop_listener import RenewableLink, StopLink, estop_listener, notification
 from strands_robots.safety.plane import plane
 
 
@@ -33,10 +32,10 @@ def test_a_link_carries_stops_while_it_is_made_anew_and_leaves_no_thread() -> No
     hand, told = ZenohStopLink(link), list[bool]()
     try:
         hand.open((), lambda event, source, data: None, told.append)
-        eventually(lambda: hand.up and all(seat.link.up for seat in lane().seats))
+        eventually(lambda: hand.up and all(each.link.up for each in estop_listener().registrations))
         assert isinstance(hand, RenewableLink)
         # The device's own session, which holds the meeting port, and the hand's.
-        before = eventually(lambda: len(there := seen_by(lane().seats[0].link)) == 2 and there)
+        before = eventually(lambda: len(there := seen_by(estop_listener().registrations[0].link)) == 2 and there)
         hand.renew()
         hand.renew()
         for number in range(1, 4):
@@ -44,8 +43,8 @@ def test_a_link_carries_stops_while_it_is_made_anew_and_leaves_no_thread() -> No
             stopped(hand, world, f"{number:032x}")
             plane().clear_local("the test")
             if number == 2:
-                eventually(lambda: len(seen_by(lane().seats[0].link) - before) == 1)
-                eventually(lambda: not before <= seen_by(lane().seats[0].link))
+                eventually(lambda: len(seen_by(estop_listener().registrations[0].link) - before) == 1)
+                eventually(lambda: not before <= seen_by(estop_listener().registrations[0].link))
         assert told == [True], "it never was down"
     finally:
         hand.close()

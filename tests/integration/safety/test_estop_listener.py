@@ -1,4 +1,4 @@
-"""The stop lane on real transports: heard, decided, halted and answered, beside no data plane at all."""
+"""The e-stop listener on real transports, with no data plane beside it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from strands_robots.audit import read_audit_log
 from strands_robots.device_connect.backends import LinkConfig, loopback_config, zenoh_session
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
-from strands_robots.safety.decision import Decision, signed_fields
-from strands_robots.safety.links import CHECK_IN, ESTOP, VERDICT, StopLink, notification
-from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, StopLink, notification
+from strands_robots.safety.orders import StopRules, new_epoch, signed_fields
 
 Broker = ZenohRouter | NatsServer
 
@@ -68,7 +67,7 @@ def open_site(network: tuple[LinkConfig, Broker | None]) -> Iterator[Callable[..
         site, listener = Site(network[0], *names, **options), Listener(network[0])
         made.append((site, listener))
         eventually(lambda: site.ready() and listener.link.up)
-        if not options.get("decide", Decision)().signed:
+        if not options.get("rules", StopRules)().signed:
             probe(site, listener)
         return site, listener
 
@@ -170,7 +169,7 @@ def test_a_flood_of_forged_stops_delays_no_true_one_and_stops_nothing(
     open_site: Callable[..., tuple[Site, Listener]],
 ) -> None:
     key = Ed25519PrivateKey.generate()
-    site, listener = open_site("arm-1", decide=lambda: Decision(allow=("safety-*",), keys=(ed25519.public_half(key),)))
+    site, listener = open_site("arm-1", rules=lambda: StopRules(allow=("safety-*",), keys=(ed25519.public_half(key),)))
     robot, done = site.robots["arm-1"], threading.Event()
 
     def refused() -> list[str]:
@@ -229,7 +228,7 @@ def test_a_broker_that_was_killed_is_noticed_and_the_next_stop_comes_through(
 
 
 def test_a_check_in_reaches_the_plane_from_who_may(open_site: Callable[..., tuple[Site, Listener]]) -> None:
-    site, listener = open_site("arm-1", decide=lambda: Decision(allow=("safety-*", "probe-*"), keys=()))
+    site, listener = open_site("arm-1", rules=lambda: StopRules(allow=("safety-*", "probe-*"), keys=()))
 
     def known() -> dict[str, float]:
         listener.send("safety-1", CHECK_IN)
@@ -250,7 +249,7 @@ def test_the_lane_leaves_no_thread_and_no_connection_behind() -> None:
         for link in (LinkConfig(transport="nats", connect=(server.url,)), loopback_config(free_port())):
             before = own_threads()
             site = Site(link, "arm-1", "arm-2")
-            assert len({id(seat.link) for seat in site.seats}) == 1
+            assert len({id(each.link) for each in site.registrations}) == 1
             site.close()
             eventually(lambda before=before: own_threads() <= before)  # type: ignore[misc]
 

@@ -1,4 +1,4 @@
-"""A device that listens on a fixed port: its runtime has that port, and its stop lane is still reached."""
+"""A device that listens on a fixed port: its runtime has that port, and its e-stop listener is still reached."""
 
 from __future__ import annotations
 

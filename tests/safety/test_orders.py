@@ -1,4 +1,4 @@
-"""Whether an emergency stop counts: its source, its signature, and nothing else."""
+"""The rules by which an emergency stop counts: its source, its signature, and nothing else."""
 
 from __future__ import annotations
 
@@ -11,36 +11,35 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots.safety import ed25519
-from strands_robots.safety.decision import PARSED_MAX_BYTES, Decision, Refused, signed_fields
-from strands_robots.safety.orders import StopOrder, new_epoch
+from strands_robots.safety.orders import PARSED_MAX_BYTES, StopOrder, StopRefused, StopRules, new_epoch, signed_fields
 
-OPEN = Decision(allow=(), keys=())
+OPEN = StopRules(allow=(), keys=())
 
 
 def event(**params: Any) -> bytes:
     return json.dumps({"jsonrpc": "2.0", "method": "emergencyStop", "params": params}).encode()
 
 
-def counted(answer: StopOrder | Refused) -> StopOrder:
+def counted(answer: StopOrder | StopRefused) -> StopOrder:
     assert isinstance(answer, StopOrder), answer
     return answer
 
 
 def test_a_stop_brings_its_epoch_reason_and_time() -> None:
     epoch = new_epoch()
-    order = counted(OPEN.heard("safety-1", event(estop_id=epoch, reason="smoke", t=12.5)))
+    order = counted(OPEN.order_of("safety-1", event(estop_id=epoch, reason="smoke", t=12.5)))
     assert (order.epoch, order.source, order.reason, order.issued) == (epoch, "safety-1", "smoke", 12.5)
-    assert order.heard
-    assert order.road == "lane"
+    assert order.remote
+    assert order.path == "lane"
 
 
-def test_both_roads_of_one_stop_have_one_epoch() -> None:
+def test_one_stop_by_two_paths_has_one_epoch() -> None:
     params = {"reason": "smoke", "event_id": "e-1"}
-    lane, runtime = OPEN.heard("s", event(**params)), OPEN.order("s", params, "runtime")
-    assert counted(lane).epoch == counted(runtime).epoch
+    listener, runtime = OPEN.order_of("s", event(**params)), OPEN.order("s", params, "runtime")
+    assert counted(listener).epoch == counted(runtime).epoch
     bare = {"reason": "smoke"}
-    lane, runtime = OPEN.heard("s", event(**bare)), OPEN.order("s", bare, "runtime")
-    assert counted(lane).epoch == counted(runtime).epoch
+    listener, runtime = OPEN.order_of("s", event(**bare)), OPEN.order("s", bare, "runtime")
+    assert counted(listener).epoch == counted(runtime).epoch
 
 
 @pytest.mark.parametrize(
@@ -60,14 +59,14 @@ def test_both_roads_of_one_stop_have_one_epoch() -> None:
     ],
 )
 def test_no_shape_and_no_size_keeps_a_stop_from_counting(payload: bytes) -> None:
-    order = counted(OPEN.heard("safety-1", payload))
+    order = counted(OPEN.order_of("safety-1", payload))
     assert len(order.epoch) == 32
-    assert order == counted(OPEN.heard("safety-1", payload, received=order.received))
+    assert order == counted(OPEN.order_of("safety-1", payload, received=order.received))
 
 
 @given(st.binary(max_size=300))
 def test_whatever_the_bytes_a_source_that_may_stop_stops(payload: bytes) -> None:
-    assert isinstance(OPEN.heard("safety-1", payload), StopOrder)
+    assert isinstance(OPEN.order_of("safety-1", payload), StopOrder)
 
 
 @pytest.mark.parametrize(
@@ -83,7 +82,7 @@ def test_whatever_the_bytes_a_source_that_may_stop_stops(payload: bytes) -> None
     ],
 )
 def test_the_allowlist_decides_by_name(allow: tuple[str, ...], source: str, may: bool) -> None:
-    assert isinstance(Decision(allow=allow, keys=()).heard(source, event()), StopOrder) is may
+    assert isinstance(StopRules(allow=allow, keys=()).order_of(source, event()), StopOrder) is may
 
 
 class Signer:
@@ -99,10 +98,10 @@ class Signer:
 
 def test_with_keys_only_a_signed_stop_counts() -> None:
     signer = Signer()
-    decision = Decision(allow=(), keys=(Signer().public, signer.public))
-    assert decision.signed
-    assert isinstance(decision.heard("safety-1", event(**signer.params())), StopOrder)
-    assert isinstance(decision.heard("safety-1", event(estop_id=new_epoch())), Refused)
+    rules = StopRules(allow=(), keys=(Signer().public, signer.public))
+    assert rules.signed
+    assert isinstance(rules.order_of("safety-1", event(**signer.params())), StopOrder)
+    assert isinstance(rules.order_of("safety-1", event(estop_id=new_epoch())), StopRefused)
 
 
 @pytest.mark.parametrize(
@@ -121,19 +120,19 @@ def test_with_keys_only_a_signed_stop_counts() -> None:
 )
 def test_a_signature_over_anything_else_does_not_count(change: dict[str, Any]) -> None:
     signer = Signer()
-    decision = Decision(allow=(), keys=(signer.public,))
-    assert isinstance(decision.order("safety-1", signer.params(**change), "lane"), Refused)
+    rules = StopRules(allow=(), keys=(signer.public,))
+    assert isinstance(rules.order("safety-1", signer.params(**change), "lane"), StopRefused)
 
 
 def test_a_signed_stop_of_another_source_does_not_count() -> None:
     signer = Signer()
-    decision = Decision(allow=(), keys=(signer.public,))
-    assert isinstance(decision.order("safety-2", signer.params(), "lane"), Refused)
+    rules = StopRules(allow=(), keys=(signer.public,))
+    assert isinstance(rules.order("safety-2", signer.params(), "lane"), StopRefused)
 
 
 def test_a_mistyped_key_leaves_the_fleet_stoppable_and_says_so(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("DEVICE_CONNECT_ESTOP_PUBLIC_KEYS", "oops")
-    assert isinstance(Decision().heard("safety-1", event()), StopOrder)
+    assert isinstance(StopRules().order_of("safety-1", event()), StopOrder)
     assert "oops" in caplog.text

@@ -1,0 +1,361 @@
+"""The e-stop listener: one thread of the process that turns emergency stops from the network into halts.
+
+It lives from the first registered device to the last, and shares no event loop, queue, lock, executor or session with
+the data plane. A link's thread hands an event to the listener's thread; that one locks every robot and submits each to
+the stop executor: two hand-offs.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import sys
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+from strands_robots.audit import log_safety_event
+from strands_robots.safety.orders import RobotReport, StopRefused, StopRules, params_of
+from strands_robots.safety.plane import SafetyPlane, plane
+from strands_robots.utils import shown
+
+logger = logging.getLogger(__name__)
+
+ESTOP = "emergencyStop"
+VERDICT = "emergencyStopVerdict"
+CHECK_IN = "safetyCheckIn"
+
+ANSWER_AGAIN_S = 0.01
+REFUSAL_INTERVAL_S = 10.0
+SOURCES_MAX = 256
+"""Sources remembered; past it the oldest is forgotten or all new ones share an entry, so that names take no memory."""
+CHECK_IN_AGE_S = 60.0
+
+SWITCH_S = 0.0005
+"""How long a busy Python thread may keep the interpreter from the stop's threads while the listener runs; Python's own
+default is ten times that, and a stop wakes three threads."""
+
+BUCKETS = 64
+BUCKET_CAPACITY = 16
+
+OnEvent = Callable[[str, str, bytes], None]
+"""Called with event, source and bytes on a thread of the link; it must return at once and may not raise."""
+
+OnState = Callable[[bool], None]
+"""Called with the link's state, True for up, on a thread of the link, at each change."""
+
+
+class StopLink(Protocol):
+    """A connection that carries stops and nothing else, supplied by a network.
+
+    No method blocks on the network, and none raises for the connection's state.
+    """
+
+    @property
+    def up(self) -> bool:
+        """True while a peer can be reached."""
+
+    def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
+        """Receive these events of every device of the tenant. Returns at once; the link comes up when it can."""
+
+    def publish(self, source: str, event: str, payload: bytes) -> bool:
+        """Send as ``source`` now; False when the link is down, and then nothing is kept for later."""
+
+    def close(self) -> None:
+        """Close the connection and end the link's thread. Safe to call twice."""
+
+
+@runtime_checkable
+class RenewableLink(Protocol):
+    """A link that can be made anew while it is used."""
+
+    def renew(self) -> None:
+        """Open another connection in place of the present one, which carries stops until then; returns at once."""
+
+
+def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:
+    """Encode an event as Device Connect does: a JSON-RPC 2.0 notification with ``event_id`` and ``ts``."""
+    stamp = {"event_id": event_id or uuid.uuid4().hex, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
+    return json.dumps({"jsonrpc": "2.0", "method": event, "params": {**params, **stamp}}).encode()
+
+
+@dataclass(frozen=True, slots=True)
+class StopEvent:
+    """One event from a link: its name, its declared source, its bytes, and our monotonic seconds at receipt."""
+
+    event: str
+    source: str
+    payload: bytes
+    at: float
+
+
+class FairQueue:
+    """A bounded queue from the links' threads to the listener's: fair between sources, newest first.
+
+    A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
+    are served in turn, one event each, the newest first. What overflows a bucket is its oldest event; a controller
+    repeats its stop, so a true one arrives again. No method but :meth:`get` blocks.
+    """
+
+    def __init__(self) -> None:
+        self._salt = secrets.randbits(62)
+        self._buckets: list[deque[StopEvent]] = [deque(maxlen=BUCKET_CAPACITY) for _ in range(BUCKETS)]
+        self._waiting = threading.Event()
+        self._turn = 0
+        self._closed = False
+
+    def put(self, event: str, source: str, payload: bytes, *, urgent: bool = True) -> None:
+        """Add an event. One that is not urgent is served last, and dropped when its bucket is half full."""
+        received = StopEvent(event, source, payload, time.monotonic())
+        bucket = self._buckets[hash((self._salt, source)) % BUCKETS]
+        # Appending to a deque and setting an event are atomic; no lock is shared with the listener's thread.
+        if urgent:
+            bucket.append(received)
+        elif len(bucket) < BUCKET_CAPACITY // 2:
+            bucket.appendleft(received)
+        self._waiting.set()
+
+    def get(self) -> StopEvent | None:
+        """Return the next event, waiting for one; None once closed and empty."""
+        while True:
+            for _ in range(BUCKETS):
+                self._turn = (self._turn + 1) % BUCKETS
+                bucket = self._buckets[self._turn]
+                if bucket:
+                    return bucket.pop()
+            if self._closed:
+                return None
+            self._waiting.wait()
+            self._waiting.clear()
+            # What was put between the look and the clearing is found by the next look; what comes later sets it.
+
+    def close(self) -> None:
+        """Let :meth:`get` return None when nothing is left."""
+        self._closed = True
+        self._waiting.set()
+
+
+class FailureBudget:
+    """Failed signature checks of each source, counted in windows of a second of monotonic time."""
+
+    def __init__(self, per_s: int = 20) -> None:
+        self._per_s = per_s
+        self._failures: dict[str, tuple[float, int]] = {}
+
+    def allows(self, source: str, now: float) -> bool:
+        """Return True while one more message of ``source`` may be checked."""
+        since, count = self._failures.get(source, (now, 0))
+        return count < self._per_s or now - since >= 1.0
+
+    def record(self, source: str, now: float) -> None:
+        """Count a failure of ``source``."""
+        since, count = self._failures.pop(source, (now, 0))
+        self._failures[source] = (since, count + 1) if now - since < 1.0 else (now, 1)
+        _bound(self._failures)
+
+
+class RefusalLog:
+    """Counts refused messages, and reports each source once in ten seconds, however many it sends."""
+
+    def __init__(self) -> None:
+        self._sources: dict[str, list[float]] = {}
+
+    def due(self, source: str) -> bool:
+        """Return True when this refusal should be recorded; else count it."""
+        entry = self._entry(source)
+        if time.monotonic() >= entry[0]:
+            return True
+        entry[1] += 1
+        return False
+
+    def record(self, refused: StopRefused, event: str) -> None:
+        """Log and audit a refusal, unless one of this source was recorded a moment ago."""
+        if not self.due(refused.source):
+            return
+        entry = self._entry(refused.source)
+        more, entry[:] = int(entry[1]), [time.monotonic() + REFUSAL_INTERVAL_S, 0.0]
+        logger.warning("%s of %s does not count: %s.", event, shown(refused.source), refused.why)
+        facts = {"event": event, "source": refused.source[:256], "why": refused.why, "more_since": more}
+        log_safety_event("estop_refused", "stop-lane", facts)
+
+    def _entry(self, source: str) -> list[float]:
+        name = source if source in self._sources or len(self._sources) < SOURCES_MAX else ""
+        return self._sources.setdefault(name, [float("-inf"), 0.0])
+
+
+class ListenerRegistration:
+    """One device's registration with the listener; the last one of a link to close closes the link."""
+
+    def __init__(self, listener: EstopListener, robot_id: str, key: Hashable, link: StopLink) -> None:
+        self.robot_id = robot_id
+        self.key = key
+        self.link = link
+        self._listener = listener
+
+    def close(self) -> None:
+        """Unregister. Safe to call twice."""
+        self._listener.unregister(self)
+
+
+class EstopListener:
+    """Receives every ``emergencyStop`` of the tenant and has the plane act on it.
+
+    Args:
+        of: the plane that stops its robots.
+        rules: makes the rules by which a stop counts; they are read when the first device registers.
+    """
+
+    def __init__(self, of: SafetyPlane | None = None, rules: Callable[[], StopRules] = StopRules) -> None:
+        self._plane = of or plane()
+        self._make_rules = rules
+        self._registering = threading.Lock()
+        self._registrations: tuple[ListenerRegistration, ...] = ()
+        self._refusals = RefusalLog()
+        self._budget = FailureBudget()
+        self._rules = StopRules(allow=(), keys=())
+        self._checked_in: dict[str, float] = {}
+        self._answered: dict[tuple[str, str], float] = {}
+        self._redundant: dict[tuple[str, str], None] = {}
+        self._queue: FairQueue | None = None
+        self._thread: threading.Thread | None = None
+        self._switch_s = sys.getswitchinterval()
+
+    @property
+    def registrations(self) -> tuple[ListenerRegistration, ...]:
+        """The devices that are registered now."""
+        return self._registrations
+
+    def register(self, robot_id: str, key: Hashable, make: Callable[[], StopLink]) -> ListenerRegistration:
+        """Serve a robot of the plane over the link that ``key`` names; ``make`` it where no device uses it yet."""
+        with self._registering:
+            if self._queue is None:
+                self._start()
+            link = next((each.link for each in self._registrations if each.key == key), None)
+            if link is None:
+                link = make()
+                link.open((ESTOP, CHECK_IN), self.receive, lambda up: None)
+            registration = ListenerRegistration(self, robot_id, key, link)
+            self._registrations = (*self._registrations, registration)
+            return registration
+
+    def unregister(self, registration: ListenerRegistration) -> None:
+        """Serve a device no longer; the thread ends with the last one."""
+        with self._registering:
+            if registration not in self._registrations:
+                return
+            self._registrations = tuple(each for each in self._registrations if each is not registration)
+            last_of_link = all(each.key != registration.key for each in self._registrations)
+            events, thread = (self._queue, self._thread) if not self._registrations else (None, None)
+            if events is not None:
+                self._queue = self._thread = None
+        if last_of_link:
+            registration.link.close()
+        if events is not None:
+            sys.setswitchinterval(self._switch_s)
+            events.close()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(2.0)
+
+    def accept_params(self, source: str, params: Mapping[str, Any], path: str) -> None:
+        """Act on an emergency stop that came by another path, already parsed; returns at once.
+
+        A source whose signatures keep failing is not checked again here for up to a second: its stops arrive at the
+        listener's own link as well.
+        """
+        if self._rules.signed and not self._budget.allows(source, time.monotonic()):
+            return
+        order = self._rules.order(source, params, path)
+        if isinstance(order, StopRefused):
+            self._budget.record(source, time.monotonic())
+            self._refusals.record(order, ESTOP)
+        else:
+            self._plane.begin(order, self._answer)
+
+    def receive(self, event: str, source: str, payload: bytes) -> None:
+        """Take an event from a link's thread; returns at once."""
+        events = self._queue
+        if events is None:
+            return
+        why = self._rules.source_refusal(source)
+        if why is None:
+            events.put(event, source, payload, urgent=event == ESTOP)
+        elif self._refusals.due(source):
+            events.put(event, source, payload, urgent=False)
+
+    def _start(self) -> None:
+        self._rules = self._make_rules()
+        if not self._rules.signed:
+            logger.warning(
+                "The source of an emergency stop is what it says it is: DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not set, "
+                "and only a broker's access rules can vouch for it."
+            )
+        self._switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(min(self._switch_s, SWITCH_S))
+        self._queue = FairQueue()
+        self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)
+        self._thread.start()
+
+    def _run(self, events: FairQueue) -> None:
+        while (received := events.get()) is not None:
+            try:
+                if received.event == CHECK_IN:
+                    self._check_in(received)
+                    continue
+                order = self._rules.order_of(received.source, received.payload, received.at)
+                if isinstance(order, StopRefused):
+                    self._refusals.record(order, received.event)
+                else:
+                    self._plane.begin(order, self._answer)
+            except Exception:
+                logger.critical("The e-stop listener failed on an event of %s.", shown(received.source), exc_info=True)
+
+    def _check_in(self, received: StopEvent) -> None:
+        source, params = received.source, params_of(received.payload)
+        why = self._rules.source_refusal(source) or self._rules.signature_refusal(source, params)
+        t = params.get("t")
+        if why is None and self._rules.signed and isinstance(t, int | float):
+            # A recorded check-in played again must not keep a robot moving.
+            if t <= self._checked_in.get(source, 0.0) or abs(time.time() - t) > CHECK_IN_AGE_S:
+                why = "it was checked in before, or its clock is a minute off"
+            elif len(self._checked_in) < SOURCES_MAX or source in self._checked_in:
+                self._checked_in[source] = t
+        if why is not None:
+            self._refusals.record(StopRefused(source, why), received.event)
+        else:
+            self._plane.checkin.heard(source, received.at)
+
+    def _answer(self, report: RobotReport) -> None:
+        key, now = (report.robot_id, report.epoch), time.monotonic()
+        if report.repeated and now - self._answered.get(key, 0.0) < ANSWER_AGAIN_S:
+            return
+        if report.repeated and key not in self._redundant:
+            # Once for each stop: a controller repeats until every robot has answered.
+            self._redundant[key] = None
+            log_safety_event("remote_estop_redundant", report.robot_id, {"epoch": report.epoch})
+            _bound(self._redundant)
+        self._answered[key] = now
+        _bound(self._answered)
+        for each in self._registrations:
+            if each.robot_id == report.robot_id:
+                entry = self._plane.robots.get(report.robot_id)
+                device_id = entry.wire_id if entry else report.robot_id
+                answer = {**report.fields(), "device_id": device_id}
+                each.link.publish(device_id, VERDICT, notification(VERDICT, answer))
+
+
+def _bound(remembered: dict[Any, Any]) -> None:
+    while len(remembered) > SOURCES_MAX:
+        del remembered[next(iter(remembered))]
+
+
+_LISTENER = EstopListener()
+
+
+def estop_listener() -> EstopListener:
+    """Return the e-stop listener of this process."""
+    return _LISTENER

@@ -1,0 +1,92 @@
+"""Queue and failure budget of the e-stop listener."""
+
+from __future__ import annotations
+
+import threading
+
+from strands_robots.safety.estop_listener import BUCKET_CAPACITY, SOURCES_MAX, FailureBudget, FairQueue, StopEvent
+
+
+def drained(events: FairQueue) -> list[StopEvent]:
+    events.close()
+    found = []
+    while (received := events.get()) is not None:
+        found.append(received)
+    return found
+
+
+def test_event_that_was_put_is_returned() -> None:
+    events = FairQueue()
+    events.put("emergencyStop", "safety-1", b"x")
+    received = events.get()
+    assert received is not None
+    assert (received.event, received.source, received.payload) == ("emergencyStop", "safety-1", b"x")
+    assert drained(events) == []
+
+
+def test_flood_of_one_source_does_not_delay_another() -> None:
+    events = FairQueue()
+    for number in range(200):
+        for forged in range(50):
+            events.put("emergencyStop", "forger", str(forged).encode())
+        events.put("emergencyStop", f"safety-{number}", b"true")
+        taken = [events.get(), events.get()]
+        assert any(received is not None and received.payload == b"true" for received in taken)
+
+
+def test_newest_event_of_a_source_comes_first_and_memory_is_bounded() -> None:
+    events = FairQueue()
+    for number in range(1000):
+        events.put("emergencyStop", "s", str(number).encode())
+    found = drained(events)
+    assert [received.payload for received in found] == [str(n).encode() for n in range(999, 999 - BUCKET_CAPACITY, -1)]
+
+
+def test_check_in_is_served_after_a_stop_and_never_displaces_one() -> None:
+    events = FairQueue()
+    events.put("emergencyStop", "s", b"stop")
+    for _ in range(100):
+        events.put("safetyCheckIn", "s", b"", urgent=False)
+    assert drained(events)[0].event == "emergencyStop"
+
+
+def test_get_waits_for_an_event_and_ends_with_the_queue() -> None:
+    events, found = FairQueue(), []
+
+    def take() -> None:
+        while (received := events.get()) is not None:
+            found.append(received.payload)
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    for number in range(100):
+        events.put("emergencyStop", f"s{number}", str(number).encode())
+    events.close()
+    thread.join(20)
+    assert sorted(map(int, found)) == list(range(100))
+
+
+def test_failure_budget_of_a_source_lasts_until_the_next_second() -> None:
+    budget = FailureBudget(per_s=3)
+    for _ in range(3):
+        assert budget.allows("forger", 10.0)
+        budget.record("forger", 10.0)
+    assert not budget.allows("forger", 10.9)
+    assert budget.allows("forger", 11.0)
+    budget.record("forger", 11.0)
+    assert budget.allows("forger", 11.1)
+
+
+def test_failures_of_one_source_cost_no_other() -> None:
+    budget = FailureBudget(per_s=1)
+    budget.record("forger", 10.0)
+    assert not budget.allows("forger", 10.0)
+    assert budget.allows("safety-1", 10.0)
+
+
+def test_invented_sources_are_bounded_and_the_latest_is_remembered() -> None:
+    budget = FailureBudget(per_s=1)
+    for number in range(10 * SOURCES_MAX):
+        budget.record(f"forger-{number}", 10.0)
+    assert not budget.allows(f"forger-{10 * SOURCES_MAX - 1}", 10.0)
+    assert budget.allows("forger-0", 10.0)
