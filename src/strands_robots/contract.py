@@ -133,6 +133,9 @@ class WorldRobot(Haltable, Protocol):
         """Tell ``observer`` of every rollout event until the returned callable is called."""
 
 
+Robot = TaskRobot | WorldRobot
+"""What the networks serve."""
+
 JointReader = Callable[[Any], Mapping[str, float]]
 """Reads a robot's joints, by name in its own unit; empty where it has none. Raises what the robot raises."""
 

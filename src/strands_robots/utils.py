@@ -19,6 +19,9 @@ from strands_robots.errors import StrandsRobotsError
 DISTRIBUTION = "strands-robots-edge"
 """Name of this project on a package index; ``strands-robots`` is another project's."""
 
+DURATION_MAX_S = 3600.0
+"""Longest task, drive, goal or teleoperation, in seconds."""
+
 IDENTIFIER_MAX = 128
 """Longest peer id and message identifier, in characters (the mesh wire's bound)."""
 
@@ -100,6 +103,11 @@ def whole(name: str, value: object, *, low: int | None = None, high: int | None 
         if inside:
             return value
     raise ValidationError(f"{name} must be {_domain('an integer', low, high, None)}, not {shown(value)}.")
+
+
+def duration(name: str, value: object) -> float:
+    """Seconds above 0 and at most :data:`DURATION_MAX_S`."""
+    return number(name, value, above=0, high=DURATION_MAX_S)
 
 
 def flag(name: str, value: object) -> bool:

@@ -146,7 +146,7 @@ async def test_concurrent_calls_keep_their_callers_apart():
     answers = []
 
     async def ask(number):
-        command = jsonrpc.Command("late", number, {"_dc_meta": {"source_device": f"agent-{number}"}})
+        command = jsonrpc.RpcRequest("late", number, {"_dc_meta": {"source_device": f"agent-{number}"}})
         await messaging.serve_command(command, lambda data: answers.append(json.loads(data)))
 
     await asyncio.gather(*(ask(number) for number in range(20)))

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from strands_robots.device_connect import live_driver
+from strands_robots.device_connect import base_driver
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.telemetry import Throttle, paced
 from strands_robots.envelope import error, success
@@ -205,7 +205,7 @@ async def test_state_is_told_ten_times_a_second_while_busy_and_once_while_idle(
         rates.append(hz)
         return paced(hz, *more)
 
-    monkeypatch.setattr(live_driver, "paced", noted)
+    monkeypatch.setattr(base_driver, "paced", noted)
     async with DriverBench(drive(robot)) as bench:
         (rate,) = rates
         assert rate() == 1.0

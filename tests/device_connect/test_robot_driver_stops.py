@@ -10,7 +10,8 @@ import pytest
 from fixtures.driver_bench import DriverBench, drive
 from fixtures.toy_robots import ToyRobot
 
-from strands_robots.device_connect import base_driver, live_driver
+from strands_robots.device_connect import base_driver
+from strands_robots.serving.workers import RUNNING_MAX, WAITING_MAX
 
 
 async def test_stop_ends_the_task_for_every_caller(robot: ToyRobot) -> None:
@@ -42,10 +43,11 @@ async def test_a_stop_is_answered_while_motion_and_reads_block(robot: ToyRobot) 
     let_go = threading.Event()
     robot.before = {"start_task": let_go.wait, "get_state": let_go.wait}
     async with DriverBench(drive(robot)) as bench:
-        blocked = [asyncio.create_task(bench.call("execute", instruction="wave")) for _ in range(5)]
-        blocked += [asyncio.create_task(bench.call("getState")) for _ in range(9)]
+        each = RUNNING_MAX + WAITING_MAX + 3
+        blocked = [asyncio.create_task(bench.call("execute", instruction="wave")) for _ in range(each)]
+        blocked += [asyncio.create_task(bench.call("getState")) for _ in range(each)]
         # The watch of its state may hold one of the places for reads.
-        beyond = len(blocked) - base_driver.MOVES_AT_ONCE - live_driver.READS_AT_ONCE
+        beyond = len(blocked) - 2 * (RUNNING_MAX + WAITING_MAX)
         await bench.until(lambda: sum(task.done() for task in blocked) >= beyond)
         assert (await bench.call("stop"))["stopped"] is True
         let_go.set()
@@ -55,7 +57,7 @@ async def test_a_stop_is_answered_while_motion_and_reads_block(robot: ToyRobot) 
 
 
 async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(base_driver, "MOVE_DEADLINE_S", 0.1)
+    monkeypatch.setattr(base_driver, "START_DEADLINE_S", 0.1)
     let_go = threading.Event()
     robot.before["start_task"] = let_go.wait
     async with DriverBench(drive(robot)) as bench:
@@ -70,7 +72,7 @@ async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, mon
 async def test_a_motion_that_is_not_started_in_time_takes_nothing_else_with_it(
     robot: ToyRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(base_driver, "MOVE_DEADLINE_S", 0.1)
+    monkeypatch.setattr(base_driver, "START_DEADLINE_S", 0.1)
     let_go, moving = threading.Event(), robot.gate.permit("a local motion")
     robot.before["start_task"] = let_go.wait
     async with DriverBench(drive(robot)) as bench:

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from strands_robots.mesh.assembly import Parts
-from strands_robots.mesh.core import Mesh
+from strands_robots.mesh.core import Mesh, Parts
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity

@@ -15,6 +15,7 @@ from strands_robots.envelope import Envelope, success
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.presence import DESCRIBE_S
 from strands_robots.mesh.transport.memory import MemoryTransport
+from strands_robots.serving.workers import shares_of
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
 
@@ -100,7 +101,7 @@ def test_the_stop_of_one_robot_reaches_its_starts_in_line_wherever_they_were_ask
     peers: Fleet, stopped: str
 ) -> None:
     world = Led("left", "right")
-    mesh, console = peers.join(world, "sim-1", "sim"), peers.join(None, "console")
+    _, console = peers.join(world, "sim-1", "sim"), peers.join(None, "console")
     eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id))
     world.free.clear()
     answers: dict[str, Any] = {}
@@ -114,7 +115,7 @@ def test_the_stop_of_one_robot_reaches_its_starts_in_line_wherever_they_were_ask
     assert all(world.asked.acquire(timeout=20) for _ in threads)
     threads += [ask(name, f"sim-1__{name}", START) for name in ("left", "right")]
     threads.append(ask("by name", "sim-1", {**START, "robot_name": "left"}))
-    eventually(lambda: mesh._assembled.lanes.commands._queue.qsize() == 3)
+    eventually(lambda: shares_of(world).motion.waiting == 3)
     stop = {"action": "stop", **({"robot_name": "left"} if stopped == "sim-1" else {})}
     assert console.send(stopped, stop, timeout=20)["result"]["ok"] is True
     world.free.set()
@@ -166,9 +167,9 @@ def test_an_emergency_stop_finds_no_child_silent_and_locks_them(peers: Fleet) ->
 def test_robots_come_and_go_with_their_world(peers: Fleet) -> None:
     world, mesh, console = joined(peers)
     world.names.remove("right")
-    children = mesh._assembled.children
+    children = mesh.children
     assert children is not None
-    eventually(lambda: not children._children)
+    eventually(lambda: not children.peers)
     eventually(lambda: not console.peers_by_id["sim-1__left"]["reachable"])
     world.names.append("middle")
     eventually(lambda: "sim-1__middle" in console.peers_by_id)
@@ -199,7 +200,7 @@ def declared_keys(peers: Fleet) -> list[str]:
 def test_robots_whose_world_hangs_in_its_read_take_commands_and_are_announced_by_name_alone(peers: Fleet) -> None:
     world = Wedged("left")
     mesh, console = peers.join(world, "sim-1", "sim"), peers.join(None, "console")
-    children = mesh._assembled.children
+    children = mesh.children
     assert children is not None
     world.free.clear()
     # The sampler hangs as well, so that nobody but this test asks for the children.
@@ -208,7 +209,7 @@ def test_robots_whose_world_hangs_in_its_read_take_commands_and_are_announced_by
     reading = threading.Thread(target=children.refresh)
     reading.start()
     try:
-        eventually(lambda: set(children._children) == {"sim-1__left", "sim-1__right"})
+        eventually(lambda: children.peers == {"sim-1__left", "sim-1__right"})
         children.announce()
         assert set(console.peers_by_id) == {"sim-1"}, "neither has been described yet"
         peers.clock.pass_(DESCRIBE_S)
@@ -220,14 +221,14 @@ def test_robots_whose_world_hangs_in_its_read_take_commands_and_are_announced_by
     finally:
         world.free.set()
         reading.join(20)
-    assert children._children == {}
+    assert children.peers == set()
 
 
 def test_a_robot_that_begins_while_its_world_leaves_is_taken_away(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world = World("left")
-    children = peers.join(world, "sim-1", "sim")._assembled.children
+    children = peers.join(world, "sim-1", "sim").children
     assert children is not None
     transport, declared = peers.transports["sim-1"], list[str]()
     declare = transport.declare_token
@@ -263,14 +264,14 @@ def test_a_broker_that_pins_a_peer_to_its_topics_is_shown_no_children(
 ) -> None:
     monkeypatch.setattr(MemoryTransport, "pins_topics", True, raising=False)
     mesh, console = peers.join(World("left", "right"), "sim-1", "sim"), peers.join(None, "console")
-    assert mesh._assembled.children is not None
-    mesh._assembled.children.refresh()
-    mesh._assembled.children.announce()
+    assert mesh.children is not None
+    mesh.children.refresh()
+    mesh.children.announce()
     assert set(console.peers_by_id) == {"sim-1"}
 
 
 def test_a_world_of_one_robot_is_one_peer(peers: Fleet) -> None:
     mesh, console = peers.join(World("left"), "sim-1", "sim"), peers.join(None, "console")
-    assert mesh._assembled.children is not None
-    mesh._assembled.children.refresh()
+    assert mesh.children is not None
+    mesh.children.refresh()
     assert set(console.peers_by_id) == {"sim-1"}

@@ -13,12 +13,11 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots import policies
-from strands_robots.mesh.context import registered_providers
-from strands_robots.mesh.dispatch import Dispatcher, fit
 from strands_robots.mesh.security import ValidationError, validate_command
 from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.safety.approval import Grants, state_dir
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.policy_arguments import registered_providers
+from strands_robots.serving.robot_verbs import run_to_end, served
 
 
 def ask(
@@ -120,10 +119,9 @@ def test_execute_waits_until_the_policy_has_ended(peers: Fleet, monkeypatch: pyt
 
 def test_leaving_the_mesh_ends_an_execute_with_the_reason(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     arm, left = Arm(), threading.Event()
-    execute = {"action": "execute", "policy_provider": "mock", "policy_host": "localhost", "duration": 30.0}
+    execute = {"policy_provider": "mock", "policy_host": "localhost", "duration": 30.0}
     answers: list[Any] = []
-    told = Dispatcher(fit(arm), lambda reason: StopVerdict(), left.is_set)
-    asking = threading.Thread(target=lambda: answers.append(told(execute)))
+    asking = threading.Thread(target=lambda: answers.append(run_to_end(served(arm), execute, left.is_set)))
     asking.start()
     eventually(lambda: arm.moving)
     left.set()

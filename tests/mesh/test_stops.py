@@ -1,10 +1,9 @@
-"""Stops over the mesh: of one robot of a world, of what stands in line, and beside a stream that hangs."""
+"""Stops over the mesh: of one robot of a world, of commands that wait, and beside a stream that hangs."""
 
 from __future__ import annotations
 
 import json
 import threading
-from collections import Counter
 from typing import Any
 
 import pytest
@@ -14,10 +13,10 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope, success
 from strands_robots.mesh import teleop
-from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.input_receiver import InputReceiver
-from strands_robots.mesh.stops import EACH, MOST, Stops, Tell
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.stop_requests import CALLER_MAX
+from strands_robots.serving.workers import shares_of
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 30.0}
 
@@ -81,7 +80,7 @@ def test_a_stop_is_answered_while_the_frames_of_every_stream_hang(
     assert console.send("arm-1", {"action": "teleop_status"}, timeout=20)["result"]["streams"] == []
     assert console.send("arm-1", {"action": "stop"}, timeout=20)["result"]["ok"] is True
     eventually(lambda: sum("still being applied" in each.getMessage() for each in list(caplog.records)) == 2)
-    assert all(name.startswith("arm-1-command") for name in waited), "no stop and no answer waits for a frame"
+    assert not any(name.startswith("halt-") for name in waited), "no stop waits for a frame"
     arm.let_go.set()
 
 
@@ -128,91 +127,21 @@ def test_no_stop_of_a_flood_is_refused_and_an_honest_one_gets_its_verdict(peers:
     ]
     for thread in asking:
         thread.start()
-    server = peers.meshes[0]._assembled.server
-    waiting = server._stops._waiting
-    # Copies: the askers' threads put themselves in meanwhile.
-    eventually(lambda: any("console" in who for each in list(waiting.values()) for who in list(each)))
+    mesh = peers.meshes[0]
+    # The stop of one robot waits for no halt of the whole world.
+    eventually(lambda: mesh.stops_waiting == CALLER_MAX + 1 and len(answers) == 1)
     pour(1000)
-    assert len(server._stops) <= EACH + len(commands)
+    assert mesh.stops_waiting <= CALLER_MAX + len(commands)
     world.let_go.set()
     for thread in asking:
         thread.join(20)
     assert [answer["result"]["ok"] for answer in answers] == [True, True]
-    eventually(lambda: len(server._stops) == 0)
+    eventually(lambda: mesh.stops_waiting == 0)
     assert all(each["ok"] is True for each in said["flood"])
     assert world.halts <= 4
 
 
-def test_a_flood_under_many_names_keeps_its_bound_and_the_fleet_stop() -> None:
-    lane, halted, begun, let_go = Lane("stops", 1, 2), Counter[str](), threading.Event(), threading.Event()
-
-    def halt(robot: str) -> Tell:
-        begun.set()
-        let_go.wait(60)
-        return lambda askers: halted.update({robot: len(askers)})
-
-    answers = Lane("answers", 1, MOST * 2)
-    stops = Stops(lane, answers, halt)
-    stops.add("", "first", "t")
-    assert begun.wait(20)
-    stops.add("", "console", "t")
-    for number in range(MOST + 500):
-        stops.add(f"robot-{number}", f"sender-{number % 100}", "t")
-    assert len(stops) <= MOST
-    let_go.set()
-    eventually(lambda: len(stops) == 0)
-    assert halted[""] == 2
-    assert stops.unanswered >= 500
-    assert lane.stop(20) == []
-    assert stops.add("", "late", "t") is False
-    answers.stop(20)
-
-
-def test_a_stop_that_lost_its_answer_to_a_flood_is_carried_out_all_the_same() -> None:
-    lane, answers, begun, let_go = Lane("stops", 1, 2), Lane("answers", 1, 8), threading.Event(), threading.Event()
-    halted: list[str] = []
-
-    def halt(robot: str) -> Tell:
-        begun.set()
-        let_go.wait(60)
-        halted.append(robot)
-        return lambda askers: None
-
-    stops = Stops(lane, answers, halt)
-    stops.add("", "first", "t")
-    assert begun.wait(20)
-    stops.add("left", "one", "t0")
-    for turn in range(EACH):
-        stops.add("right", "one", f"t{turn + 1}")
-    let_go.set()
-    eventually(lambda: halted == ["", "left", "right"])
-    eventually(lambda: len(stops) == 0)
-    assert stops.unanswered == 1
-    assert (lane.stop(20), answers.stop(20)) == ([], [])
-
-
-def test_the_next_halt_waits_for_no_answer_to_the_one_before() -> None:
-    lane, answers, let_go = Lane("stops", 1, 2), Lane("answers", 1, 8), threading.Event()
-    halted: list[str] = []
-    told: list[tuple[str, str]] = []
-
-    def halt(robot: str) -> Tell:
-        halted.append(robot)
-        return lambda askers: told.extend(askers if let_go.wait(60) else [])
-
-    stops = Stops(lane, answers, halt)
-    for robot in ("", "left", "right"):
-        stops.add(robot, "console", robot)
-    eventually(lambda: halted == ["", "left", "right"])
-    assert told == []
-    assert len(stops) == 3
-    let_go.set()
-    eventually(lambda: len(stops) == 0)
-    assert [turn for _, turn in told] == ["", "left", "right"]
-    assert (lane.stop(20), answers.stop(20)) == ([], [])
-
-
-def test_names_that_nobody_bears_stand_in_no_line(peers: Fleet) -> None:
+def test_a_stop_of_an_unknown_robot_is_answered_at_once_and_halts_nothing(peers: Fleet) -> None:
     world, arm = Slow("left", "right"), Arm()
     for robot, name in ((world, "sim-1"), (arm, "arm-1")):
         peers.join(robot, name, "sim")
@@ -229,8 +158,7 @@ def test_names_that_nobody_bears_stand_in_no_line(peers: Fleet) -> None:
     assert len(said) == 500, "an unknown name is answered while a halt is carried out"
     assert said[0]["result"]["ok"] is False
     assert "there are left, right" in said[0]["result"]["error"]
-    assert list(peers.meshes[0]._assembled.server._stops._waiting) == []
-    assert set(peers.meshes[1]._assembled.server._stops._waiting) <= {""}
+    assert peers.meshes[0].stops_waiting == 1
     world.let_go.set()
     asking.join(20)
     assert world.halts == 1
@@ -274,9 +202,8 @@ def test_the_stop_of_one_robot_reaches_its_start_that_stands_in_line(peers: Flee
 
     threads = [ask(f"step-{n}", {"action": "step", "steps": 1}) for n in range(4)]
     assert all(begun.acquire(timeout=20) for _ in threads)
-    server = peers.meshes[0]._assembled.lanes.commands._queue
     threads += [ask(name, {**START, "robot_name": name}) for name in ("left", "right")]
-    eventually(lambda: server.qsize() == 2)
+    eventually(lambda: shares_of(world).motion.waiting == 2)
     stopped = console.send("sim-1", {"action": "stop", "robot_name": "left"}, timeout=20)
     assert stopped["result"]["ok"] is True
     let_go.set()

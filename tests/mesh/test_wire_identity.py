@@ -16,7 +16,7 @@ from fixtures.mesh_robots import Arm, World
 from tests.mesh.peers import Clock, Fleet
 
 from strands_robots.mesh import keys, wire_identity
-from strands_robots.mesh.assembly import identity_of
+from strands_robots.mesh.core import identity_of
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
 

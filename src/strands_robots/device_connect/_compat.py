@@ -243,7 +243,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         functions.update({name: _quick(function) for name, function in functions.items()})
         await self.messaging.serve(f"device-connect.{self.tenant}.{self.device_id}.cmd", self._serve)
 
-    async def _serve(self, command: jsonrpc.Command, answer: Answer | None) -> None:
+    async def _serve(self, command: jsonrpc.RpcRequest, answer: Answer | None) -> None:
         """Give the framework's answer to a command, without its spans: no exporter would receive them."""
         method, params = command.method, command.params
         source = params.pop("_dc_meta", {}).get("source_device")

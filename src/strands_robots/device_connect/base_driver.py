@@ -1,230 +1,212 @@
-"""What the device drivers share: the door that every RPC passes, and the stop.
+"""A robot as a device: RPC methods made from its verbs, its stop, and its state in status, presence and events.
 
-An RPC of a subclass asks :meth:`RobotDriver.move` or :meth:`RobotDriver.read` and returns what they return: an
-envelope, always. Robot verbs run on threads (:mod:`.workers`), never on the event loop; ``stop`` has threads that
-no motion and no read can take.
+The driver is a codec: it turns an RPC into a :class:`~strands_robots.serving.pipeline.Command`, and the pipeline's
+answer into an envelope that JSON can carry. Robot calls run on threads, never on the event loop.
 """
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import logging
-from collections.abc import Awaitable, Callable, Mapping
-from concurrent.futures import TimeoutError as FutureTimeoutError
-from functools import cached_property
-from typing import Any
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
+from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.drivers.decorators import get_rpc_source_device
+from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
-from strands_robots.contract import TaskRobot, WorldRobot
-from strands_robots.device_connect._compat import emit, on, rpc
-from strands_robots.device_connect.live_driver import READ_DEADLINE_S, LiveDriver
-from strands_robots.device_connect.safety_seat import SafetySeat
-from strands_robots.device_connect.workers import Lane, LaneFullError
-from strands_robots.envelope import Envelope, error, is_error, jsonable, success
+from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
+from strands_robots.device_connect._compat import Labels, emit, on, rpc
+from strands_robots.device_connect.safety_registration import SafetyRegistration
+from strands_robots.device_connect.telemetry import RolloutPump, paced
+from strands_robots.envelope import Envelope, error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
-from strands_robots.safety.gate import Asked, MotionRefused
-from strands_robots.safety.stopping import StopVerdict, explain, grade
-from strands_robots.utils import ValidationError, shown
+from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result
+from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
+from strands_robots.serving.workers import awaited, called
+from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
 
-MOVE_DEADLINE_S = 10.0
-"""Seconds in which a robot has to have started a motion; after that its permit is void."""
+START_DEADLINE_S = 10.0
+"""Seconds in which a robot has to have started a motion; after that the motion is void."""
 
-MOVES_AT_ONCE, STOPS_AT_ONCE = 2, 8
+READ_DEADLINE_S = 5.0
+"""Seconds in which a robot has to have answered a read."""
 
-Call = Callable[[], object]
+_FUNCTIONS: WeakKeyDictionary[type, tuple[FunctionDef, ...]] = WeakKeyDictionary()
+_EVENTS: WeakKeyDictionary[type, tuple[EventDef, ...]] = WeakKeyDictionary()
 
 
-class RobotDriver(LiveDriver):
-    """A robot as a device. Subclasses name the verbs and read the state.
+@dataclass(frozen=True, slots=True)
+class Activity:
+    """The present doing of a robot, as told in status, presence, heartbeat and ``stateUpdate``."""
+
+    busy: bool = False
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    fault: str = ""
+
+
+def rpc_method(verb: Verb) -> Callable[..., Any]:
+    """Make the RPC method of a verb; its signature, docstring and schema are the verb's description."""
+
+    async def method(self: RobotDriver, *values: object, **named: object) -> dict[str, Any]:
+        if verb.kind is Kind.STOP:
+            return await self.stop_answer(verb.name)
+        arguments = {**dict(zip(verb.by_name, values, strict=False)), **named}
+        moves = verb.kind is Kind.MOTION
+        asked = self.pipeline.pending.arrive() if moves else None
+        command = Command(verb, arguments, get_rpc_source_device(), asked)
+        within = START_DEADLINE_S if moves else READ_DEADLINE_S
+        try:
+            answer: Result = await awaited(partial(self.pipeline.submit, command), within)
+        except TimeoutError:
+            # This command alone: to revoke the gate without a halt would leave what moves with its last command.
+            if asked is not None:
+                asked.give_up()
+            return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
+        if moves and answer.refusal is None:
+            logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(command.caller))
+            self.changed.set()
+        return enveloped(verb.name, answer.result)
+
+    empty = inspect.Parameter.empty
+    method.__name__ = verb.name
+    method.__qualname__ = f"RobotDriver.{verb.name}"
+    method.__doc__ = _docstring(verb)
+    method.__annotations__ = {**{each.name: each.type for each in verb.parameters}, "return": dict[str, Any]}
+    parameters = [
+        inspect.Parameter(
+            each.name,
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            default=empty if each.default is REQUIRED else each.default,
+            annotation=each.type,
+        )
+        for each in verb.parameters
+    ]
+    itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    vars(method)["__signature__"] = inspect.Signature([itself, *parameters], return_annotation=dict[str, Any])
+    return rpc(labels=_labels(verb))(method)
+
+
+def enveloped(verb: str, answer: object) -> Envelope:
+    """Return a robot's answer as an envelope that JSON can carry."""
+    if not isinstance(answer, Mapping):
+        return error(f"The robot answered {verb} with an unknown result shape: {shown(answer)}.")
+    plain: Envelope = jsonable(answer)
+    if plain.get("status") in ("success", "error"):
+        return plain
+    return success(f"{verb} answered.", **{k: v for k, v in plain.items() if k not in ("content", "status")})
+
+
+class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
+    """A robot as a device. Subclasses name its verbs, read its state and name its events.
 
     Args:
         robot: what is driven, behind its contract.
         hardware: True where a motion needs the operator's approval besides the caller's authorization.
     """
 
+    verbs: ClassVar[Mapping[str, Verb]] = {}
+    """The verbs of the device, by name; each becomes an RPC method."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name, verb in cls.verbs.items():
+            if name not in vars(cls):
+                setattr(cls, name, rpc_method(verb))
+
     def __init__(
         self,
-        robot: TaskRobot | WorldRobot,
+        robot: Robot,
         *,
         hardware: bool,
         authorization: Authorization | None = None,
         approval: Approval | None = None,
     ) -> None:
-        super().__init__(robot)
-        name = robot.tool_name_str
+        super().__init__()
+        self.robot = robot
         self.hardware = hardware
-        self.authorization = authorization or Authorization(hardware=hardware, robot=name)
-        self.approval = approval or Approval()
-        self.seat: SafetySeat | None = None
-        self.moves = Lane("motion", MOVES_AT_ONCE)
-        self.stops = Lane("stop", STOPS_AT_ONCE)
-        self.alarms = Lane("emergency stop", STOPS_AT_ONCE)
+        self.authorization = authorization or Authorization(hardware=hardware, robot=robot.tool_name_str)
+        self.registration: SafetyRegistration | None = None
+        self.pipeline = Pipeline.of(
+            robot,
+            lambda: self.peer_id,
+            hardware=hardware,
+            authorize=self.authorize,
+            approval=approval or Approval(),
+            own={"resume": self._resume, "getStatus": self._status},
+        )
+        self.runtime: Any = None
+        self.activity = Activity()
+        self.changed = asyncio.Event()
+        self._rolling: set[str] = set()
+        self._watchers: list[asyncio.Task[None]] = []
+        self._unsubscribe: Unsubscribe | None = None
 
-    # The door.
+    # Commands.
 
     async def invoke(self, function_name: str, /, **params: Any) -> Any:
         """Call an RPC by name; parameters that it does not have, or lacks, are refused by name."""
-        signature = self._signatures.get(function_name)
-        if signature is not None:
-            known = {name: value for name, value in params.items() if name != "source_device"}
-            try:
-                signature.bind(**known)
-            except TypeError as exc:
-                has = ", ".join(signature.parameters) or "no parameters"
-                return error(f"{function_name} takes {has}: {exc}.")
-        return await super().invoke(function_name, **params)
+        verb = self.verbs.get(function_name)
+        problem = verb and verb.unfit(params.keys() - {"source_device"})
+        return error(problem) if problem else await super().invoke(function_name, **params)
 
-    @cached_property
-    def _signatures(self) -> dict[str, inspect.Signature]:
-        methods = {definition.name: getattr(self, definition.name) for definition in self.functions}
-        return {name: inspect.signature(method) for name, method in methods.items()}
-
-    async def move(self, verb: str, prepare: Callable[[], Call]) -> Envelope:
-        """Start a motion: authorization, arguments, lockout, the operator's approval, then the robot's verb.
-
-        Args:
-            verb: the RPC's name, which is what callers and operators are allowed.
-            prepare: checks the arguments (raising :class:`ValidationError`) and gives the call.
-        """
-        caller = get_rpc_source_device()
-        return await self._guarded(verb, lambda: self._moved(verb, prepare, caller))
-
-    async def read(self, verb: str, call: Call) -> Envelope:
-        """Answer a question, to every caller."""
-        return await self._guarded(verb, lambda: self.reads.run(call, READ_DEADLINE_S))
-
-    async def _moved(self, verb: str, prepare: Callable[[], Call], caller: object) -> object:
-        refusal = self.authorization.motion(caller, verb)
+    def authorize(self, command: Command, arguments: Arguments) -> None:
+        """Refuse a motion of a caller that may not move the robot, and a policy that callers may not ask for."""
+        if command.verb.kind is not Kind.MOTION:
+            return
+        refusal = self.authorization.motion(command.caller, command.verb.name)
+        if refusal is None and "policy_provider" in arguments:
+            refusal = self.authorization.provider(arguments["policy_provider"])
         if refusal is not None:
-            return error(refusal)
-        call, asked = prepare(), self.robot.gate.asked()
-        try:
-            answer = await self.moves.run(lambda: self._start(verb, call, asked), MOVE_DEADLINE_S)
-        except TimeoutError:
-            # This call alone: to revoke the gate without a halt would leave what moves with its last command.
-            asked.give_up()
-            raise
-        logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb, shown(caller))
-        self.changed.set()
-        return answer
+            raise Refused(RefusalReason.CALLER, refusal)
 
-    def _start(self, verb: str, call: Call, asked: Asked) -> object:
-        """The part of a motion that may touch a disk or a device: lockout, approval, the robot's verb."""
-        with self.robot.gate.asked_at(asked):
-            return self._permitted(verb, call)
+    def _resume(self, arguments: Arguments) -> Envelope:
+        registration = self.registration
+        return error("resume rejected") if registration is None else registration.resume(arguments["assertion"])
 
-    def _permitted(self, verb: str, call: Call) -> object:
-        locked = self.robot.gate.refusal(verb)
-        if locked is not None:
-            return locked
-        if not self.hardware:
-            return call()
-        claim = self.approval.claim(verb, self.peer_id)
-        if claim is None:
-            return error(Approval.refusal(verb, self.peer_id))
-        answer: object = None
-        try:
-            answer = call()
-        finally:
-            if answer is None or is_error(answer):
-                claim.give_back()
-            else:
-                claim.spend()
-        return answer
+    def _status(self, arguments: Arguments) -> object:
+        """The robot's status with its lockouts and the dead-man check-in."""
+        run = self.verbs["getStatus"].run
+        answer = run(self.robot, arguments) if run is not None else None
+        if self.registration is None or not isinstance(answer, dict):
+            return answer
+        return {**answer, **self.registration.facts()}
 
-    async def _guarded(self, verb: str, work: Callable[[], Awaitable[object]]) -> Envelope:
-        try:
-            return _enveloped(verb, await work())
-        except ValidationError as exc:
-            return error(str(exc))
-        except MotionRefused as exc:
-            return _enveloped(verb, exc.envelope)
-        except LaneFullError as exc:
-            return error(f"{verb} refused: the robot has not yet answered earlier {exc} calls; try again later.")
-        except TimeoutError:
-            return error(f"The robot did not answer {verb} in time; what it may still start is void.")
-        except Exception:
-            logger.exception("%s: %s failed.", self.peer_id, verb)
-            return error(f"{verb} failed inside the device; its log has the details.")
+    # Stops.
 
-    # The stop.
+    def stop_target(self) -> Haltable:
+        """Return what ``stop`` halts: everything that moves."""
+        return self.robot
 
-    @rpc(labels={"direction": "write", "safety": "critical"})
-    async def resume(self, assertion: dict[str, Any]) -> dict[str, Any]:
-        """Free the robot of one emergency stop, at the word of the operator's key; nothing starts to move by it.
+    def stop_within(self) -> float | None:
+        """Return the seconds in which ``stop`` is answered; None for the halt deadline."""
+        return None
 
-        Args:
-            assertion: What the operator's resume key signed: v, epoch, targets, t, nonce and sig
-        """
-        seat = self.seat
-        if seat is None:
-            return error("resume rejected")
-        return await self._guarded("resume", lambda: self.alarms.run(lambda: seat.resume(assertion), READ_DEADLINE_S))
+    def stop_envelope(self, verdict: StopVerdict) -> Envelope:
+        """Return the answer to ``stop`` for a verdict."""
+        return verdict.envelope()
 
-    def with_safety(self, call: Call) -> Call:
-        """``call`` whose answer also says what holds the robot and how the dead-man check-in stands."""
-
-        def read() -> object:
-            answer = call()
-            if self.seat is None or not isinstance(answer, dict):
-                return answer
-            return {**answer, **self.seat.facts()}
-
-        return read
-
-    def halt(self, reason: str) -> StopVerdict:
-        """Halt every motion source and wait for the verdict, at most the halt deadline. Callable from any thread."""
-        within = settings.number("STRANDS_HALT_DEADLINE_S")
-        try:
-            answer: object = self.stops.start(lambda: self.robot.halt(reason)).result(within)
-        except FutureTimeoutError:
-            return StopVerdict(not_stopped={self.peer_id: f"no answer in {within:g} s"}, elapsed_ms=within * 1000)
-        except LaneFullError:
-            self.robot.gate.revoke()
-            return StopVerdict(unknown={self.peer_id: "earlier stops are still unanswered"})
-        except Exception as exc:  # noqa: BLE001 - whatever a halt raises is graded
-            answer = exc
-        return answer if isinstance(answer, StopVerdict) else _graded(self.peer_id, answer)
-
-    async def halted(self, work: Callable[[], Envelope]) -> Envelope:
-        """Run a stop on threads of its own; the answer to the caller, which is never a refusal to try."""
-        within = 2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0
-        try:
-            return _enveloped("stop", await self.alarms.run(work, within))
-        except LaneFullError:
-            self.robot.gate.revoke()
-            return error(
-                "Earlier stops of this robot are still unanswered; its motion permits are revoked.", stopped=None
-            )
-        except TimeoutError:
-            return error(f"The robot did not answer the stop within {within:g} s.", stopped=False)
-        except Exception as exc:
-            logger.exception("%s: stop failed.", self.peer_id)
-            return error(f"stop failed inside the device: {type(exc).__name__}; its log has the details.", stopped=None)
+    async def stop_answer(self, reason: str) -> Envelope:
+        """Halt and answer within the halt deadline, whoever asks."""
+        halting = stop_executor().submit(self.stop_target(), self.peer_id, reason, within=self.stop_within())
+        verdict = await asyncio.wrap_future(halting)
+        return enveloped("stop", self.stop_envelope(verdict))
 
     def handle_estop(self, device_id: object, payload: object) -> StopVerdict | None:
-        """Act on an emergency stop: halt, and log what did not. None when it does not count. Any thread."""
-        if device_id == self.peer_id:
-            return None
-        refusal = self.authorization.estop(device_id)
-        if refusal is not None:
-            logger.warning("%s: emergency stop ignored: %s.", self.peer_id, refusal)
-            return None
-        why = payload.get("reason", "") if isinstance(payload, Mapping) else ""
-        verdict = self.halt(f"emergency stop of {device_id}: {shown(why)}")
-        told = verdict.envelope()
-        if verdict.stopped:
-            logger.warning(
-                "%s: halted by emergency stop of %s: %s", self.peer_id, device_id, told["content"][0]["text"]
-            )
-        else:
-            logger.critical("%s: EMERGENCY STOP of %s DID NOT STOP IT: %s", self.peer_id, device_id, told.get("reason"))
-        return verdict
+        """Act on an emergency stop and wait for the verdict; None when it does not count. Any thread."""
+        halting = self._begin_estop(device_id, payload)
+        return None if halting is None else halting.result()
 
     @emit(labels={"safety": "critical"})
     async def emergencyStop(self, reason: str = "") -> None:
@@ -240,33 +222,173 @@ class RobotDriver(LiveDriver):
         await self.on_estop(device_id, payload)
 
     async def on_estop(self, device_id: object, payload: object) -> None:
-        """The second road of an emergency stop: into the safety plane, or, off the network, off the loop at least."""
+        """Act on an emergency stop that came by the runtime: in the safety plane, or off the network by itself."""
+        if device_id != self.peer_id and self.registration is not None:
+            self.registration.runtime_estop(device_id, payload)
+        else:
+            self._begin_estop(device_id, payload)
+
+    def _begin_estop(self, device_id: object, payload: object) -> Future[StopVerdict] | None:
         if device_id == self.peer_id:
+            return None
+        refusal = self.authorization.estop(device_id)
+        if refusal is not None:
+            logger.warning("%s: emergency stop ignored: %s.", self.peer_id, refusal)
+            return None
+        why = payload.get("reason", "") if isinstance(payload, Mapping) else ""
+        halting = stop_executor().submit(self.robot, self.peer_id, f"emergency stop of {device_id}: {shown(why)}")
+        halting.add_done_callback(lambda halted: self._log_estop(device_id, halted.result()))
+        return halting
+
+    def _log_estop(self, device_id: object, verdict: StopVerdict) -> None:
+        answer = verdict.envelope()
+        if verdict.stopped:
+            text = answer["content"][0]["text"]
+            logger.warning("%s: halted by emergency stop of %s: %s", self.peer_id, device_id, text)
+        else:
+            reason = answer.get("reason")
+            logger.critical("%s: EMERGENCY STOP of %s DID NOT STOP IT: %s", self.peer_id, device_id, reason)
+
+    # State.
+
+    def glance(self) -> Activity:
+        """Ask the robot for its activity. May block: runs on a thread."""
+        raise NotImplementedError
+
+    async def tell(self, activity: Activity) -> None:
+        """Emit the state events of ``activity``."""
+        raise NotImplementedError
+
+    async def tell_rollout(self, event: RolloutEvent) -> None:
+        """Emit the events that belong to ``event``."""
+        raise NotImplementedError
+
+    @property
+    def functions(self) -> list[FunctionDef]:
+        """The functions that can be called; read off a class once, not for each robot of a fleet."""
+        if type(self) not in _FUNCTIONS:
+            _FUNCTIONS[type(self)] = tuple(super().functions)
+        return list(_FUNCTIONS[type(self)])
+
+    @property
+    def events(self) -> list[EventDef]:
+        """The events that can be received; read off a class once, too."""
+        if type(self) not in _EVENTS:
+            _EVENTS[type(self)] = tuple(super().events)
+        return list(_EVENTS[type(self)])
+
+    @property
+    def status(self) -> DeviceStatus:
+        """Live availability: busy (score 1.0) while something runs, else idle (0.0)."""
+        activity = self.activity if self._watchers else self._look_now()
+        return DeviceStatus(**_status_fields(activity))
+
+    def heartbeat(self) -> dict[str, Any]:
+        """Return what every heartbeat carries besides the id and the time."""
+        return {**_status_fields(self.activity), "state": jsonable(self.activity.facts)}
+
+    def set_device(self, device: Any) -> None:
+        """Learn the runtime, which has this robot's id on the network."""
+        super().set_device(device)
+        self.runtime = device
+
+    @property
+    def peer_id(self) -> str:
+        """The device's id on the network; before it has one, the robot's own name."""
+        return str(getattr(self.runtime, "device_id", "") or self.robot.tool_name_str)
+
+    def set_event_callback(self, callback: Callable[[str, dict[str, Any]], Any]) -> None:
+        """Emit through ``callback`` on the loop of this call, from whatever thread or loop an event comes."""
+        home = asyncio.get_running_loop()
+
+        async def emit_at_home(name: str, payload: dict[str, Any]) -> None:
+            clean = jsonable(payload)
+            if asyncio.get_running_loop() is home:
+                await callback(name, clean)
+            else:
+                await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(callback(name, clean), home))
+
+        super().set_event_callback(emit_at_home)
+
+    async def connect(self) -> None:
+        """Start telling the state; the robot manages its own hardware connection."""
+        if self.runtime is None or self._watchers:
             return
-        if self.seat is not None:
-            self.seat.second_road(device_id, payload)
-            return
+        self.changed = asyncio.Event()
+        self.activity = await self._looked()
+        pump = RolloutPump(self._on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
+        self._unsubscribe = self.robot.subscribe(pump.observe)
+        self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
+
+    def watches(self) -> list[Any]:
+        """Return the coroutines that run while the device is connected."""
+        idle, busy = settings.number("STRANDS_DC_STATE_HZ"), settings.number("STRANDS_DC_STATE_BUSY_HZ")
+        # A robot may tell that a rollout began before its own status says so.
+        return [paced(lambda: busy if self.activity.busy or self._rolling else idle, self._tell_state, self.changed)]
+
+    async def disconnect(self) -> None:
+        """Stop telling the state; the robot manages its own shutdown."""
+        watchers, self._watchers = self._watchers, []
+        if self._unsubscribe is not None:
+            self._unsubscribe()
+            self._unsubscribe = None
+        for watcher in watchers:
+            watcher.cancel()
+        await asyncio.gather(*watchers, return_exceptions=True)
+
+    async def refresh(self) -> Activity:
+        """Ask the robot again; the answer is what status and presence say from now on."""
+        activity = self.activity = await self._looked()
+        # The runtime announces this very mapping in its presence.
+        self.runtime.status.update(_status_fields(activity))
+        return activity
+
+    async def _on_rollout(self, event: RolloutEvent) -> None:
+        if event.kind == "started":
+            self._rolling.add(event.robot)
+        elif event.kind == "finished":
+            self._rolling.discard(event.robot)
+        await self.tell_rollout(event)
+        if event.kind != "step":
+            self.changed.set()
+
+    async def _tell_state(self) -> None:
+        activity = await self.refresh()
+        if not activity.fault:
+            await self.tell(activity)
+
+    async def _looked(self) -> Activity:
         try:
-            self.alarms.start(lambda: self.handle_estop(device_id, payload))
-        except LaneFullError:
-            if self.authorization.estop(device_id) is None:
-                self.robot.gate.revoke()
-                logger.critical("%s: emergency stop of %s while earlier stops are unanswered.", self.peer_id, device_id)
+            return await called(self.pipeline.shares.read, self.glance, READ_DEADLINE_S)
+        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
+            fault = f"{type(exc).__name__}: {exc}"
+            if fault != self.activity.fault:
+                logger.warning("%s: its state cannot be read: %s", self.peer_id, fault)
+            return Activity(self.activity.busy, self.activity.facts, fault)
+
+    def _look_now(self) -> Activity:
+        try:
+            return self.pipeline.shares.read.call(self.glance).result(1.0)
+        except Exception as exc:  # noqa: BLE001 - a robot that cannot answer is shown with its fault
+            return Activity(fault=f"{type(exc).__name__}: {exc}")
 
 
-def _graded(name: str, answer: object) -> StopVerdict:
-    outcome = grade(answer)
-    if outcome.stopped:
-        return StopVerdict(halted=(name,))
-    where = {name: explain(answer)}
-    return StopVerdict(unknown=where) if outcome.stopped is None else StopVerdict(not_stopped=where)
+def _status_fields(activity: Activity) -> dict[str, Any]:
+    return {
+        "availability": "busy" if activity.busy else "idle",
+        "busy_score": 1.0 if activity.busy else 0.0,
+        "error_state": activity.fault or None,
+    }
 
 
-def _enveloped(verb: str, answer: object) -> Envelope:
-    """A robot's answer as an envelope that JSON can carry."""
-    if not isinstance(answer, Mapping):
-        return error(f"The robot answered {verb} with {shown(answer)}, which nobody here understands.")
-    plain: Envelope = jsonable(answer)
-    if plain.get("status") in ("success", "error"):
-        return plain
-    return success(f"{verb} answered.", **{k: v for k, v in plain.items() if k not in ("content", "status")})
+def _labels(verb: Verb) -> Labels:
+    if verb.kind is Kind.READ:
+        return {"direction": "read"}
+    return {"direction": "write", **({"safety": "critical"} if verb.critical else {})}
+
+
+def _docstring(verb: Verb) -> str:
+    lines = [verb.summary]
+    if verb.parameters:
+        lines += ["", "Args:", *(f"    {each.name}: {each.meaning}" for each in verb.parameters)]
+    return "\n".join(lines)

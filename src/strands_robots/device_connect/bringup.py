@@ -27,11 +27,11 @@ from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
-from strands_robots.device_connect.safety_seat import SafetySeat, take_seat
+from strands_robots.device_connect.safety_registration import SafetyRegistration, register_safety
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
-from strands_robots.device_connect.workers import Lane
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.serving.workers import Share, called
 from strands_robots.utils import ValidationError, choice, device_id
 
 logger = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ class Host:
 
 
 _hosts: dict[Runtime, Host] = {}
-_SEATING = Lane("bring-up", 1000)
+_REGISTRATIONS = Share(running=1000)
 
 
 async def init_device_connect(  # noqa: PLR0917 - the documented signature
@@ -110,14 +110,18 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     driver = driver_for(robot, peer_type)
     announceable(driver)
     said = _listen_to_the_framework(name)
-    seat = asyncio.create_task(
-        _SEATING.run(lambda: take_seat(name, driver, reach, named=peer_id is not None), bringup_timeout)
+    registration = asyncio.create_task(
+        called(
+            _REGISTRATIONS,
+            lambda: register_safety(name, driver, reach, named=peer_id is not None),
+            bringup_timeout,
+        )
     )
 
     async def before_live(messaging: Any) -> None:
         await refuse_duplicate(name, reach, messaging)
         # Before it can be called, it can be stopped.
-        await asyncio.shield(seat)
+        await asyncio.shield(registration)
 
     runtime = Runtime(
         driver=driver,
@@ -129,7 +133,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     )
     if isinstance(driver, RobotDriver):
         runtime.set_heartbeat_provider(driver.heartbeat)
-    task = asyncio.create_task(_live(runtime, seat), name=f"device {name}")
+    task = asyncio.create_task(_live(runtime, registration), name=f"device {name}")
     try:
         await runtime.wait_ready(bringup_timeout)
     except BaseException as exc:
@@ -260,7 +264,7 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
 
         return ReachyMiniDriver(robot=robot)
     if getattr(robot, "nav_action", None) is not None and callable(getattr(robot, "start_navigation", None)):
-        from strands_robots.device_connect.navigating_base_driver import (  # noqa: PLC0415 - as above
+        from strands_robots.device_connect.mobile_base_driver import (  # noqa: PLC0415 - as above
             NavigatingBaseDeviceDriver,
         )
 
@@ -366,18 +370,18 @@ async def _put_down(runtime: Runtime, task: asyncio.Task[None]) -> None:
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def _live(runtime: Runtime, seat: asyncio.Task[SafetySeat | None]) -> None:
+async def _live(runtime: Runtime, registration: asyncio.Task[SafetyRegistration | None]) -> None:
     try:
         await runtime.run()
     finally:
         # Closing a link blocks, so it is done on a thread, to its end.
-        await asyncio.shield(_leave(seat))
+        await asyncio.shield(_leave(registration))
 
 
-async def _leave(seat: asyncio.Task[SafetySeat | None]) -> None:
-    (taken,) = await asyncio.gather(seat, return_exceptions=True)
-    if isinstance(taken, SafetySeat):
-        await _SEATING.run(taken.leave, LEAVE_TIMEOUT_S)
+async def _leave(registration: asyncio.Task[SafetyRegistration | None]) -> None:
+    (taken,) = await asyncio.gather(registration, return_exceptions=True)
+    if isinstance(taken, SafetyRegistration):
+        await called(_REGISTRATIONS, taken.leave, LEAVE_TIMEOUT_S)
 
 
 def _ended(runtime: Runtime, task: asyncio.Task[None]) -> None:

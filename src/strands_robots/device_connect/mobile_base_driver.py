@@ -1,44 +1,24 @@
-"""A mobile base as a device: ``drive`` beside what every robot answers."""
+"""Mobile bases as devices: ``drive``, and ``navigateTo`` where there is a navigation stack."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
-from strands_robots.device_connect._compat import Labels, rpc
-from strands_robots.device_connect.base_driver import Call
-from strands_robots.device_connect.robot_driver import DURATION_MAX_S, RobotDeviceDriver
-from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
-from strands_robots.ros.gate import Approved
-from strands_robots.utils import number
+from strands_robots.device_connect._compat import Labels
+from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.serving.base_verbs import BASE_VERBS, NAVIGATING_BASE_VERBS
+from strands_robots.serving.verbs import Verb
 
 
 class MobileBaseDeviceDriver(RobotDeviceDriver):
-    """A mobile base. Start it with drive, end it with stop.
-
-    Args:
-        robot: a base of :mod:`strands_robots.drivers.ros`.
-    """
+    """A mobile base of :mod:`strands_robots.drivers.ros`. Start it with drive, end it with stop."""
 
     labels: ClassVar[Labels] = {"category": "mobile_base"}
+    verbs: ClassVar[Mapping[str, Verb]] = BASE_VERBS
 
-    def __init__(self, robot: MobileBaseRobot, **options: Any) -> None:
-        super().__init__(robot, **options)
-        self._base = robot
 
-    @rpc(labels={"direction": "write", "safety": "critical"})
-    async def drive(self, linear: float, angular: float, duration: float) -> dict[str, Any]:
-        """Drive for some seconds and return at once; follow it with getStatus or the taskComplete event.
+class NavigatingBaseDeviceDriver(MobileBaseDeviceDriver):
+    """A mobile base that was made with a ``nav_action``. Start it with drive or navigateTo, end it with stop."""
 
-        Args:
-            linear: Speed forwards in m/s; negative reverses
-            angular: Turning rate in rad/s; positive turns left
-            duration: Seconds until the base is stopped again, above 0 and at most 3600
-        """
-
-        def prepare() -> Call:
-            speeds = number("linear", linear), number("angular", angular)
-            seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
-            # The operator's approval of this verb is the approval of the commands that it sends.
-            return lambda: self._base.start_drive(*speeds, seconds, Approved())
-
-        return await self.move("drive", prepare)
+    verbs: ClassVar[Mapping[str, Verb]] = NAVIGATING_BASE_VERBS

@@ -1,44 +1,31 @@
-"""Reachy Mini as a device. Degrees and millimetres here, radians and metres below."""
+"""A Reachy Mini as a device: its verbs, its availability and the events of its motions."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any, ClassVar, cast
 
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
+from strands_robots import settings
 from strands_robots.contract import RolloutEvent, TaskRobot
-from strands_robots.device_connect._compat import Labels, emit, rpc
-from strands_robots.device_connect.base_driver import Call, RobotDriver
-from strands_robots.device_connect.live_driver import Activity
+from strands_robots.device_connect._compat import Labels, emit
+from strands_robots.device_connect.base_driver import Activity, RobotDriver
 from strands_robots.drivers.reachy import ReachyDriver
-from strands_robots.drivers.reachy.connection import STATUS_PATH
-from strands_robots.drivers.reachy.driver import LIBRARIES, motor_names
 from strands_robots.drivers.reachy.links import DEFAULT_PREFIX
-from strands_robots.drivers.reachy.rest import DaemonError
-from strands_robots.drivers.reachy.target import HeadPose, Target, bounded
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import error
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
-from strands_robots.utils import choice, flag, identifier, shown
+from strands_robots.serving.reachy_verbs import REACHY_VERBS
+from strands_robots.serving.verbs import Verb
+from strands_robots.serving.workers import Share, ShareFullError, called
+from strands_robots.utils import flag
 
 logger = logging.getLogger(__name__)
 
-DEGREES, MILLIMETRES = math.degrees(1.0), 1000.0
 UNAVAILABLE = "unavailable"
-_MOTION: Labels = {"direction": "write", "safety": "critical"}
-_READ: Labels = {"direction": "read"}
-
-
-def _angle(key: str, name: str, value: object) -> float:
-    return bounded(key, value, unit="degrees", scale=DEGREES, name=name)
-
-
-def _offset(key: str, name: str, value: object) -> float:
-    return bounded(key, value, unit="mm", scale=MILLIMETRES, name=name)
 
 
 class ReachyMiniDriver(RobotDriver):
@@ -59,6 +46,7 @@ class ReachyMiniDriver(RobotDriver):
 
     device_type = "reachy_mini"
     labels: ClassVar[Labels] = {"category": "robot"}
+    verbs: ClassVar[Mapping[str, Verb]] = REACHY_VERBS
 
     def __init__(
         self,
@@ -74,8 +62,9 @@ class ReachyMiniDriver(RobotDriver):
     ) -> None:
         self.reachy = robot or ReachyDriver(host, prefix, api_port, transport=transport)
         self._release = flag("release_on_estop", release_on_estop)
-        # The door needs of a robot its name, gate, halt and subscribe; tasks by instruction are not a Reachy's.
+        # A driver needs of a robot its name, gate, halt and subscribe; tasks by instruction are not a Reachy's.
         super().__init__(cast(TaskRobot, self.reachy), hardware=True, authorization=authorization, approval=approval)
+        self._emergencies = Share()
 
     @property
     def identity(self) -> DeviceIdentity:
@@ -120,189 +109,6 @@ class ReachyMiniDriver(RobotDriver):
         await super().disconnect()
         await asyncio.to_thread(self.reachy.disconnect)
 
-    def answering(self, verb: Callable[[], object]) -> Call:
-        """``verb`` whose daemon errors are answers."""
-
-        def call() -> object:
-            try:
-                return verb()
-            except DaemonError as exc:
-                return error(str(exc), http_status=exc.status)
-
-        return call
-
-    async def act(self, name: str, verb: Callable[[], object]) -> dict[str, Any]:
-        """Start a motion without arguments."""
-        return await self.move(name, lambda: self.answering(verb))
-
-    # Motion.
-
-    @rpc(labels=_MOTION)
-    async def look(  # noqa: PLR0917 - the documented signature
-        self, pitch: float = 0, roll: float = 0, yaw: float = 0, x: float = 0, y: float = 0, z: float = 0
-    ) -> dict[str, Any]:
-        """Set the head pose: at once within a short way, else by a quick ramp that any later motion or stop ends.
-
-        Args:
-            pitch: Degrees, -40 to 40, positive looks down; pitch and roll together at most 60
-            roll: Degrees, -40 to 40
-            yaw: Degrees, -180 to 180, positive looks left; the body turns along beyond 65
-            x: Forward offset in mm, -25 to 25
-            y: Leftward offset in mm, -25 to 25
-            z: Upward offset in mm, -30 to 15
-        """
-
-        def prepare() -> Call:
-            head = HeadPose(
-                pitch=_angle("head_pitch", "pitch", pitch),
-                roll=_angle("head_roll", "roll", roll),
-                yaw=_angle("head_yaw", "yaw", yaw),
-                x=_offset("head_x", "x", x),
-                y=_offset("head_y", "y", y),
-                z=_offset("head_z", "z", z),
-            )
-            target = self.reachy.checked(Target(head))
-            return self.answering(lambda: self.reachy.go(target, "look"))
-
-        return await self.move("look", prepare)
-
-    @rpc(labels=_MOTION)
-    async def antennas(self, left: float = 0, right: float = 0) -> dict[str, Any]:
-        """Set the antenna angles.
-
-        Args:
-            left: Left antenna in degrees, -180 to 180
-            right: Right antenna in degrees, -180 to 180
-        """
-
-        def prepare() -> Call:
-            target = Target(antennas=(_angle("antenna_right", "right", right), _angle("antenna_left", "left", left)))
-            return self.answering(lambda: self.reachy.go(target, "antennas"))
-
-        return await self.move("antennas", prepare)
-
-    @rpc(labels=_MOTION)
-    async def body(self, yaw: float = 0) -> dict[str, Any]:
-        """Turn the body.
-
-        Args:
-            yaw: Degrees, -160 to 160, positive turns left
-        """
-
-        def prepare() -> Call:
-            target = self.reachy.checked(Target(body_yaw=_angle("body_yaw", "yaw", yaw)))
-            return self.answering(lambda: self.reachy.go(target, "body"))
-
-        return await self.move("body", prepare)
-
-    @rpc(labels=_MOTION)
-    async def nod(self) -> dict[str, Any]:
-        """Nod the head: yes."""
-        return await self.act("nod", lambda: self.reachy.gesture("nod"))
-
-    @rpc(labels=_MOTION)
-    async def shake(self) -> dict[str, Any]:
-        """Shake the head: no."""
-        return await self.act("shake", lambda: self.reachy.gesture("shake"))
-
-    @rpc(labels=_MOTION)
-    async def happy(self) -> dict[str, Any]:
-        """Wiggle the antennas: happy."""
-        return await self.act("happy", lambda: self.reachy.gesture("happy"))
-
-    @rpc(labels=_MOTION)
-    async def wakeUp(self) -> dict[str, Any]:
-        """Enable the motors, make sure that they are, and play the wake-up; its end is told by motionComplete."""
-        return await self.act("wakeUp", self.reachy.wake_up)
-
-    @rpc(labels=_MOTION)
-    async def sleep(self) -> dict[str, Any]:
-        """Lie down, with the motors off at the end; the end is told by motionComplete."""
-        return await self.act("sleep", self.reachy.sleep)
-
-    @rpc(labels=_MOTION)
-    async def playMove(self, move_name: str, library: str = "emotions") -> dict[str, Any]:
-        """Play a recorded move; its end is told by motionComplete.
-
-        Args:
-            move_name: Name of the move, as listMoves gives it
-            library: Which library, one of 'emotions' or 'dances'
-        """
-
-        def prepare() -> Call:
-            name, known = identifier("move_name", move_name), choice("library", library, tuple(LIBRARIES))
-            return self.answering(lambda: self.reachy.catalogue.play(name, known))
-
-        return await self.move("playMove", prepare)
-
-    @rpc(labels=_MOTION)
-    async def enableMotors(self, motor_ids: str = "") -> dict[str, Any]:
-        """Switch torque on. Whatever moves is stopped first.
-
-        Args:
-            motor_ids: Comma list of motor names or bus ids; empty for all
-        """
-        return await self._torque("enableMotors", True, motor_ids)
-
-    @rpc(labels=_MOTION)
-    async def disableMotors(self, motor_ids: str = "") -> dict[str, Any]:
-        """Switch torque off; the head drops. Whatever moves is stopped first.
-
-        Args:
-            motor_ids: Comma list of motor names or bus ids; empty for all
-        """
-        return await self._torque("disableMotors", False, motor_ids)
-
-    async def _torque(self, verb: str, on_: bool, motor_ids: object) -> Envelope:
-        def prepare() -> Call:
-            names = ",".join(motor_names(motor_ids))
-            return self.answering(lambda: self.reachy.motors.torque(on_, names, verb))
-
-        return await self.move(verb, prepare)
-
-    # Stops and reads: answered to every caller.
-
-    @rpc(labels=_MOTION)
-    async def stopMotion(self) -> dict[str, Any]:
-        """Stop everything that moves now, gestures and every move of the daemon; the answer says what stopped."""
-        return await self.halted(lambda: self.halt("stopMotion").envelope())
-
-    @rpc(labels=_READ)
-    async def getStatus(self) -> dict[str, Any]:
-        """Link, daemon state and version, motor mode, application, data age, motion, and what holds the robot."""
-        return await self.read("getStatus", self.with_safety(lambda: success("Reachy Mini.", **self.reachy.facts())))
-
-    @rpc(labels=_READ)
-    async def getDaemonStatus(self) -> dict[str, Any]:
-        """The daemon's own status object under this device's verdict, or why the daemon was not reached."""
-        return await self.read("getDaemonStatus", self.answering(self._daemon_status))
-
-    @rpc(labels=_READ)
-    async def getJoints(self) -> dict[str, Any]:
-        """Joint positions by motor name in radians and their age in seconds; stale ones are refused."""
-        return await self.read("getJoints", self.reachy.get_joints)
-
-    @rpc(labels=_READ)
-    async def getImu(self) -> dict[str, Any]:
-        """Accelerometer, gyroscope, quaternion (w x y z), temperature and their age; stale ones are refused."""
-        return await self.read("getImu", self.reachy.get_imu)
-
-    @rpc(labels=_READ)
-    async def listMoves(self, library: str = "emotions") -> dict[str, Any]:
-        """Names of the recorded moves, or why they are unknown.
-
-        Args:
-            library: Which library, one of 'emotions' or 'dances'
-        """
-        return await self.read("listMoves", lambda: self.reachy.catalogue.names(library))
-
-    def _daemon_status(self) -> Envelope:
-        payload = self.reachy.connection.rest.get(STATUS_PATH)
-        if not isinstance(payload, dict):
-            return error(f"The daemon's status is no object: {shown(payload)}.")
-        told = success("The daemon's status.", daemon=payload)
-        return {**payload, "status": told["status"], "content": told["content"]}
-
     # Emergency.
 
     @emit(labels={"safety": "critical"})
@@ -312,7 +118,14 @@ class ReachyMiniDriver(RobotDriver):
         Args:
             reason: Why the emergency stop was triggered
         """
-        told = await self.halted(lambda: self.reachy.emergency_stop(reason, release=self._release))
+        within = 2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0
+        try:
+            told = await called(
+                self._emergencies, lambda: self.reachy.emergency_stop(reason, release=self._release), within
+            )
+        except (ShareFullError, TimeoutError):
+            self.robot.gate.revoke()
+            told = error(f"the robot did not answer within {within:g} s.")
         level = logging.WARNING if told.get("stopped") else logging.CRITICAL
         text = told["content"][0]["text"]
         logger.log(level, "%s: emergency stop (%s): %s Torque %s.", self.peer_id, reason, text, told.get("torque"))

@@ -1,37 +1,24 @@
-"""A robot with one body as a device: ``execute``, ``stop`` and reads, and the events of its tasks."""
+"""A robot with one body as a device: its verbs, and the events of its tasks."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from device_connect_edge.types import DeviceIdentity
 
 from strands_robots.bus_access import read_joints
 from strands_robots.contract import RUNNING, AdaptedRobot, RolloutEvent, adapt
-from strands_robots.device_connect._compat import Labels, emit, rpc
-from strands_robots.device_connect.base_driver import Call, RobotDriver
-from strands_robots.device_connect.live_driver import Activity
+from strands_robots.device_connect._compat import Labels, emit
+from strands_robots.device_connect.base_driver import Activity, RobotDriver
 from strands_robots.device_connect.telemetry import numbers
 from strands_robots.envelope import fields_of
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
-from strands_robots.utils import ValidationError, identifier, number, text, whole
-
-DURATION_MAX_S = 3600.0
-"""Longest task in seconds, the bound of both networks."""
-
-
-def task_arguments(
-    authorization: Authorization, instruction: object, policy_provider: object, duration: object
-) -> tuple[str, str, float]:
-    """The checked arguments of ``execute``. Raises :class:`ValidationError` naming the first that is out of domain."""
-    checked = text("instruction", instruction), identifier("policy_provider", policy_provider)
-    seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
-    refusal = authorization.provider(checked[1])
-    if refusal is not None:
-        raise ValidationError(refusal, "POLICY_TYPE_NOT_ALLOWED")
-    return (*checked, seconds)
+from strands_robots.serving.pipeline import Command
+from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.verbs import Arguments, Verb
 
 
 class RobotDeviceDriver(RobotDriver):
@@ -43,6 +30,7 @@ class RobotDeviceDriver(RobotDriver):
 
     device_type = "strands_robot"
     labels: ClassVar[Labels] = {"category": "robot"}
+    verbs: ClassVar[Mapping[str, Verb]] = ARM_VERBS
 
     def __init__(
         self,
@@ -71,48 +59,10 @@ class RobotDeviceDriver(RobotDriver):
             description=f"Robot {self._model}",
         )
 
-    @rpc(labels={"direction": "write", "safety": "critical"})
-    async def execute(
-        self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
-    ) -> dict[str, Any]:
-        """Start a task on the robot and return at once; follow it with getStatus or the taskComplete event.
-
-        Args:
-            instruction: What to do, in plain language, 1 to 2000 characters
-            policy_provider: Policy that decides the actions, such as mock, remote or lerobot_local
-            duration: Longest time the task may take, in seconds, above 0 and at most 3600
-            policy_port: TCP port of the policy's server, 1 to 65535; 0 for the provider's own
-        """
-
-        def prepare() -> Call:
-            what, provider, seconds = task_arguments(self.authorization, instruction, policy_provider, duration)
-            port = whole("policy_port", policy_port, low=0, high=65535)
-            self._provider = provider
-            return lambda: self.task_robot.start_task(
-                what, policy_provider=provider, duration=seconds, policy_port=port
-            )
-
-        return await self.move("execute", prepare)
-
-    @rpc(labels={"direction": "write", "safety": "critical"})
-    async def stop(self) -> dict[str, Any]:
-        """Stop everything that moves the robot now; the answer says whether it stopped."""
-        return await self.halted(lambda: self.halt("stop").envelope())
-
-    @rpc(labels={"direction": "read"})
-    async def getStatus(self) -> dict[str, Any]:
-        """What the robot is doing: task state, instruction and steps so far."""
-        return await self.read("getStatus", self.with_safety(self.task_robot.get_task_status))
-
-    @rpc(labels={"direction": "read"})
-    async def getFeatures(self) -> dict[str, Any]:
-        """What the robot senses and what it can be told: its observation and action features."""
-        return await self.read("getFeatures", self.task_robot.get_features)
-
-    @rpc(labels={"direction": "read"})
-    async def getState(self) -> dict[str, Any]:
-        """Joint positions by name, in the robot's own units, and the task."""
-        return await self.read("getState", self.task_robot.get_state)
+    def authorize(self, command: Command, arguments: Arguments) -> None:
+        """Refuse as every device does, and note the policy for a robot that tells no rollout by itself."""
+        super().authorize(command, arguments)
+        self._provider = arguments.get("policy_provider", self._provider)
 
     @emit()
     async def taskStarted(self, instruction: str, policy_provider: str) -> None:

@@ -16,22 +16,20 @@ from typing import Any
 from strands_robots.contract import Observer, Unsubscribe, WorldRobot
 from strands_robots.envelope import Envelope, error
 from strands_robots.mesh import topics
+from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.dispatch import Dispatcher, stop_one
-from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
-from strands_robots.mesh.serving import Line, MotionDoor, Server
-from strands_robots.mesh.teleop import TeleopDesk
+from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Declaration, LiveTransport, TransportError
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.pipeline import Own, Pipeline
+from strands_robots.serving.robot_verbs import TELEOP_VERBS, RobotStop
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)
 
-MOST = 64
-
-Resume = Callable[[object], dict[str, Any]]
+CHILDREN_MAX = 64
 
 
 class OneRobot:
@@ -75,10 +73,21 @@ class OneRobot:
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop this robot alone."""
-        return stop_one(self._world, self.tool_name_str) if self.list_robots() else StopVerdict()
+        stop = self.stop_target()
+        return StopVerdict() if stop is None else stop.halt(reason)
+
+    def stop_target(self, name: str = "") -> RobotStop | None:
+        """Return the stop of this robot; None when it left its world.
+
+        Raises:
+            ValidationError: ``name`` is another robot's.
+        """
+        if name not in ("", self.tool_name_str):
+            raise ValidationError(f"there is no robot of this name; there are {self.tool_name_str}")
+        return RobotStop(self._world, self.tool_name_str) if self.list_robots() else None
 
     def facts(self) -> dict[str, Any]:
-        """What presence says of it."""
+        """Return its fields of presence."""
         running = self.list_policies_running()
         told: dict[str, Any] = {
             "tool_name": self.tool_name_str,
@@ -98,16 +107,17 @@ class OneRobot:
 @dataclass(slots=True)
 class _Child:
     context: Context
-    herald: PresencePublisher
-    held: list[Declaration]
-    begun: float
+    presence: PresencePublisher
+    pipeline: Pipeline
+    handles: list[Declaration]
+    since: float
     # In memory a heartbeat is delivered on the thread that announces, and who hears it may leave the mesh there.
     leaving: threading.RLock = field(default_factory=threading.RLock)
     gone: bool = False
 
     def presentable(self) -> bool:
         """Whether it may be announced: it has a description, or one that hangs had its time."""
-        return self.herald.described.is_set() or self.context.monotonic() - self.begun >= DESCRIBE_S
+        return self.presence.described.is_set() or self.context.monotonic() - self.since >= DESCRIBE_S
 
 
 class Children:
@@ -115,37 +125,39 @@ class Children:
 
     Args:
         context: the parent's.
-        line: where the parent's commands stand, and the children's with them.
+        pipeline: the parent's, whose threads and pending commands the children share.
+        kind: the parent's type.
+        own: the verbs that the parent answers for its children.
         teleop: the parent's input streams, which may drive any of the robots.
-        locked: whether the parent's lockout holds.
-        resume: admits an assertion at the parent.
+        audit: makes the audit of a child.
     """
 
     def __init__(
         self,
         context: Context,
         world: WorldRobot,
-        lanes: Lanes,
+        pipeline: Pipeline,
         *,
         kind: str,
-        line: Line,
-        teleop: TeleopDesk,
-        locked: Callable[[], bool],
-        resume: Resume,
+        own: Mapping[str, Own],
+        teleop: TeleopReceivers,
         audit: Callable[[str], AuditThrottle],
     ) -> None:
         self._context = context
         self._world = world
-        self._lanes = lanes
+        self._pipeline = pipeline
         self._kind = kind
-        self._line = line
+        self._own = own
         self._teleop = teleop
-        self._locked = locked
-        self._resume = resume
         self._audit = audit
         self._children: dict[str, _Child] = {}
-        self._told: set[str] = set()
+        self._unnamed: set[str] = set()
         self._closed = threading.Event()
+
+    @property
+    def peers(self) -> set[str]:
+        """The ids of the children that there are now."""
+        return set(self._children)
 
     def refresh(self) -> None:
         """Announce the robots that came and take away those that went."""
@@ -153,7 +165,7 @@ class Children:
         if transport is None or transport.session_id is None or getattr(transport, "pins_topics", False):
             return
         names = self._world.list_robots()
-        wanted = {each: name for name in names[:MOST] if (each := self._id(name))} if len(names) > 1 else {}
+        wanted = {each: name for name in names[:CHILDREN_MAX] if (each := self._id(name))} if len(names) > 1 else {}
         for peer in list(self._children):
             if peer not in wanted:
                 self._end(peer)
@@ -164,14 +176,14 @@ class Children:
                     self._end(peer)
         # When all have begun: a robot that hangs in its read costs no other its commands.
         for child in list(self._children.values()):
-            child.herald.refresh()
+            child.presence.refresh()
 
     def announce(self) -> None:
         for child in list(self._children.values()):
             with child.leaving:
                 # A heartbeat after its token went would have it in reach again.
                 if not child.gone and child.presentable():
-                    child.herald.announce()
+                    child.presence.announce()
 
     def close(self) -> None:
         self._closed.set()
@@ -183,8 +195,8 @@ class Children:
         try:
             return identifier("peer_id", peer)
         except ValidationError as exc:
-            if robot not in self._told:
-                self._told.add(robot)
+            if robot not in self._unnamed:
+                self._unnamed.add(robot)
                 logger.warning("A robot of this world is not announced by itself: %s", exc)
             return None
 
@@ -194,42 +206,46 @@ class Children:
         if transport is None:
             raise TransportError("the mesh is not running.")
         context = replace(parent, peer_id=peer, audit=self._audit(peer))
-        dispatcher = Dispatcher(robot, robot.halt, closing=lambda: not parent.running())
-
-        def dispatch(command: dict[str, Any]) -> Any:
-            action = command["action"]
-            if action == "resume":
-                return self._resume(command["assertion"])
-            if action == "ping":
-                return {}
-            if action == "stop":
-                with self._teleop.stopping():
-                    return dispatcher(command)
-            if action.startswith("teleop_"):
-                return error(f"{action}: {name} is one robot of a world; ask {parent.peer_id}.")
-            return dispatcher(command)
-
-        door = MotionDoor(context, hardware=False)
-        server = Server(
-            context, self._lanes, door, self._locked, dispatch, line=self._line.of(name), meant=dispatcher.meant
+        parents = dict.fromkeys(TELEOP_VERBS, self._ask_parent(name))
+        pipeline = Pipeline.of(
+            robot,
+            lambda: peer,
+            hardware=False,
+            authorize=SenderCheck(context, hardware=False),
+            own={**self._own, **parents, "execute": execute_on(robot, parent)},
+            pending=self._pipeline.pending.of(name),
+            shares=self._pipeline.shares,
         )
-        held: list[Declaration] = []
-        child = _Child(context, PresencePublisher(context, self._kind, robot.facts), held, context.monotonic())
-        held.append(transport.declare_subscriber(topics.command(peer), server.on_command))
-        held.append(transport.declare_subscriber(topics.broadcast(), server.on_command))
+        server = CommandReceiver(
+            context,
+            pipeline,
+            target_of=robot.stop_target,
+            before_stop=self._teleop.void,
+            after_stop=self._teleop.reap,
+        )
+        presence = PresencePublisher(context, self._kind, robot.facts)
+        handles: list[Declaration] = []
+        child = _Child(context, presence, pipeline, handles, context.monotonic())
+        handles.append(transport.declare_subscriber(topics.command(peer), server.on_command))
+        handles.append(transport.declare_subscriber(topics.broadcast(), server.on_command))
         session = transport.session_id
         if isinstance(transport, LiveTransport) and session is not None:
-            held.append(transport.declare_token(topics.token(peer, session)))
+            handles.append(transport.declare_token(topics.token(peer, session)))
         return child
 
+    def _ask_parent(self, name: str) -> Own:
+        text = f"{name} is one robot of a world; ask {self._context.peer_id}."
+        return lambda arguments: error(text)
+
     def _end(self, peer: str) -> None:
-        # The sampler and whoever leaves the mesh may both come: the first one ends it.
+        # The sampler and a stop of the mesh may both come: the first one ends it.
         child = self._children.pop(peer, None)
         if child is None:
             return
         with child.leaving:
             child.gone = True
-        for each in child.held:
+        child.pipeline.close()
+        for each in child.handles:
             with contextlib.suppress(TransportError):  # the session may be gone already, and the subscriber with it
                 each.undeclare()
         child.context.audit.close()

@@ -6,22 +6,14 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.wire_identity import Identity
-from strands_robots.policies import policy_names
 
 logger = logging.getLogger(__name__)
-
-
-@lru_cache(maxsize=1)
-def registered_providers() -> tuple[str, ...]:
-    """The policy providers of this machine; read once, because a message must not cost a look at the disk."""
-    return policy_names()
 
 
 @dataclass(slots=True)
@@ -32,7 +24,6 @@ class Context:
         clock: wall-clock seconds, as stated on the wire.
         monotonic: seconds, for ages.
         audit: records refusals; ``audit.always`` records what may never be left out.
-        providers: gives the policy providers of this machine, those of plug-ins included.
         transport: None while the peer is not on the mesh.
     """
 
@@ -42,7 +33,6 @@ class Context:
     identity: Identity
     clock: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic
-    providers: Callable[[], tuple[str, ...]] = registered_providers
     transport: Transport | None = field(default=None)
 
     def running(self) -> bool:

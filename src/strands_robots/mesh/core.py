@@ -1,4 +1,4 @@
-"""The mesh peer that a robot exposes: presence, commands, streams, safety, composed from their own modules."""
+"""A robot as a peer of the mesh: its presence, commands, streams and safety, composed from their modules."""
 
 from __future__ import annotations
 
@@ -8,18 +8,39 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.mesh.assembly import Parts, assemble
-from strands_robots.mesh.dispatch import fit
+from strands_robots.contract import WorldRobot, body_of
+from strands_robots.mesh import session, topics
+from strands_robots.mesh.children import Children
+from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on
+from strands_robots.mesh.context import Context
+from strands_robots.mesh.executor import BoundedExecutor
+from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
+from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.rpc import Requester
+from strands_robots.mesh.safety import FleetSafety, SafetyAdapter
+from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.security import validate_peer_id
-from strands_robots.mesh.sensors import SensorLoopsMixin
-from strands_robots.mesh.subscriptions import DataCallback, SampleCallback
-from strands_robots.mesh.topics import stream
-from strands_robots.mesh.transport import Sample
+from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
+from strands_robots.mesh.state import Description, StateReader
+from strands_robots.mesh.stream import StepPublisher
+from strands_robots.mesh.subscriptions import DataCallback, SampleCallback, Subscriptions
+from strands_robots.mesh.teleop import TeleopReceivers, join
+from strands_robots.mesh.throttle import AuditSink, AuditThrottle
+from strands_robots.mesh.transport import Declaration, Sample, Transport
+from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
+from strands_robots.mesh.wire_identity import Identity, signature_policy
+from strands_robots.recording.cameras import frames_of
+from strands_robots.safety.persistence import simulation_key
+from strands_robots.safety.plane import SafetyPlane
+from strands_robots.serving.pipeline import Own, Pipeline
+from strands_robots.serving.robot_verbs import served
 from strands_robots.utils import number
 
 logger = logging.getLogger(__name__)
@@ -27,8 +48,39 @@ logger = logging.getLogger(__name__)
 LOOP_JOIN_TIMEOUT_S = 2.0
 """Seconds that :meth:`Mesh.stop` waits, in all, for what it started."""
 
+PRUNE_HZ = 1.0
+TOKENS_HZ = 5.0
+DELIVERIES_MAX = 1024
+"""Messages of the user's subscriptions that wait for their callbacks."""
+
 _local: dict[str, Mesh] = {}
 _local_lock = threading.Lock()
+
+
+@dataclass(slots=True)
+class Parts:
+    """What a peer takes from its process, and a test gives it instead.
+
+    Attributes:
+        acquire: gives the transport, connected, or None; ``release`` gives it back.
+        identity: gives the signer and verifier of a transport.
+        audit: where safety events go; the audit log by default.
+        keep: the lockout outlives the process under the peer's id.
+    """
+
+    acquire: Callable[[], Transport | None] = session.acquire
+    release: Callable[[], None] = session.release_session
+    registry: PeerRegistry = field(default_factory=session.registry)
+    clock: Callable[[], float] = time.time
+    monotonic: Callable[[], float] = time.monotonic
+    identity: Callable[[Transport], Identity] | None = None
+    audit: AuditSink | None = None
+    plane: SafetyPlane | None = None
+    keep: bool = False
+
+    def recorder(self, name: str) -> AuditThrottle:
+        """Return the audit of a peer."""
+        return AuditThrottle(name) if self.audit is None else AuditThrottle(name, self.audit)
 
 
 class Mesh(SensorLoopsMixin):
@@ -49,13 +101,72 @@ class Mesh(SensorLoopsMixin):
     def __init__(self, robot: Any, peer_id: str, peer_type: str = "robot", *, parts: Parts | None = None) -> None:
         self.peer_id = validate_peer_id(peer_id)
         self.peer_type = peer_type
-        self.robot = fit(robot)
+        self.robot = None if robot is None else served(robot)
         self._parts = parts or Parts()
         self._lifecycle_lock = threading.Lock()
         self._frames: dict[str, count[int]] = {}
-        self._assembled = assemble(self, self._parts)
-        self._context = self._assembled.context
-        self._sensors = self._assembled.sensors
+        key = _safety_key(self.robot, self.peer_id, keep=self._parts.keep)
+        # A locked robot that leaves the mesh stays on the safety plane: to leave and join again must not unlock it.
+        self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane)
+        self._compose()
+
+    def _compose(self) -> None:
+        """Make the parts of one stay on the mesh."""
+        parts, robot, peer = self._parts, self.robot, self.peer_id
+        hardware = robot is not None and not isinstance(robot, WorldRobot) and self.peer_type != "sim"
+        self._context = context = Context(
+            peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
+        )
+        self._handles: list[Declaration] = []
+        self._inputs: dict[str, dict[str, Any]] = {}
+        self._scheduler = Scheduler(f"mesh-{peer}")
+        self._sensors = SensorPublisher(context, self._scheduler)
+        self._requester = Requester(context)
+        self._teleop = TeleopReceivers(lambda source, device: InputReceiver(self, body_of(robot), source, device))
+        self._description = Description(peer, robot)
+        self._presence = PresencePublisher(context, self.peer_type, self._describe)
+        self._state = StateReader(peer, robot, parts.clock)
+        self._steps = StepPublisher(context, robot, settings.number("STRANDS_MESH_STREAM_HZ"))
+        self._delivery = BoundedExecutor(f"{peer}-delivery", 1, DELIVERIES_MAX, drop_oldest=True)
+        self._subscriptions = Subscriptions(self._delivery)
+        own: dict[str, Own] = {
+            "teleop_status": self._teleop.status,
+            "teleop_receive": self._teleop.receive,
+            "teleop_stop": self._teleop.stop,
+            "ping": lambda arguments: {},
+            "resume": lambda arguments: self._safety.on_resume_command(arguments.get("assertion")),
+        }
+        if robot is not None:
+            own["execute"] = execute_on(robot, context, lambda: self._pipeline.closed)
+        self._pipeline = Pipeline.of(
+            robot, lambda: peer, hardware=hardware, authorize=SenderCheck(context, hardware=hardware), own=own
+        )
+        self._commands = CommandReceiver(
+            context, self._pipeline, before_stop=self._teleop.void, after_stop=self._teleop.reap
+        )
+        self._safety = FleetSafety(
+            context, self._adapter, self._requester, self._pipeline.shares.resume, robot=robot is not None
+        )
+        self.children: Children | None = None
+        if isinstance(robot, WorldRobot):
+            answered_here = {name: own[name] for name in ("ping", "resume")}
+            self.children = Children(
+                context,
+                robot,
+                self._pipeline,
+                kind=self.peer_type,
+                own=answered_here,
+                teleop=self._teleop,
+                audit=parts.recorder,
+            )
+
+    def _describe(self) -> dict[str, Any]:
+        """Return the fields of presence: the robot's own, and the streams of this peer."""
+        fields = self._description.read()
+        if self._inputs:
+            fields["inputs"] = list(self._inputs.values())
+        topics_published = self._sensors.topics()
+        return {**fields, "topics": topics_published} if topics_published else fields
 
     # Life.
 
@@ -73,8 +184,8 @@ class Mesh(SensorLoopsMixin):
             if transport is None:
                 return
             try:
-                self._assembled.door.open()
-                self._assembled.begin(transport)
+                self._adapter.open()
+                self._begin(transport)
             except BaseException:
                 # Whoever cannot join holds nothing: neither the session nor half of its subscribers.
                 self._leave()
@@ -93,23 +204,89 @@ class Mesh(SensorLoopsMixin):
                 del _local[self.peer_id]
 
     def _leave(self) -> None:
-        self._assembled.end(LOOP_JOIN_TIMEOUT_S)
+        self._end(LOOP_JOIN_TIMEOUT_S)
         self._parts.release()
-        # A locked peer stays with the safety plane: leaving and joining again must not unlock it.
-        if not self._assembled.door.epochs():
-            self._assembled.door.close()
-        self._assembled = assemble(self, self._parts, self._assembled)
-        self._context = self._assembled.context
-        self._sensors = self._assembled.sensors
+        if not self._adapter.epochs():
+            self._adapter.close()
+        self._compose()
+
+    def _begin(self, transport: Transport) -> None:
+        """Receive before being seen: the safety topics first, then commands, presence, the publishers."""
+        context, peer = self._context, self.peer_id
+        context.transport = transport
+        context.identity = (self._parts.identity or identity_of)(transport)
+        for key, receive in (
+            # The resumes first: one that the broker kept tells which kept e-stop is over.
+            (topics.resume(), self._safety.on_resume),
+            (topics.estop(), self._safety.on_estop),
+            (topics.command(peer), self._commands.on_command),
+            (topics.broadcast(), self._commands.on_command),
+            (topics.responses(peer), self._requester.on_response),
+        ):
+            self._handles.append(transport.declare_subscriber(key, receive))
+        self._presence.start()
+        every, rates = self._scheduler.every, topics.BY_NAME
+        if self.robot is not None:
+            self.add_robot_sensors()
+        every("describe", rates["presence"].rate_hz, self._presence.refresh)
+        every("state", rates["state"].rate_hz, self._publish_state)
+        if self.children is not None:
+            every("children", rates["presence"].rate_hz, self.children.refresh)
+            every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
+        every("tokens", TOKENS_HZ, self._presence.judge_tokens, quick=True)
+        every("prune", PRUNE_HZ, self._prune, quick=True)
+        frames = frames_of(self.robot)
+        if frames is not None:
+            every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), CameraPublisher(context, frames).publish)
+        self._scheduler.start()
+        self._steps.start()
+        # A robot whose bus is wedged is announced all the same, by its name alone.
+        self._presence.described.wait(DESCRIBE_S)
+        every("presence", rates["presence"].rate_hz, self._presence.announce, quick=True)
+        if not settings.is_set("STRANDS_MESH_RESUME_PUBLIC_KEY"):
+            logger.info("%s: no resume key is configured; an emergency stop is cleared at this machine only.", peer)
+
+    def _end(self, timeout: float) -> None:
+        """Stop what publishes, then what receives, then the workers."""
+        deadline = time.monotonic() + timeout
+
+        def left() -> float:
+            return max(0.0, deadline - time.monotonic())
+
+        streams = self._teleop.close()
+        alive = self._scheduler.stop(left()) + self._sensors.stop(left()) + self._steps.stop(left())
+        self._requester.close()
+        dropped = self._subscriptions.clear()
+        if dropped:
+            logger.info("%s left the mesh and dropped %d subscriptions.", self.peer_id, dropped)
+        self._presence.stop()
+        if self.children is not None:
+            self.children.close()
+        for handle in self._handles:
+            handle.undeclare()
+        self._handles = []
+        alive += self._pipeline.close(left()) + self._delivery.stop(left()) + join(streams, left())
+        self._context.transport = None
+        self._context.audit.close()
+        if alive:
+            logger.warning("%s left the mesh with loops still running: %s.", self.peer_id, ", ".join(alive))
+
+    def _publish_state(self) -> None:
+        body = self._state.read()
+        if body is not None:
+            self._context.put(topics.state(self.peer_id), body)
+
+    def _prune(self) -> None:
+        self._context.registry.prune()
 
     def close(self) -> None:
         """Leave the mesh for good, and the safety plane with it."""
         self.stop()
-        self._assembled.door.close()
+        self._adapter.close()
 
     def announce(self) -> None:
         """Publish one heartbeat now, besides those the scheduler sends."""
-        self._assembled.herald.announce()
+        self._presence.announce()
 
     # Who is there.
 
@@ -140,19 +317,24 @@ class Mesh(SensorLoopsMixin):
         """The session that a peer last announced itself from, or None. A hint: its publisher chose it."""
         return self._context.registry.session_of(peer_id)
 
+    @property
+    def stops_waiting(self) -> int:
+        """The stops of other peers that have no answer yet."""
+        return len(self._commands.stops)
+
     # Asking.
 
     def send(self, target: str, cmd: dict[str, Any], timeout: float = 30.0) -> dict[str, Any]:
         """Send a command to one peer. Its raw reply; or status ``timeout``; or status ``error`` with the reason."""
-        return self._assembled.caller.send(target, cmd, timeout)
+        return self._requester.send(target, cmd, timeout)
 
     def ping(self, target: str, timeout: float = 2.0) -> dict[str, Any]:
         """Is a peer reachable, and how fast: ``status``, ``latency_ms``, ``via``, and ``confirmed`` where it is ok."""
-        return self._assembled.caller.ping(target, timeout)
+        return self._requester.ping(target, timeout)
 
     def broadcast(self, cmd: dict[str, Any], timeout: float = 5.0) -> list[dict[str, Any]]:
         """Send a command to every peer and collect replies for ``timeout`` seconds."""
-        return self._assembled.caller.broadcast(cmd, timeout)
+        return self._requester.broadcast(cmd, timeout)
 
     def tell(self, target: str, instruction: str, **kw: Any) -> dict[str, Any]:
         """Ask a peer to run a policy and wait: an ``execute`` with ``policy_provider=`` and what it needs."""
@@ -196,22 +378,22 @@ class Mesh(SensorLoopsMixin):
         if transport is None:
             logger.warning("subscribe %s: %s is not on the mesh.", topic, self.peer_id)
             return None
-        done = self._assembled.subscriptions.add(transport, topic, chosen, callback=callback, on_sample=on_sample)
+        done = self._subscriptions.add(transport, topic, chosen, callback=callback, on_sample=on_sample)
         return chosen if done else None
 
     def listen(self, topic: str, heard: Callable[[Sample], None], name: str) -> bool:
         """Hear raw samples on the transport's thread; for parts of the mesh that return at once."""
         transport = self._context.transport
-        return transport is not None and self._assembled.subscriptions.add(transport, topic, name, direct=heard)
+        return transport is not None and self._subscriptions.add(transport, topic, name, direct=heard)
 
     def unsubscribe(self, name: str) -> None:
         """Drop a subscription by its name; an unknown one is fine."""
-        self._assembled.subscriptions.remove(name)
+        self._subscriptions.remove(name)
 
     @property
     def inbox(self) -> dict[str, Any]:
         """The latest messages of each subscription without a callback, oldest first."""
-        return dict(self._assembled.subscriptions.inbox)
+        return dict(self._subscriptions.inbox)
 
     def publish_step(
         self,
@@ -225,18 +407,18 @@ class Mesh(SensorLoopsMixin):
 
         The rollouts of this peer's own robot are published without it, at the same rate.
         """
-        self._assembled.steps.publish(step, observation, action, instruction, policy)
+        self._steps.publish(step, observation, action, instruction, policy)
 
     def on_stream(self, peer_id: str, callback: DataCallback | None = None) -> str | None:
         """Hear another peer's policy steps."""
-        return self.subscribe(stream(peer_id), callback)
+        return self.subscribe(topics.stream(peer_id), callback)
 
     def announce_input(self, device: str, method: str | None, hz: float) -> None:
         """Name an input stream of this peer in its presence; without ``method`` it is no longer named."""
         if method is None:
-            self._assembled.inputs.pop(device, None)
+            self._inputs.pop(device, None)
         else:
-            self._assembled.inputs[device] = {"device": device, "method": method, "hz": hz}
+            self._inputs[device] = {"device": device, "method": method, "hz": hz}
 
     def next_input(self, device: str) -> int:
         """The number of the next frame of an input stream. It rises for as long as this peer lives, so that a follower
@@ -256,7 +438,7 @@ class Mesh(SensorLoopsMixin):
     @property
     def lockout_epoch(self) -> str | None:
         """The id of the e-stop that holds this peer's lockout, the oldest of several; None while clear."""
-        return next(iter(self._assembled.door.epochs()), None)
+        return next(iter(self._adapter.epochs()), None)
 
     def emergency_stop(self) -> list[dict[str, Any]]:
         """Stop and lock this robot and every peer; the answer of the robot here, if any, then each peer's.
@@ -269,7 +451,7 @@ class Mesh(SensorLoopsMixin):
         # A link that is down for the moment keeps nobody from stopping here, and the fleet hears of it later.
         if self._context.transport is None:
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
-        return self._assembled.safety.emergency_stop()
+        return self._safety.emergency_stop()
 
     def resume(self, signing_key: Any, *, targets: list[str] | None = None) -> dict[str, Any]:
         """Clear this peer's lockout and the fleet's with the operator's key.
@@ -281,7 +463,27 @@ class Mesh(SensorLoopsMixin):
         Returns:
             ``{"status": "ok"}``, or status ``error`` and ``resume rejected``; the reason is in the local audit.
         """
-        return self._assembled.safety.resume(signing_key, targets)
+        return self._safety.resume(signing_key, targets)
+
+
+def _safety_key(robot: Any, peer: str, *, keep: bool) -> str | None:
+    """Under what the robot's lockout outlives the process: its hardware's own key, else the id it was given."""
+    own = getattr(robot, "safety_key", None)
+    if isinstance(own, str) and own:
+        return own
+    return simulation_key(peer) if keep and robot is not None else None
+
+
+def identity_of(transport: Transport) -> Identity:
+    """The identity that the environment asks for on this transport.
+
+    Signed where the session has certificates. MQTT's own certificates are the broker's business, so there it is signed
+    only where that is demanded, with the mesh's.
+    """
+    posture: Posture | None = getattr(transport, "posture", None)
+    if posture is not None:
+        return Identity.from_settings(posture.credentials)
+    return Identity.from_settings(TlsCredentials.from_settings() if signature_policy() == "1" else None)
 
 
 def init_mesh(robot: Any, peer_id: str | None = None, peer_type: str = "robot", mesh: bool = True) -> Mesh | None:

@@ -1,4 +1,4 @@
-"""Bounded work: commands on a few workers, stops on one of their own. A fleet stop waits for no worker."""
+"""A few threads and a bounded queue, for work that must hold up neither the transport nor a command."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ logger = logging.getLogger(__name__)
 Work = Callable[[], None]
 
 
-class Lane:
+class BoundedExecutor:
     """At most ``workers`` threads and ``depth`` waiting jobs. Threads start with the first job and end with stop.
 
     Args:
-        drop_oldest: a full lane forgets its oldest job instead of refusing the new one.
+        drop_oldest: a full executor forgets its oldest job instead of refusing the new one.
     """
 
     def __init__(self, name: str, workers: int, depth: int, *, drop_oldest: bool = False) -> None:
@@ -32,7 +32,7 @@ class Lane:
         self.dropped = 0
 
     def submit(self, work: Work) -> bool:
-        """Queue a job; False when the lane is full or closed."""
+        """Queue a job; False when the executor is full or closed."""
         if not self._open:
             return False
         while True:
@@ -70,7 +70,7 @@ class Lane:
         return self.join(timeout)
 
     def join(self, timeout: float) -> list[str]:
-        """Wait for the threads of a closed lane; names of those still running."""
+        """Wait for the threads of a closed executor; names of those still running."""
         with self._lock:
             threads = list(self._threads)
         deadline = time.monotonic() + timeout
@@ -102,24 +102,3 @@ class Lane:
             finally:
                 with self._lock:
                     self._done += 1
-
-
-class Lanes:
-    """The lanes of one peer: motions (4 workers, 32 waiting), what reads or ends one (2, 32), stops, their answers,
-    resumes, and delivery to its user."""
-
-    def __init__(self, peer_id: str) -> None:
-        self.stop_lane = Lane(f"{peer_id}-stop", 1, 128)
-        # As deep as there may be stops without an answer, each of which is a job at most.
-        self.answers = Lane(f"{peer_id}-answer", 1, 8192)
-        self.resumes = Lane(f"{peer_id}-resume", 1, 64)
-        self.commands = Lane(f"{peer_id}-command", 4, 32)
-        self.quick = Lane(f"{peer_id}-quick", 2, 32)
-        self.delivery = Lane(f"{peer_id}-delivery", 1, 1024, drop_oldest=True)
-
-    def stop(self, timeout: float) -> list[str]:
-        deadline = time.monotonic() + timeout
-        alive: list[str] = []
-        for lane in (self.commands, self.quick, self.delivery, self.resumes, self.stop_lane, self.answers):
-            alive += lane.stop(max(0.0, deadline - time.monotonic()))
-        return alive

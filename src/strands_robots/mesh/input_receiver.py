@@ -7,21 +7,18 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.bus_access import read_joints
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, validate_mesh_identifier
 from strands_robots.mesh.transport import Sample
 from strands_robots.policies.base import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.utils import ValidationError
-
-if TYPE_CHECKING:
-    from strands_robots.mesh.core import Mesh
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +33,31 @@ UNITS_FULL_SCALE = {"normalized": 100.0, "radians": 6.283185307179586, "degrees"
 """Largest magnitude in each unit: LeRobot's normalised range is -100 to 100, an angle's one turn."""
 
 
+class FollowerMesh(Protocol):
+    """The part of a mesh peer that a receiver uses."""
+
+    robot: Any
+
+    @property
+    def lockout_epoch(self) -> str | None:
+        """The epoch that locks the peer, or None."""
+
+    def peer_wire_zid(self, peer_id: str) -> str | None:
+        """Return the session that a peer announced itself from, or None."""
+
+    def listen(self, topic: str, heard: Callable[[Sample], None], name: str) -> bool:
+        """Receive raw samples on the transport's thread; False off the mesh."""
+
+    def unsubscribe(self, name: str) -> None:
+        """Drop a subscription."""
+
+    def record(self, event: str, about: str, **payload: Any) -> None:
+        """Record an event in the audit log."""
+
+    def now(self) -> float:
+        """Return wall-clock seconds."""
+
+
 class InputReceiver:
     """Applies a remote peer's actions to ``robot``.
 
@@ -48,7 +70,7 @@ class InputReceiver:
 
     def __init__(
         self,
-        mesh: Mesh,
+        mesh: FollowerMesh,
         robot: Any,
         source_peer_id: str,
         device_name: str = "leader",
@@ -60,7 +82,7 @@ class InputReceiver:
         self._device = validate_mesh_identifier(device_name, "device_name")
         self._apply: ApplyFn = apply_fn or (lambda body, action: body.send_action(action))
         self._limits = joint_limits(robot)
-        self._lane: Lane | None = None
+        self._executor: BoundedExecutor | None = None
         self._running = False
         self._permit: Permit | None = None
         self._session: str | None = None
@@ -95,7 +117,7 @@ class InputReceiver:
             "frames_received": counts["received"],
             "errors": counts["errors"],
             "out_of_order": counts["out_of_order"],
-            "rate_dropped": counts["rate_dropped"] + (self._lane.dropped if self._lane else 0),
+            "rate_dropped": counts["rate_dropped"] + (self._executor.dropped if self._executor else 0),
             "slew_rejected": counts["slew"],
             "rejected": sum(rejections.values()),
             **rejections,
@@ -132,27 +154,27 @@ class InputReceiver:
         if self._running:
             self._running, self._ended = False, time.monotonic()
             self._mesh.unsubscribe(self._name)
-            if self._lane is not None:
-                self._lane.close()
+            if self._executor is not None:
+                self._executor.close()
 
     def join(self, timeout: float) -> bool:
         """Wait for the frame that a closed stream still applies; False, with a warning, when that is not done."""
-        if self._lane is None or not self._lane.join(timeout):
+        if self._executor is None or not self._executor.join(timeout):
             return True
         logger.warning("%s: an action is still being applied.", self.topic)
         return False
 
     def on_frame(self, sample: Sample) -> None:
         """A frame on the transport's thread: queued for the stream's own."""
-        lane = self._lane
-        if not self._running or lane is None:
+        executor = self._executor
+        if not self._running or executor is None:
             return
         if sample.session != self._session:
             # Not queued, so that a stranger's flood displaces none of the leader's frames.
             self._counts["source"] += 1
             return
         heard = time.monotonic()
-        lane.submit(lambda: self._take(sample, heard))
+        executor.submit(lambda: self._take(sample, heard))
 
     def _open(self) -> str | None:
         session = self._mesh.peer_wire_zid(self._source)
@@ -168,7 +190,7 @@ class InputReceiver:
         self._session, self._sequence, self._last, self._seeded = session, -1, {}, False
         self._tokens, self._refilled = BURST, time.monotonic()
         self._counts = Counter()
-        self._lane = Lane(f"mesh-follow-{self._device}", 1, DEPTH, drop_oldest=True)
+        self._executor = BoundedExecutor(f"mesh-follow-{self._device}", 1, DEPTH, drop_oldest=True)
         self._opened, self._ended, self._running = time.monotonic(), 0.0, True
         if not self._mesh.listen(self.topic, self.on_frame, self._name):
             self._running, self._ended = False, time.monotonic()

@@ -223,7 +223,7 @@ class Requester:
         if not isinstance(target, str) or not target or "\x00" in target:
             return f"target must be a non-empty string without NUL, not {shown(target)}."
         try:
-            clean = validate_command(command, providers=self._context.providers)
+            clean = validate_command(command)
             seconds = number("timeout", timeout, above=0)
         except ValidationError as exc:
             return f"validation: {exc}"

@@ -16,9 +16,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from strands_robots.envelope import is_error
-from strands_robots.mesh import dispatch, topics, wire
+from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.executor import Lane
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
@@ -27,6 +26,8 @@ from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, ne
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, sign
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain
+from strands_robots.serving.robot_verbs import peer_stop_answer
+from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.utils import ValidationError, identifier, shown
 
 logger = logging.getLogger(__name__)
@@ -202,7 +203,7 @@ class FleetSafety:
     """
 
     def __init__(
-        self, context: Context, adapter: SafetyAdapter, requester: Requester, resumes: Lane, *, robot: bool = True
+        self, context: Context, adapter: SafetyAdapter, requester: Requester, resumes: Share, *, robot: bool = True
     ) -> None:
         self._context = context
         self._adapter = adapter
@@ -278,7 +279,7 @@ class FleetSafety:
         if not self._robot:
             return []
         context = self._context
-        result = dispatch.told(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
+        result = peer_stop_answer(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
         return [wire.Reply("response", context.peer_id, order.epoch, result, timestamp=context.clock()).to_wire()]
 
     def _publish_estop(self, order: StopOrder, counts: dict[str, Any]) -> None:
@@ -397,7 +398,10 @@ class FleetSafety:
         targets = assertion.get("targets")
         if not isinstance(targets, list) or context.peer_id not in targets:
             return
-        self._resumes.submit(lambda: self._admit_relayed(relay))
+        try:
+            self._resumes.submit(lambda: self._admit_relayed(relay))
+        except ShareFullError as exc:
+            logger.warning("%s: a relayed resume was left out: %s", context.peer_id, exc)
 
     def _note_retained(self, assertion: Any) -> None:
         """Note the epoch of a retained resume: it is too old to clear a lockout, but ends the retained e-stop."""

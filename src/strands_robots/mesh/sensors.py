@@ -27,7 +27,7 @@ from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.throttle import TroubleLog
 from strands_robots.recording.cameras import Frames, jpeg
@@ -91,7 +91,7 @@ class SensorPublisher:
     def __init__(self, context: Context, scheduler: Scheduler) -> None:
         self._context = context
         self._scheduler = scheduler
-        self._lane = Lane(f"{context.peer_id}-sensors", READERS, WAITING)
+        self._executor = BoundedExecutor(f"{context.peer_id}-sensors", READERS, WAITING)
         self._sensors: dict[str, _Sensor] = {}
         self._troubles = TroubleLog(logger)
 
@@ -110,12 +110,12 @@ class SensorPublisher:
 
     def stop(self, timeout: float) -> list[str]:
         """Read no more; names of threads that still read after ``timeout`` seconds."""
-        return self._lane.stop(timeout)
+        return self._executor.stop(timeout)
 
     def _due(self, sensor: _Sensor) -> None:
         if not sensor.busy:
             sensor.busy = True
-            if not self._lane.submit(lambda: self._sample(sensor)):
+            if not self._executor.submit(lambda: self._sample(sensor)):
                 sensor.busy = False
 
     def _sample(self, sensor: _Sensor) -> None:

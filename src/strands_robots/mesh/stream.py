@@ -10,7 +10,7 @@ from typing import Any
 from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.throttle import RateLimiter
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
@@ -37,7 +37,7 @@ class StepPublisher:
         self._hz = hz
         self._handed_in = RateLimiter(hz)
         self._limits: dict[str, RateLimiter] = {}
-        self._lane = Lane(f"{context.peer_id}-stream", 1, WAITING, drop_oldest=True)
+        self._executor = BoundedExecutor(f"{context.peer_id}-stream", 1, WAITING, drop_oldest=True)
         self._unsubscribe: Unsubscribe | None = None
         self._several = False
         self._unpublished = 0
@@ -58,7 +58,7 @@ class StepPublisher:
         unsubscribe, self._unsubscribe = self._unsubscribe, None
         if callable(unsubscribe):
             unsubscribe()
-        return self._lane.stop(timeout)
+        return self._executor.stop(timeout)
 
     def on_event(self, event: object) -> None:
         """Take a rollout event, on its control thread; returns at once."""
@@ -76,7 +76,7 @@ class StepPublisher:
                 action = {prefix + key: value for key, value in event.action.items()}
                 self._put(stamp, event.step, observation, action, instruction=event.instruction, policy=event.policy)
 
-            self._lane.submit(publish)
+            self._executor.submit(publish)
 
     def publish(
         self, step: int, observation: Mapping[str, Any], action: Mapping[str, Any], instruction: str, policy: str

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.executor import Lane
+from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError
 
 logger = logging.getLogger(__name__)
@@ -27,8 +27,8 @@ class Subscriptions:
     A slow callback loses the oldest messages; it never delays a command or a stop.
     """
 
-    def __init__(self, lane: Lane) -> None:
-        self._lane = lane
+    def __init__(self, executor: BoundedExecutor) -> None:
+        self._executor = executor
         self._lock = threading.Lock()
         self._declared: dict[str, Declaration] = {}
         self.inbox: dict[str, deque[dict[str, Any]]] = {}
@@ -95,6 +95,6 @@ class Subscriptions:
                     inbox.append({"key": sample.key, **data})
 
         def submit(sample: Sample) -> None:
-            self._lane.submit(lambda: deliver(sample))
+            self._executor.submit(lambda: deliver(sample))
 
         return submit

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Iterable
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.mesh.executor import Lanes
 from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.serving.verbs import Arguments
+from strands_robots.serving.workers import POOL
 
 STREAMS_MAX = 8
 JOIN_S = 2.0
@@ -18,20 +17,15 @@ JOIN_S = 2.0
 Key = tuple[str, str]
 
 
-class TeleopDesk:
-    """Opens, tells and closes receivers; at most eight at once.
+class TeleopReceivers:
+    """Opens, lists and closes receivers; at most eight at once."""
 
-    Args:
-        lanes: off the stop lane, ``answers`` closes what a stop has voided, and ``commands`` waits for it.
-    """
-
-    def __init__(self, open_receiver: Callable[[str, str], InputReceiver], lanes: Lanes) -> None:
+    def __init__(self, open_receiver: Callable[[str, str], InputReceiver]) -> None:
         self._open = open_receiver
-        self._lanes = lanes
         self._receivers: dict[Key, InputReceiver] = {}
         self._lock = threading.Lock()
 
-    def receive(self, command: dict[str, Any]) -> Envelope:
+    def receive(self, command: Arguments) -> Envelope:
         """Follow ``source_peer_id``'s device (``leader`` by default)."""
         key = (command["source_peer_id"], command.get("device_name", "leader"))
         with self._lock:
@@ -47,13 +41,13 @@ class TeleopDesk:
             self._receivers[key] = receiver
         return success(f"Following {key[0]}/{key[1]}.", **receiver.stats)
 
-    def status(self, command: dict[str, Any]) -> Envelope:
+    def status(self, command: Arguments) -> Envelope:
         """The counters of every stream."""
         with self._lock:
             streams = [receiver.stats for receiver in self._receivers.values()]
         return success(f"{sum(stream['running'] for stream in streams)} input streams run.", streams=streams)
 
-    def stop(self, command: dict[str, Any]) -> Envelope:
+    def stop(self, command: Arguments) -> Envelope:
         """Close the named stream, or all of them, and wait at most 2 s for the frames that are being applied."""
         source, device = command.get("source_peer_id"), command.get("device_name")
         with self._lock:
@@ -66,28 +60,20 @@ class TeleopDesk:
         with self._lock:
             return self._end(lambda key, each: True)
 
-    @contextmanager
-    def stopping(self) -> Iterator[None]:
-        """Around a stop, of the robot or of one of a world's: no frame moves anything from its beginning on.
+    def void(self) -> None:
+        """Let no frame move anything from now on, because a robot is being stopped.
 
-        Voiding a stream waits for nothing, neither for the lock nor for a frame that a slow bus still takes.
+        It waits for nothing, neither for the lock nor for a frame that a slow bus still takes.
         """
         for receiver in list(self._receivers.values()):
             receiver.void()
-        try:
-            yield
-        finally:
-            self._lanes.answers.submit(self._reap)
 
-    def _reap(self) -> None:
+    def reap(self) -> None:
+        """Close the streams that a stop has voided; their last frames are waited for on a thread of the pool."""
         with self._lock:
             ended = self._end(lambda key, each: not each.running)
-
-        def wait() -> None:
-            join(ended, JOIN_S)
-
         if ended:
-            self._lanes.commands.submit(wait)
+            POOL.submit(lambda: _joined(ended))
 
     def _end(self, chosen: Callable[[Key, InputReceiver], bool]) -> list[InputReceiver]:
         ended = [self._receivers.pop(key) for key, each in list(self._receivers.items()) if chosen(key, each)]
@@ -100,3 +86,7 @@ def join(closed: Iterable[InputReceiver], timeout: float) -> list[str]:
     """Wait for the frames that closed streams still apply, ``timeout`` seconds in all; whose are not done by then."""
     deadline = time.monotonic() + timeout
     return [each.topic for each in closed if not each.join(max(0.0, deadline - time.monotonic()))]
+
+
+def _joined(closed: Iterable[InputReceiver]) -> None:
+    join(closed, JOIN_S)

@@ -197,6 +197,14 @@ class MotionGate:
         finally:
             self._here.asked = before
 
+    def lockout(self, verb: str) -> Envelope | None:
+        """Return the answer to ``verb`` while locked, else None."""
+        for latch in self._latches:
+            locked = latch.refusal(verb)
+            if locked is not None:
+                return locked
+        return None
+
     def refusal(self, verb: str) -> Envelope | None:
         """The answer to ``verb`` while locked, or when the robot was halted since it was asked for; else None."""
         return self._refusal(verb, self._asked_here())
@@ -237,10 +245,9 @@ class MotionGate:
         return getattr(self._here, "asked", None) or Asked(self._generation)
 
     def _refusal(self, verb: str, asked: Asked) -> Envelope | None:
-        for latch in self._latches:
-            locked = latch.refusal(verb)
-            if locked is not None:
-                return locked
+        locked = self.lockout(verb)
+        if locked is not None:
+            return locked
         late = asked.given_up or asked.generation != self._generation
         return error(_LATE.format(verb)) if late else None
 

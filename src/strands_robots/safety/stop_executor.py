@@ -248,9 +248,6 @@ class StopExecutor:
         Returns:
             A future of the graded verdict. It is set at the latest when the time is over, and never to an exception.
         """
-        gate = getattr(target, "gate", None)
-        if isinstance(gate, MotionGate):
-            gate.revoke()
         limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
         slot = self._slot(target, name)
         stop = _Stop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
@@ -258,6 +255,10 @@ class StopExecutor:
         stop.future.set_running_or_notify_cancel()
         if answered is not None:
             stop.future.add_done_callback(lambda future: answered(future.result()))
+        gate = getattr(target, "gate", None)
+        if slot.running is not None and isinstance(gate, MotionGate):
+            # Its own halt, which voids permits after it has seen what moves, cannot begin yet.
+            gate.revoke()
         if slot in getattr(self._here, "serving", ()):
             # A halt that asks for itself again: this thread is the one that carries it out.
             self._serve(slot, [stop])

@@ -19,7 +19,7 @@ def code_for(payload):
 @pytest.mark.parametrize("rpc_id", ["1", "", 7, 1.5, None])
 def test_command_with_any_id_of_the_specification_is_one(rpc_id):
     checked = jsonrpc.check(json.dumps({**GOOD, "id": rpc_id}).encode())
-    assert checked == jsonrpc.Command("getStatus", rpc_id)
+    assert checked == jsonrpc.RpcRequest("getStatus", rpc_id)
 
 
 def test_command_needs_no_params_and_no_version():
@@ -105,7 +105,7 @@ JSON = st.recursive(
 @given(st.fixed_dictionaries({}, optional={"id": JSON, "method": JSON, "params": JSON, "jsonrpc": JSON}))
 def test_every_object_is_a_command_or_has_a_code(request_):
     checked = jsonrpc.check(json.dumps(request_).encode())
-    assert isinstance(checked, jsonrpc.Command) or checked.code in (-32600, -32602)
+    assert isinstance(checked, jsonrpc.RpcRequest) or checked.code in (-32600, -32602)
 
 
 @given(JSON)

@@ -52,7 +52,7 @@ Handler = Callable[[bytes, str | None], Awaitable[None]]
 Answer = Callable[[bytes], Awaitable[None] | None]
 """Sends an encoded reply to one caller; what it returns, if anything, is awaited."""
 
-Serve = Callable[[jsonrpc.Command, Answer | None], Coroutine[Any, Any, None]]
+Serve = Callable[[jsonrpc.RpcRequest, Answer | None], Coroutine[Any, Any, None]]
 """Carries a command out and answers it; there is no answer where no caller waits for one."""
 
 CallSoon = Callable[[Callable[[], None]], object]
@@ -200,7 +200,7 @@ class CommandServer:
         if tasks:
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _admitted(self, data: bytes | int) -> jsonrpc.Command | jsonrpc.Refusal:
+    def _admitted(self, data: bytes | int) -> jsonrpc.RpcRequest | jsonrpc.Refusal:
         command = jsonrpc.too_large(data) if isinstance(data, int) else jsonrpc.check(data)
         running = len(self._running)
         if running < MAX_COMMANDS or isinstance(command, jsonrpc.Refusal):
@@ -209,7 +209,7 @@ class CommandServer:
             return command
         return jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {running} commands are running", command.id)
 
-    def _finished(self, command: jsonrpc.Command, reply: Any, task: asyncio.Future[None]) -> None:
+    def _finished(self, command: jsonrpc.RpcRequest, reply: Any, task: asyncio.Future[None]) -> None:
         self._running.discard(task)
         problem = None if task.cancelled() else task.exception()
         if problem is not None:
@@ -263,7 +263,7 @@ class PendingReplies:
 def relaying(handler: Handler, replies: PendingReplies) -> Serve:
     """Serve commands by a handler that publishes its reply; the caller is answered even when it does not."""
 
-    async def relay(command: jsonrpc.Command, answer: Answer | None) -> None:
+    async def relay(command: jsonrpc.RpcRequest, answer: Answer | None) -> None:
         if answer is None:
             await handler(command.data, None)
             return
@@ -293,7 +293,7 @@ def reserved(method: str) -> bool:
     return method.startswith(("stop", "get", "list", "describe")) or method in ("emergencyStop", "requestRegistration")
 
 
-def _failure(command: jsonrpc.Command, problem: BaseException | None) -> bytes:
+def _failure(command: jsonrpc.RpcRequest, problem: BaseException | None) -> bytes:
     reason = "the device gave no answer" if problem is None else f"{type(problem).__name__} in the device"
     return jsonrpc.error(command.id, jsonrpc.INTERNAL_ERROR, reason)
 

@@ -36,7 +36,7 @@ RpcId = str | int | float | None
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class RpcRequest:
     """A well-formed command, parsed; ``data`` is the message it came as."""
 
     method: str
@@ -82,7 +82,7 @@ def sendable(reply: bytes, size_max: int | None = None) -> bytes:
     return reply
 
 
-def check(data: bytes) -> Command | Refusal:
+def check(data: bytes) -> RpcRequest | Refusal:
     """Parse ``data``: a command, or the refusal it is owed. Never raises."""
     if len(data) > MAX_COMMAND_BYTES:
         return too_large(len(data))
@@ -122,7 +122,7 @@ def _id_of(data: bytes) -> RpcId:
     return rpc_id if isinstance(rpc_id, str | int | float) else None
 
 
-def _check_request(request: dict[str, Any], data: bytes) -> Command | Refusal:
+def _check_request(request: dict[str, Any], data: bytes) -> RpcRequest | Refusal:
     if "id" not in request:
         return Refusal(INVALID_REQUEST, "id is missing")
     rpc_id = request["id"]
@@ -137,7 +137,7 @@ def _check_request(request: dict[str, Any], data: bytes) -> Command | Refusal:
         return Refusal(INVALID_REQUEST, f"method must be a name, not {shown(method)}", rpc_id)
     params = request.get("params", {})
     problem = _params_problem(params)
-    return Refusal(INVALID_PARAMS, problem, rpc_id) if problem else Command(method, rpc_id, params, data)
+    return Refusal(INVALID_PARAMS, problem, rpc_id) if problem else RpcRequest(method, rpc_id, params, data)
 
 
 def _params_problem(params: object) -> str:

@@ -1,4 +1,4 @@
-"""A device's place in the safety plane: its robot held, its stops heard on the lane, its second road joined to it."""
+"""A device's registration with the safety plane: its robot, its e-stop connection, and its runtime's e-stop handler."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from strands_robots.safety.plane import Registered, plane
 logger = logging.getLogger(__name__)
 
 
-def take_seat(device_id: str, driver: DeviceDriver, link: LinkConfig, *, named: bool) -> SafetySeat | None:
+def register_safety(
+    device_id: str, driver: DeviceDriver, link: LinkConfig, *, named: bool
+) -> SafetyRegistration | None:
     """Put a driver's robot under the safety plane before it is on the network; None for a driver without a robot.
 
     Args:
@@ -32,10 +34,10 @@ def take_seat(device_id: str, driver: DeviceDriver, link: LinkConfig, *, named: 
     if not isinstance(robot, Haltable) or not isinstance(gate, MotionGate):
         logger.warning("%s has no robot that the safety plane could halt; it hears no emergency stop.", device_id)
         return None
-    seat = SafetySeat(device_id, robot, link, _key(device_id, driver, robot, named=named))
-    if hasattr(driver, "seat"):
-        driver.seat = seat
-    return seat
+    registration = SafetyRegistration(device_id, robot, link, _key(device_id, driver, robot, named=named))
+    if hasattr(driver, "registration"):
+        driver.registration = registration
+    return registration
 
 
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
@@ -47,8 +49,8 @@ def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> st
     return simulation_key(device_id) if named else None
 
 
-class SafetySeat:
-    """One robot's entry in the plane and its seat on the lane."""
+class SafetyRegistration:
+    """One robot in the safety plane and on the e-stop listener."""
 
     def __init__(self, device_id: str, robot: Any, link: LinkConfig, key: str | None) -> None:
         self.device_id = device_id
@@ -69,7 +71,7 @@ class SafetySeat:
         """True while the lane's link of this device reaches somebody."""
         return self._seat.link.up
 
-    def second_road(self, source: object, params: object) -> None:
+    def runtime_estop(self, source: object, params: object) -> None:
         """An emergency stop that came by the runtime's own handler; returns at once, halts nothing twice."""
         if isinstance(source, str):
             estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime")

@@ -1,0 +1,272 @@
+"""Commands of other peers: their wire form, the mesh's question to their sender, and the replies."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from strands_robots.contract import Haltable, Robot, WorldRobot
+from strands_robots.envelope import is_error
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.context import Context
+from strands_robots.mesh.registry import attribute
+from strands_robots.mesh.transport import Sample, TransportError
+from strands_robots.safety.approval import Approval
+from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
+from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result
+from strands_robots.serving.robot_verbs import PEER_VERBS, RobotStop, peer_stop_answer, run_to_end
+from strands_robots.serving.stop_requests import Request as StopRequest
+from strands_robots.serving.stop_requests import StopRequests
+from strands_robots.serving.verbs import Arguments, Kind, Verb
+from strands_robots.utils import ValidationError, shown
+
+logger = logging.getLogger(__name__)
+
+MISSING_COMMAND = "missing or malformed command"
+REPLAYED = "replay rejected"
+LOCKED = "command rejected"
+DISPATCH = "dispatch error"
+BUSY = "busy"
+PING = {"action": "ping"}
+"""The command of a bare ping: nothing in it needs checking, and its answer is nothing."""
+
+HALT = "stop over the mesh"
+LOG_EVERY_S = 1.0
+REPLAY_S = wire.FRESH_S + wire.AHEAD_S
+REPLAYS_MAX = 4096
+
+TargetOf = Callable[[str], Haltable | None]
+"""Gives what a stop means by a name, empty for all there is. Raises :class:`ValidationError` for an unknown name."""
+
+
+class Replays:
+    """The (sender, turn) pairs that were carried out lately; bounded by age and number."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._seen: dict[tuple[str, str], float] = {}
+        self._lock = threading.Lock()
+
+    def first(self, sender: str, turn: str) -> bool:
+        """True the first time."""
+        now = self._clock()
+        with self._lock:
+            while self._seen and now - next(iter(self._seen.values())) > REPLAY_S:
+                del self._seen[next(iter(self._seen))]
+            if (sender, turn) in self._seen:
+                return False
+            while len(self._seen) >= REPLAYS_MAX:
+                del self._seen[next(iter(self._seen))]
+            self._seen[sender, turn] = now
+            return True
+
+
+class SenderCheck:
+    """May this sender? The mesh's part of the pipeline: freshness, replays, and attribution for real hardware.
+
+    Args:
+        hardware: False for a simulation, which asks for no attribution.
+    """
+
+    def __init__(self, context: Context, *, hardware: bool) -> None:
+        self._context = context
+        self._hardware = hardware
+        self._replays = Replays(context.monotonic)
+
+    def __call__(self, command: Command, arguments: Arguments) -> None:
+        """Raise :class:`Refused` where the sender may not."""
+        request, sample = command.proof
+        # What only takes energy away is done twice, and whatever the sender's clock says: refusing one as a replay
+        # could only leave a robot moving.
+        if command.verb.kind in (Kind.MOTION, Kind.RESUME):
+            if request.timestamp is None or not wire.fresh(request.timestamp, self._context.clock()):
+                raise Refused(RefusalReason.CALLER, REPLAYED, reason="the timestamp is not fresh")
+            if not self._replays.first(request.sender_id, request.turn_id):
+                raise Refused(RefusalReason.CALLER, REPLAYED, reason="the turn was carried out before")
+        if self._hardware and command.verb.kind is Kind.MOTION:
+            why = self._unattributed(request, sample)
+            if why is not None:
+                text = Approval.refusal(command.verb.name, self._context.peer_id)
+                raise Refused(RefusalReason.APPROVAL, text, reason=why)
+
+    def _unattributed(self, request: wire.Request, sample: Sample) -> str | None:
+        context = self._context
+        if context.identity.required:
+            return context.identity.refusal(request.body, request.sender_id)
+        found = attribute(context.registry.session_of(request.sender_id), sample)
+        return None if found.proven else f"the sender is not attributed: {found.value}"
+
+
+def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
+    """Return what a stop halts: the robot, or the named robot of a world; None for a peer without a robot.
+
+    Raises:
+        ValidationError: the world has no robot of this name.
+    """
+    if robot is None or not name or not isinstance(robot, WorldRobot):
+        return robot
+    robots = robot.list_robots()
+    if name not in robots:
+        raise ValidationError(f"there is no robot of this name; there are {', '.join(robots) or 'none'}")
+    return RobotStop(robot, name)
+
+
+def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lambda: False) -> Own:
+    """Make the ``execute`` of a peer: it runs a policy to its end, or until the peer leaves the mesh."""
+    return lambda arguments: run_to_end(robot, arguments, lambda: closed() or not context.running())
+
+
+class CommandReceiver:
+    """Receives commands for one peer and replies.
+
+    Args:
+        pipeline: serves everything but stops.
+        target_of: finds what a stop means by a name; by default in the pipeline's robot.
+        before_stop: called when a stop has arrived; it may wait for nothing.
+        after_stop: called before stops are answered.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        pipeline: Pipeline,
+        *,
+        target_of: TargetOf | None = None,
+        before_stop: Callable[[], None] = lambda: None,
+        after_stop: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._context = context
+        self._pipeline = pipeline
+        self._target_of = target_of or partial(stop_target, pipeline.robot)
+        self._before_stop, self._after_stop = before_stop, after_stop
+        self.stops = StopRequests(self._answer_stops)
+        self._logged = ("", 0.0)
+
+    def on_command(self, sample: Sample) -> None:
+        """Take a sample on our command topic or on the broadcast topic; returns at once."""
+        context = self._context
+        try:
+            body = wire.decode(sample.payload, topics.BY_NAME["cmd"].max_bytes)
+            if body.get("sender_id") == context.peer_id:
+                return
+            request = wire.Request.of(body)
+        except wire.WireError as exc:
+            context.audit("command_rejected", reason=str(exc))
+            return
+        if request.command == PING:
+            self._reply(request.sender_id, request.turn_id, result={})
+            return
+        verb = self._verb_of(request)
+        if verb is None:
+            return
+        if verb.kind is Kind.STOP:
+            self._stop(request, verb)
+            return
+        named = request.command.get("robot_name")
+        asked = self._pipeline.pending.arrive(named if isinstance(named, str) else "")
+        command = Command(verb, request.command, request.sender_id, asked, (request, sample))
+        # A ping reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
+        serve = self._pipeline.serve if verb.name == "ping" else self._pipeline.submit
+        serve(command, partial(self._answer, request, verb))
+
+    def _verb_of(self, request: wire.Request) -> Verb | None:
+        if not isinstance(request.command, dict):
+            self._refuse(request, "", MISSING_COMMAND)
+            return None
+        action = request.command.get("action")
+        verb = PEER_VERBS.get(action) if isinstance(action, str) else None
+        if verb is None:
+            known = ", ".join(PEER_VERBS)
+            self._refuse(
+                request,
+                action if isinstance(action, str) else "",
+                f"validation: action must be one of {known}, not {shown(action)}.",
+            )
+        return verb
+
+    def _answer(self, request: wire.Request, verb: Verb, answer: Result) -> None:
+        refusal, audit = answer.refusal, self._context.audit
+        if refusal is not None:
+            event = "wire_motion_refused" if refusal.why is RefusalReason.APPROVAL else "command_refused"
+            reason = DISPATCH if refusal.why is RefusalReason.FAILED else refusal.reason
+            self._refuse(request, verb.name, _wire_text(refusal), reason, event)
+            return
+        self._reply(request.sender_id, request.turn_id, result=answer.result)
+        if verb.kind is not Kind.READ or verb.name == "teleop_stop":
+            event = "command_refused" if is_error(answer.result) else "command_executed"
+            audit(event, request.sender_id, action=verb.name, turn_id=request.turn_id)
+
+    def _stop(self, request: wire.Request, verb: Verb) -> None:
+        named = request.command.get("robot_name")
+        self._pipeline.pending.void(named if isinstance(named, str) else "")
+        self._before_stop()
+        try:
+            name = verb.checked(request.command).get("robot_name", "")
+        except ValidationError as exc:
+            self._refuse(request, verb.name, f"validation: {exc}")
+            return
+        try:
+            target = self._target_of(name)
+        except ValidationError as exc:
+            result = peer_stop_answer(StopVerdict(not_stopped={name: str(exc)}))
+            self._reply(request.sender_id, request.turn_id, result=result)
+            fields = {"action": "stop", "turn_id": request.turn_id, "reason": explain(result)}
+            self._context.audit("command_refused", request.sender_id, **fields)
+            return
+        except Exception:
+            logger.exception("%s: what a stop means is not known; everything is stopped.", self._context.peer_id)
+            target = stop_target(self._pipeline.robot)
+        asker = (request.sender_id, request.turn_id)
+        if target is None:
+            self._answer_stops(StopVerdict(), [asker])
+        else:
+            self.stops.add(target, name or self._context.peer_id, HALT, asker)
+
+    def _answer_stops(self, verdict: StopVerdict, requests: list[StopRequest]) -> None:
+        self._after_stop()
+        audit, result = self._context.audit, peer_stop_answer(verdict)
+        event, fields = "command_executed", {"action": "stop"}
+        if grade(result) is not Outcome.STOPPED:
+            event, fields["reason"] = "command_refused", explain(result)
+            self._log_doubt(fields["reason"])
+        for sender, turn in requests:
+            self._reply(sender, turn, result=result)
+            audit(event, sender, turn_id=turn, **fields)
+
+    def _log_doubt(self, reason: str) -> None:
+        # A flood of stops to a robot that does not stop is one line a second.
+        now = time.monotonic()
+        if reason != self._logged[0] or now - self._logged[1] >= LOG_EVERY_S:
+            self._logged = (reason, now)
+            logger.critical("%s was asked to stop over the mesh: %s.", self._context.peer_id, reason)
+
+    def _refuse(
+        self, request: wire.Request, action: str, text: str, reason: str = "", event: str = "command_refused"
+    ) -> None:
+        self._context.audit(event, request.sender_id, action=action[:32], reason=reason or text)
+        self._reply(request.sender_id, request.turn_id, error=text)
+
+    def _reply(self, sender: str, turn: str, *, result: Any = None, error: str = "") -> None:
+        context = self._context
+        reply = wire.Reply("error" if error else "response", context.peer_id, turn, result, error, context.clock())
+        key = topics.response(sender, context.peer_id, turn)
+        try:
+            context.put(key, context.identity.sign(reply.to_wire()))
+        except wire.WireError as exc:
+            logger.warning("%s: the reply to %s cannot be sent: %s", context.peer_id, sender, exc)
+            if not error:
+                self._reply(sender, turn, error=DISPATCH)
+        except TransportError as exc:
+            logger.warning("%s: the reply to %s was not sent: %s", context.peer_id, sender, exc)
+
+
+def _wire_text(refusal: Refused) -> str:
+    """Return the words that peers in the field know a refusal by."""
+    if refusal.why is RefusalReason.ARGUMENTS:
+        return f"validation: {refusal}"
+    known = {RefusalReason.LOCKOUT: LOCKED, RefusalReason.BUSY: BUSY, RefusalReason.FAILED: DISPATCH}
+    return known.get(refusal.why, str(refusal))

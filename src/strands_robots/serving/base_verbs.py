@@ -1,0 +1,69 @@
+"""The verbs of mobile bases, beside those of every robot with tasks."""
+
+from __future__ import annotations
+
+from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
+from strands_robots.envelope import Envelope
+from strands_robots.ros.gate import Approved
+from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.verbs import Arguments, Kind, Parameter, Verb, table
+from strands_robots.utils import DURATION_MAX_S, duration, number, text
+
+
+def _drive(base: MobileBaseRobot, arguments: Arguments) -> Envelope:
+    # The operator's approval of this verb is the approval of the commands that it sends.
+    return base.start_drive(**arguments, tool_context=Approved())
+
+
+def _navigate(base: RosBridgedRobot, arguments: Arguments) -> Envelope:
+    # The operator's approval of this verb is the approval of the goal that it sends.
+    return base.start_navigation(**arguments, tool_context=Approved())
+
+
+DRIVE = Verb(
+    "drive",
+    Kind.MOTION,
+    "Drive for some seconds and return at once; follow it with getStatus or the taskComplete event.",
+    (
+        Parameter("linear", float, "Speed forwards in m/s; negative reverses", number),
+        Parameter("angular", float, "Turning rate in rad/s; positive turns left", number),
+        Parameter(
+            "duration",
+            float,
+            f"Seconds until the base is stopped again, above 0 and at most {DURATION_MAX_S:g}",
+            duration,
+        ),
+    ),
+    returns="task_status",
+    run=_drive,
+)
+NAVIGATE_TO = Verb(
+    "navigateTo",
+    Kind.MOTION,
+    "Send the base to a place around obstacles and return at once; follow it with getStatus or taskComplete.",
+    (
+        Parameter("x", float, "Position of the goal in metres, along the frame's x axis", number),
+        Parameter("y", float, "Position of the goal in metres, along the frame's y axis", number),
+        Parameter("yaw", float, "Heading at the goal in radians; positive is to the left", number, default=0.0),
+        Parameter(
+            "frame_id",
+            str,
+            "Frame in which the goal is given, such as map or odom",
+            lambda name, value: text(name, value, longest=255),
+            default="map",
+        ),
+        Parameter(
+            "timeout",
+            float,
+            f"Seconds after which the goal is cancelled, above 0 and at most {DURATION_MAX_S:g}",
+            duration,
+            default=120.0,
+        ),
+    ),
+    returns="task_status",
+    run=_navigate,
+)
+
+BASE_VERBS = {**ARM_VERBS, **table([DRIVE])}
+NAVIGATING_BASE_VERBS = {**BASE_VERBS, **table([NAVIGATE_TO])}

@@ -1,0 +1,268 @@
+"""The way of a command from a network to a robot's method, the same for every network.
+
+In order: arguments, caller, lockout, the operator's approval, the robot's method. The first that refuses raises
+:class:`Refused`, which says which it was. Whatever is raised on the way becomes an
+:class:`Result` here alone. Stops take no part in it: they go to the stop executor at once, for every caller.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import partial
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from strands_robots.contract import Robot
+from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.approval import Approval, Claim
+from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
+from strands_robots.serving.verbs import Arguments, Kind, Verb
+from strands_robots.serving.workers import Share, ShareFullError, Shares, shares_of
+from strands_robots.utils import ValidationError
+
+logger = logging.getLogger(__name__)
+
+
+class RefusalReason(Enum):
+    """The part of the pipeline that refused a command."""
+
+    ARGUMENTS = "arguments"
+    CALLER = "caller"
+    LOCKOUT = "lockout"
+    APPROVAL = "approval"
+    BUSY = "busy"
+    FAILED = "failed"
+
+
+class Refused(StrandsRobotsError):  # noqa: N818 - a refusal, not a fault
+    """A command that did not reach the robot, or failed in it.
+
+    Args:
+        text: what the caller is told.
+        reason: what the audit is told; ``text`` by default.
+        envelope: the whole answer, where it is more than ``text``.
+    """
+
+    def __init__(self, why: RefusalReason, text: str, reason: str = "", envelope: Envelope | None = None) -> None:
+        super().__init__(text)
+        self.why = why
+        self.reason = reason or text
+        self.envelope = error(text) if envelope is None else envelope
+
+
+@dataclass(frozen=True)
+class Command:
+    """One call of a verb, as a network received it.
+
+    Attributes:
+        arguments: unchecked, as the caller gave them.
+        caller: the caller's declared name, or whatever stood in its place.
+        asked: the robot's gate when the command arrived; None for a peer without a robot.
+        proof: what the network knows of the sender besides its name.
+    """
+
+    verb: Verb
+    arguments: Mapping[str, Any]
+    caller: object = None
+    asked: Asked | None = None
+    proof: Any = None
+
+
+@dataclass(frozen=True)
+class Result:
+    """A command's end: the robot's own answer, or the refusal that kept the command from it."""
+
+    result: Any
+    refusal: Refused | None = None
+
+
+Authorize = Callable[[Command, Arguments], None]
+"""Raises :class:`Refused` where the caller may not; :mod:`strands_robots.safety.authorization` decides."""
+
+Answered = Callable[[Result], None]
+"""Gets a command's answer on the thread that served it; it may not raise."""
+
+Own = Callable[[Arguments], object]
+"""Carries out a verb that is the network peer's own and not its robot's."""
+
+
+class PendingCommands:
+    """Commands that have arrived and not been carried out, each as old as its arrival.
+
+    A halt since then refuses what one of them begins; so does the stop of the one robot of a world that it names.
+
+    Args:
+        gate: of the robot; None for a peer without one.
+        robot: the robot of the world that every command here means; empty where commands name it.
+    """
+
+    def __init__(self, gate: MotionGate | None, robot: str = "", shared: PendingCommands | None = None) -> None:
+        self._gate = gate
+        self._robot = robot
+        self._lock: threading.Lock = shared._lock if shared else threading.Lock()
+        self._pending: WeakKeyDictionary[Asked, str] = shared._pending if shared else WeakKeyDictionary()
+
+    def of(self, robot: str) -> PendingCommands:
+        """The same commands, for the peer of one robot of the world."""
+        return PendingCommands(self._gate, robot, self)
+
+    def arrive(self, robot: str = "") -> Asked | None:
+        """Note a command's arrival; what it begins may be no older than this."""
+        if self._gate is None:
+            return None
+        asked = self._gate.asked()
+        with self._lock:
+            self._pending[asked] = self._robot or robot
+        return asked
+
+    def serving(self, asked: Asked | None) -> AbstractContextManager[None]:
+        """The time in which this thread carries the command out."""
+        return nullcontext() if self._gate is None or asked is None else self._gate.asked_at(asked)
+
+    def void(self, robot: str = "") -> None:
+        """Void what arrived for this robot of the world, or for any, because the robot is being stopped."""
+        name = robot or self._robot
+        with self._lock:
+            for asked, named in self._pending.items() if name else ():
+                if named in (name, ""):
+                    asked.give_up()
+
+
+@dataclass
+class Pipeline:
+    """Serves the commands of one robot on one network.
+
+    Attributes:
+        robot: behind its contract; None for a peer that only watches and commands.
+        peer_id: gives the name that the operator's approval is for.
+        hardware: True where a motion needs the operator's approval besides the caller's authorization.
+        authorize: the network's question to the caller.
+        own: verbs that the peer carries out itself, by name.
+        pending: commands that a stop has to reach before they begin.
+        shares: the robot's threads.
+    """
+
+    robot: Robot | None
+    peer_id: Callable[[], str]
+    hardware: bool
+    authorize: Authorize
+    approval: Approval = field(default_factory=Approval)
+    own: Mapping[str, Own] = field(default_factory=dict)
+    pending: PendingCommands = field(default_factory=lambda: PendingCommands(None))
+    shares: Shares = field(default_factory=Shares)
+    _serving: list[str] = field(default_factory=list, init=False)
+    _closed: bool = field(default=False, init=False)
+    _changed: threading.Condition = field(default_factory=threading.Condition, init=False, repr=False)
+
+    @classmethod
+    def of(cls, robot: Robot | None, peer_id: Callable[[], str], **parts: Any) -> Pipeline:
+        """Make the pipeline of a robot, with the robot's own shares and pending commands where none are given."""
+        gate = None if robot is None else robot.gate
+        parts.setdefault("pending", PendingCommands(gate))
+        parts.setdefault("shares", Shares() if robot is None else shares_of(robot))
+        return cls(robot, peer_id, **parts)
+
+    def submit(self, command: Command, answered: Answered) -> None:
+        """Serve ``command`` on a thread of the robot; returns at once.
+
+        Where as many commands of its kind as may wait are waiting, it is answered as busy on this thread.
+        """
+        try:
+            self._share(command.verb).submit(partial(self.serve, command, answered))
+        except ShareFullError:
+            text = f"{command.verb.name} refused: the robot has not yet answered earlier calls; try again later."
+            refused = Refused(RefusalReason.BUSY, text, reason="busy")
+            answered(Result(refused.envelope, refused))
+
+    def serve(self, command: Command, answered: Answered) -> None:
+        """Carry ``command`` out on this thread and hand its answer to ``answered``."""
+        verb, claim = command.verb, Claim()
+        result: object = None
+        refusal: Refused | None = None
+        with self._changed:
+            self._serving.append(verb.name)
+        try:
+            arguments = self._checked(command)
+            self.authorize(command, arguments)
+            with self.pending.serving(command.asked):
+                if verb.kind is Kind.MOTION:
+                    claim = self._claim(verb)
+                result = self._carry_out(verb)(arguments)
+        except Refused as refused:
+            refusal, result = refused, refused.envelope
+        except (ValidationError, MotionRefused) as exc:
+            result = exc.envelope if isinstance(exc, MotionRefused) else error(str(exc))
+        except Exception:
+            logger.exception("%s: %s failed.", self.peer_id(), verb.name)
+            refusal = Refused(RefusalReason.FAILED, f"{verb.name} failed inside the device; its log has the details.")
+            result = refusal.envelope
+        try:
+            if result is None or is_error(result):
+                claim.give_back()
+            else:
+                claim.spend()
+            answered(Result(result, refusal))
+        finally:
+            with self._changed:
+                self._serving.remove(verb.name)
+                self._changed.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        """True once the peer leaves its network."""
+        return self._closed
+
+    def close(self, timeout: float = 0.0) -> list[str]:
+        """Refuse what still waits, and wait for the verbs that run; return the names of those still running."""
+        self._closed = True
+        with self._changed:
+            self._changed.wait_for(lambda: not self._serving, timeout)
+            return list(self._serving)
+
+    def _share(self, verb: Verb) -> Share:
+        """A motion may hold its thread while it lasts; no read and no resume ever waits for that."""
+        if verb.kind is Kind.RESUME:
+            return self.shares.resume
+        return self.shares.motion if verb.kind is Kind.MOTION else self.shares.read
+
+    def _checked(self, command: Command) -> dict[str, Any]:
+        if self._closed:
+            raise Refused(
+                RefusalReason.BUSY, f"{command.verb.name} refused: this peer has left its network.", reason="closed"
+            )
+        try:
+            return command.verb.checked(command.arguments)
+        except ValidationError as exc:
+            raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None
+
+    def _claim(self, verb: Verb) -> Claim:
+        """Leave to move: not locked, and approved by the operator where the robot is hardware."""
+        if self.robot is not None:
+            locked = self.robot.gate.lockout(verb.name)
+            if locked is not None:
+                raise Refused(RefusalReason.LOCKOUT, str(locked.get("reason", "locked")), envelope=locked)
+            # Halted since the command arrived: refused before a grant is spent on it.
+            self.robot.gate.permit(verb.name)
+        if not self.hardware:
+            return Claim()
+        claim = self.approval.claim(verb.name, self.peer_id())
+        if claim is None:
+            text = Approval.refusal(verb.name, self.peer_id())
+            raise Refused(RefusalReason.APPROVAL, text, reason="the operator has not approved it")
+        return claim
+
+    def _carry_out(self, verb: Verb) -> Own:
+        own = self.own.get(verb.name)
+        if own is not None:
+            return own
+        if self.robot is None:
+            return lambda arguments: error(f"{verb.name}: no robot is registered on this peer.")
+        if verb.run is None:
+            raise Refused(RefusalReason.FAILED, f"{verb.name} is not served here.")
+        return partial(verb.run, self.robot)

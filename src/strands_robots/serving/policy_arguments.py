@@ -1,0 +1,110 @@
+"""Bounds of what a network peer may ask of a policy: its provider, its server's host, its checkpoint, its targets."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from functools import lru_cache
+
+from strands_robots import settings
+from strands_robots.policies import policy_names
+from strands_robots.safety.authorization import provider_refusal
+from strands_robots.serving.verbs import Check
+from strands_robots.utils import ValidationError, identifier, number, shown, text
+
+POLICY_HOST_NOT_ALLOWED = "POLICY_HOST_NOT_ALLOWED"
+HF_REPO_NOT_ALLOWED = "HF_REPO_NOT_ALLOWED"
+POLICY_TYPE_NOT_ALLOWED = "POLICY_TYPE_NOT_ALLOWED"
+
+BUILT_IN_ORGS = frozenset({"nvidia", "huggingface", "lerobot"})
+LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+PROVIDERS = frozenset({"mock", "remote", "lerobot_local", "lerobot"})
+FOREIGN_PROVIDERS = frozenset(
+    {"act", "cosmos", "cosmos3", "diffusion", "dreamgen", "dreamzero", "gr00t", "groot", "lerobot_async", "openpi"}
+    | {"openvla", "pi0", "pi05", "pi0_fast", "pi0fast", "rdt", "sac", "smolvla", "sonic", "tdmpc", "vqbet", "wbc"}
+)
+"""Providers of peers of other builds: they validate, and the robot answers that it has none of the name.
+
+An operator adds a name to the table by ``STRANDS_MESH_POLICY_TYPE_ALLOW``, a plug-in by its entry point.
+"""
+
+_REPO = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,95})/([A-Za-z0-9][A-Za-z0-9._-]{0,95})\Z")
+
+
+@lru_cache(maxsize=1)
+def registered_providers() -> tuple[str, ...]:
+    """Return this machine's policy providers; read once, because a message must not cost a look at the disk."""
+    return policy_names()
+
+
+def policy_host_refusal(host: str) -> str | None:
+    """Return why a policy server's host is not allowed, or None. A name is compared as a name, never resolved."""
+    name = host.strip("[]").lower()
+    allow = settings.items("STRANDS_MESH_POLICY_HOST_ALLOW")
+    if name in LOOPBACK_NAMES or name in {entry.lower() for entry in allow}:
+        return None
+    try:
+        address = ipaddress.ip_address(name)
+    except ValueError:
+        address = None
+    if address is not None and (address.is_loopback or any(_within(address, entry) for entry in allow)):
+        return None
+    return f"policy_host must be loopback or listed in STRANDS_MESH_POLICY_HOST_ALLOW, not {shown(host)}."
+
+
+def known_provider(name: str, value: object) -> str:
+    """Check a provider that this machine, another build or the operator's list knows, and that is not shut out."""
+    provider = identifier(name, value)
+    allow = settings.items("STRANDS_MESH_POLICY_TYPE_ALLOW")
+    if provider not in PROVIDERS and provider not in FOREIGN_PROVIDERS and provider not in allow:
+        registered = registered_providers()
+        if provider not in registered:
+            known = ", ".join(sorted(PROVIDERS | set(registered)))
+            raise ValidationError(f"{name} must be one of {known}, not {shown(value)}.", POLICY_TYPE_NOT_ALLOWED)
+    refusal = provider_refusal(provider, allow)
+    if refusal is not None:
+        raise ValidationError(refusal, POLICY_TYPE_NOT_ALLOWED)
+    return provider
+
+
+def policy_host(name: str, value: object) -> str:
+    """Check a host that :func:`policy_host_refusal` allows."""
+    host = text(name, value, longest=253)
+    refusal = policy_host_refusal(host)
+    if refusal is not None:
+        raise ValidationError(refusal, POLICY_HOST_NOT_ALLOWED)
+    return host
+
+
+def repository(name: str, value: object) -> str:
+    """Check a Hub id, ``org/name``, of an allowed organisation; a local path is none."""
+    orgs = BUILT_IN_ORGS | set(settings.items("STRANDS_MESH_HF_REPO_ALLOW"))
+    found = _REPO.match(value) if isinstance(value, str) else None
+    if found is None or ".." in found[0] or found[1] not in orgs:
+        raise ValidationError(
+            f"{name} must be org/name with an org of {', '.join(sorted(orgs))}, not {shown(value)}.",
+            HF_REPO_NOT_ALLOWED,
+        )
+    return found[0]
+
+
+def vector(longest: int, *, exactly: bool = False) -> Check:
+    """Make a check of at most (or exactly) so many numbers within 1e6, as a list or, where not exact, by name."""
+    domain = f"{'' if exactly else 'at most '}{longest} numbers within 1e6"
+
+    def check(name: str, value: object) -> list[float] | dict[str, float]:
+        if isinstance(value, dict) and not exactly and len(value) <= longest:
+            return {identifier(name, key): number(name, entry, low=-1e6, high=1e6) for key, entry in value.items()}
+        if not isinstance(value, list) or len(value) > longest or (exactly and len(value) != longest):
+            raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+        return [number(name, entry, low=-1e6, high=1e6) for entry in value]
+
+    return check
+
+
+def _within(address: ipaddress.IPv4Address | ipaddress.IPv6Address, entry: str) -> bool:
+    try:
+        network = ipaddress.ip_network(entry, strict=False)
+    except ValueError:
+        return False
+    return address.version == network.version and address in network

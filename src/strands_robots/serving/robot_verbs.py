@@ -1,0 +1,413 @@
+"""The verbs of arms, vehicles and simulated worlds, and the robot methods that carry them out.
+
+Device Connect serves :data:`ARM_VERBS` and :data:`WORLD_VERBS`, the mesh :data:`PEER_VERBS`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.bus_access import read_joints
+from strands_robots.contract import RUNNING, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt
+from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
+from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
+from strands_robots.serving.verbs import (
+    ASSERTION,
+    DURATION,
+    INSTRUCTION,
+    N_STEPS,
+    POLICY_PORT,
+    POLICY_PROVIDER,
+    REQUIRED,
+    RESUME,
+    ROBOT_NAME,
+    Arguments,
+    Kind,
+    Parameter,
+    Verb,
+    between,
+    calls,
+    table,
+)
+from strands_robots.utils import ValidationError, identifier, number, port, shown
+
+POLL_S = 0.05
+EXECUTE_GRACE_S = 10.0
+"""Seconds besides its duration that a policy may take to end before ``execute`` of the mesh gives up on it."""
+
+END_EVENT_S = 0.5
+
+WORLD_MEMBERS = (
+    *("tool_name_str", "gate", "halt", "subscribe", "list_robots", "start_policy", "stop_policy"),
+    *("list_policies_running", "get_state", "get_features", "step", "reset"),
+)
+"""The members that make an object a world."""
+
+
+def served(robot: Any) -> Robot:
+    """Return ``robot`` behind its contract.
+
+    Raises:
+        ValidationError: it is neither a world nor a robot that :func:`~strands_robots.contract.adapt` makes fit.
+    """
+    return robot if isinstance(robot, WorldRobot) else adapt(robot, read_joints)
+
+
+def served_world(robot: Any) -> WorldRobot:
+    """Return ``robot``, which has to be a world.
+
+    Raises:
+        ValidationError: naming the members that it lacks.
+    """
+    if isinstance(robot, WorldRobot):
+        return robot
+    lacking = [name for name in WORLD_MEMBERS if not hasattr(robot, name)]
+    needs = ", ".join(WORLD_MEMBERS)
+    raise ValidationError(f"a simulation must have {needs}; {shown(robot)} lacks {', '.join(lacking)}.")
+
+
+def robot_of(world: WorldRobot, name: str | None, *, first: bool = False) -> str:
+    """Return the robot of a world that a caller means: the named one, the only one, or with ``first`` the first.
+
+    Raises:
+        ValidationError: no robot of this name, or several and none is named.
+    """
+    robots = world.list_robots()
+    if not robots:
+        raise ValidationError("The simulation has no robot; add one before execute.")
+    if name:
+        if name not in robots:
+            raise ValidationError(f"robot_name must be one of {', '.join(robots)}, not {shown(name)}.")
+        return name
+    if len(robots) > 1 and not first:
+        raise ValidationError(f"robot_name must name one of {', '.join(robots)}: this world has {len(robots)} robots.")
+    return robots[0]
+
+
+@dataclass(frozen=True)
+class WorldStop:
+    """The stop of everything in a world: a halt of all, then the word of each rollout that ran."""
+
+    world: WorldRobot
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Halt the world and grade each running rollout; an error of a rollout outweighs the halt's success."""
+        world, running = self.world, list[str]()
+        unlisted: dict[str, str] = {}
+        try:
+            running = [str(row.get("robot", "")) for row in world.list_policies_running()]
+        except Exception as exc:  # noqa: BLE001 - a world that changes under the stop is halted as a whole below
+            unlisted = {"rollouts": explain(exc)}
+        # The halt comes first: a policy that hangs would have the others move on while its own stop waits for it.
+        rest = verdict_of(lambda: world.halt(reason), world.tool_name_str)
+        asked = [name for name in running if name not in rest.not_stopped]
+        rollouts = halt_each({name: RobotStop(world, name).stop for name in asked})
+        return StopVerdict(
+            (*rollouts.halted, *(name for name in rest.halted if name not in running)),
+            {**rest.not_stopped, **rollouts.not_stopped},
+            {**rest.unknown, **rollouts.unknown, **unlisted},
+            rest.elapsed_ms + rollouts.elapsed_ms,
+        )
+
+
+@dataclass(frozen=True)
+class RobotStop:
+    """The stop of one robot of a world."""
+
+    world: WorldRobot
+    name: str
+
+    def stop(self) -> Envelope:
+        """Stop the robot's rollout."""
+        return self.world.stop_policy(self.name)
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop the robot's rollout and grade the answer."""
+        return verdict_of(self.stop, self.name)
+
+
+def world_stop_answer(verdict: StopVerdict) -> Envelope:
+    """Return the verdict on a world as its device answers ``stop``: names of what stopped and of what did not."""
+    refused = {**verdict.unknown, **verdict.not_stopped}
+    stopped = list(verdict.halted)
+    fields = {"stopped": stopped, "not_stopped": sorted(refused), "reasons": refused}
+    if refused:
+        return error(f"Not everything stopped: {'; '.join(f'{n}: {why}' for n, why in refused.items())}", **fields)
+    return success(f"Stopped {', '.join(stopped)}." if stopped else "Nothing was moving.", **fields)
+
+
+def peer_stop_answer(verdict: StopVerdict) -> dict[str, Any]:
+    """Return a verdict as a mesh peer answers ``stop``."""
+    doubts = {**verdict.not_stopped, **verdict.unknown}
+    result: dict[str, Any] = {
+        "ok": verdict.stopped is True,
+        "stopped": list(verdict.halted),
+        "not_stopped": list(doubts),
+        "results": {**dict.fromkeys(verdict.halted, "stopped"), **doubts},
+    }
+    if doubts:
+        result["error"] = "; ".join(f"{name}: {why}" for name, why in doubts.items())
+    return result
+
+
+def _execute(world: WorldRobot, arguments: Arguments) -> Envelope:
+    policy = dict(arguments)
+    name = robot_of(world, policy.pop("robot_name"), first=True)
+    answer = world.start_policy(name, policy.pop("instruction"), **policy)
+    return {**answer, "robot_name": name}
+
+
+def _step(robot: Robot, arguments: Arguments) -> Envelope:
+    if not isinstance(robot, WorldRobot):
+        return error("step: this robot is no simulation.")
+    return robot.step(arguments.get("n_steps", arguments.get("steps", 1)))
+
+
+def _reset(robot: Robot, arguments: Arguments) -> Envelope:
+    return robot.reset() if isinstance(robot, WorldRobot) else error("reset: this robot is no simulation.")
+
+
+def _status(robot: Robot, arguments: Arguments) -> Envelope:
+    if not isinstance(robot, WorldRobot):
+        return robot.get_task_status()
+    running = robot.list_policies_running()
+    return success(
+        f"{len(running)} of {len(robot.list_robots())} robots run a policy.",
+        task_status="running" if running else "idle",
+        robots=robot.list_robots(),
+        policies=running,
+    )
+
+
+def start(robot: Robot, arguments: Arguments) -> Envelope:
+    """Start a policy with everything that a mesh peer may say about it; ``robot_name`` picks a robot of a world."""
+    options = {name: value for name, value in arguments.items() if name != "robot_name"}
+    if options.get("policy_host") == "localhost":
+        del options["policy_host"]
+    instruction = options.pop("instruction", "")
+    if isinstance(robot, WorldRobot):
+        return robot.start_policy(robot_of(robot, arguments.get("robot_name")), instruction, **options)
+    unknown = sorted(set(options) - _accepted(robot.start_task, options))
+    if unknown:
+        return error(f"start: this robot takes no {', '.join(unknown)}.")
+    return robot.start_task(instruction, **options)
+
+
+def run_to_end(robot: Robot, arguments: Arguments, closing: Callable[[], bool]) -> Envelope:
+    """Start a policy and wait for its end, or until ``closing`` says that the peer leaves its network."""
+    name = None
+    if isinstance(robot, WorldRobot):
+        name = arguments.get("robot_name") or (robot.list_robots() or [""])[0]
+    ends: list[RolloutEvent] = []
+
+    def observe(event: RolloutEvent) -> None:
+        if event.kind == "finished" and name in (None, event.robot):
+            ends.append(event)
+
+    unsubscribe = robot.subscribe(observe)
+    try:
+        started = start(robot, arguments)
+        if is_error(started):
+            return started
+        deadline = time.monotonic() + arguments["duration"] + EXECUTE_GRACE_S
+        return _awaited_end(robot, name, started, ends, deadline, closing)
+    finally:
+        unsubscribe()
+
+
+def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
+    robot: Robot,
+    name: str | None,
+    started: Envelope,
+    ends: list[RolloutEvent],
+    deadline: float,
+    closing: Callable[[], bool],
+) -> Envelope:
+    while not ends and _moving(robot, name):
+        if closing():
+            return error("execute: this peer left the mesh while the policy ran.", started=started)
+        if time.monotonic() >= deadline:
+            return error("execute: the policy outlived its duration.", started=started)
+        time.sleep(POLL_S)
+    # A rollout that runs no more has told its end, or is about to.
+    last = time.monotonic() + END_EVENT_S
+    while not ends and not isinstance(robot, TaskRobot) and time.monotonic() < last:
+        time.sleep(POLL_S)
+    if not ends:
+        return robot.get_task_status() if isinstance(robot, TaskRobot) else {**started, "state": "unknown"}
+    end = ends[-1]
+    facts = {"state": end.state, "task_status": end.state, "step_count": end.step, "elapsed_s": end.elapsed_s}
+    if end.state == "error":
+        return error(f"execute: {end.error or 'the policy failed'}", robot=end.robot, **facts)
+    return success(f"{end.robot} {end.state} after {end.step} steps.", robot=end.robot, **facts)
+
+
+def _moving(robot: Robot, name: str | None) -> bool:
+    if isinstance(robot, WorldRobot):
+        return any(row.get("robot") == name for row in robot.list_policies_running())
+    return str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
+
+
+def _accepted(method: Callable[..., Any], options: dict[str, Any]) -> set[str]:
+    parameters = inspect.signature(method).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+        return set(options)
+    return set(parameters)
+
+
+GET_FEATURES = Verb(
+    "getFeatures",
+    Kind.READ,
+    "Read what the robot senses and what it can be told: its observation and action features.",
+    returns="observation_features, action_features",
+    run=calls("get_features"),
+)
+GET_STATE = Verb(
+    "getState",
+    Kind.READ,
+    "Read joint positions by name, in the robot's own units, and the task.",
+    returns="joints, joints_age_s, task",
+    run=calls("get_state"),
+)
+ARM_VERBS = table(
+    [
+        Verb(
+            "execute",
+            Kind.MOTION,
+            "Start a task on the robot and return at once; follow it with getStatus or the taskComplete event.",
+            (INSTRUCTION, POLICY_PROVIDER, DURATION, POLICY_PORT),
+            returns="task_status",
+            run=calls("start_task"),
+        ),
+        Verb(
+            "stop",
+            Kind.STOP,
+            "Stop everything that moves the robot now; the answer says whether it stopped.",
+            returns="stopped, halted, not_stopped, unknown, elapsed_ms",
+        ),
+        RESUME,
+        Verb(
+            "getStatus",
+            Kind.READ,
+            "Read what the robot is doing: task state, instruction and steps so far.",
+            returns="task_status, instruction, step_count, duration, locked, lockout, check_in",
+            run=calls("get_task_status"),
+        ),
+        GET_FEATURES,
+        GET_STATE,
+    ]
+)
+WORLD_VERBS = table(
+    [
+        Verb(
+            "execute",
+            Kind.MOTION,
+            "Start a policy on a simulated robot and return at once; follow it with getStatus or policyComplete.",
+            (INSTRUCTION, POLICY_PROVIDER, DURATION, ROBOT_NAME),
+            returns="robot_name",
+            run=_execute,
+        ),
+        Verb(
+            "stop",
+            Kind.STOP,
+            "Stop everything that moves in the simulation; the answer names what stopped and what did not.",
+            returns="stopped, not_stopped, reasons",
+        ),
+        RESUME,
+        Verb(
+            "getStatus",
+            Kind.READ,
+            "Read simulated time, physics steps, joints of every robot and the policies that run.",
+            returns="sim_time, step_count, robots, running_policies, locked, lockout, check_in",
+            run=calls("get_state"),
+        ),
+        Verb("getFeatures", Kind.READ, "Read joints, actuators and cameras by robot.", run=calls("get_features")),
+        Verb(
+            "step",
+            Kind.MOTION,
+            "Step physics by hand, as fast as it computes.",
+            (N_STEPS,),
+            returns="sim_time, step_count",
+            run=_step,
+            critical=False,
+        ),
+        Verb(
+            "reset",
+            Kind.MOTION,
+            "Halt everything and put the world back to its initial state.",
+            run=_reset,
+            critical=False,
+        ),
+    ]
+)
+
+
+def _optional(name: str, type_: type, meaning: str, check: Any) -> Parameter:
+    return Parameter(name, type_, meaning, check, default=None)
+
+
+def _frequency(name: str, value: object) -> float:
+    return number(name, value, low=0.1, high=2000)
+
+
+_PEER_ROBOT = _optional("robot_name", str, "Which robot of the world; left out where there is only one", identifier)
+_PEER_POLICY = (
+    Parameter("policy_provider", str, POLICY_PROVIDER.meaning, known_provider, default=REQUIRED),
+    _optional("instruction", str, INSTRUCTION.meaning, INSTRUCTION.check),
+    DURATION,
+    Parameter("policy_host", str, "Host of the policy's server, loopback or allowed", policy_host, "localhost"),
+    _optional("policy_port", int, "TCP port of the policy's server, 1 to 65535", port),
+    _optional("pretrained_name_or_path", str, "Checkpoint on the Hub, org/name", repository),
+    _optional("control_frequency", float, "Rate of the policy in Hz, 0.1 to 2000", _frequency),
+    _optional("action_horizon", int, "Actions taken of each chunk, 1 to 10000", between(1, 10_000)),
+    _optional("n_steps", int, "Actions after which the policy ends, 1 to 10000000", between(1, 10_000_000)),
+    _optional("target_pose", list, "Goal of the tip: 7 numbers", vector(7, exactly=True)),
+    _optional("target_joints", list, "Goal of the joints: at most 256 numbers", vector(256)),
+    _optional("target_velocity", list, "Goal velocity: at most 16 numbers", vector(16)),
+    _PEER_ROBOT,
+)
+_SOURCE = Parameter("source_peer_id", str, "Peer that leads", identifier)
+_PEER_ASSERTION = _optional("assertion", dict, ASSERTION.meaning, ASSERTION.check)
+_DEVICE = _optional("device_name", str, "The leader's device; leader where left out", identifier)
+
+
+def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter, ...] = (), run: Any = None) -> Verb:
+    return Verb(name, kind, summary, parameters, run=run, drops_unknown=True)
+
+
+PEER_VERBS = table(
+    [
+        _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", run=_status),
+        _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
+        _peer_verb("features", Kind.READ, GET_FEATURES.summary, run=calls("get_features")),
+        _peer_verb("state", Kind.READ, GET_STATE.summary, run=calls("get_state")),
+        _peer_verb("execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY),
+        _peer_verb("start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start),
+        _peer_verb(
+            "step",
+            Kind.MOTION,
+            WORLD_VERBS["step"].summary,
+            (_optional("steps", int, "Physics steps to take, 1 to 10000", between(1, 10_000)),),
+            run=_step,
+        ),
+        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=_reset),
+        _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream."),
+        _peer_verb("teleop_receive", Kind.MOTION, "Follow a leader's input stream.", (_SOURCE, _DEVICE)),
+        _peer_verb(
+            "teleop_stop",
+            Kind.READ,
+            "Close the named input stream, or all of them.",
+            (_optional("source_peer_id", str, _SOURCE.meaning, identifier), _DEVICE),
+        ),
+        _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,)),
+        _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
+    ]
+)
+"""The actions of the mesh; ``execute``, ``stop``, ``resume``, ``ping`` and teleoperation are the peer's own."""
+
+TELEOP_VERBS = tuple(name for name in PEER_VERBS if name.startswith("teleop_"))

@@ -1,0 +1,183 @@
+"""Every verb described once: its name, its parameters with domain and unit, and what it returns.
+
+Device Connect makes its RPC methods and their schemas from these descriptions, the mesh its validation, and
+``tests/serving/test_verbs.py`` holds the agent tool to them. A new verb is one entry here and one robot method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, text, whole
+
+Arguments = Mapping[str, Any]
+"""Checked arguments, by parameter."""
+
+Check = Callable[[str, object], Any]
+"""Gives the value that is used, or raises :class:`ValidationError` naming parameter, value and domain."""
+
+Run = Callable[[Any, Arguments], object]
+"""Carries a verb out on a robot; returns an envelope. What it raises is reported as a failure inside the device."""
+
+REQUIRED: Any = object()
+"""Stands for the default of a parameter that has none."""
+
+
+class Kind(Enum):
+    """Decides what a verb passes on its way, and whom it may wait for."""
+
+    MOTION = "motion"
+    """Authorized, refused while locked, approved on hardware."""
+
+    READ = "read"
+    """Answered to every caller."""
+
+    STOP = "stop"
+    """Carried out for every caller, on threads of its own."""
+
+    RESUME = "resume"
+    """Authorized by the operator's signature that it brings."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a verb.
+
+    Attributes:
+        meaning: a line for callers, with the unit and the domain.
+        type: the Python type that its schema is made from.
+    """
+
+    name: str
+    type: type
+    meaning: str
+    check: Check
+    default: Any = REQUIRED
+
+
+@dataclass(frozen=True)
+class Verb:
+    """One thing that a caller may ask of a robot.
+
+    Attributes:
+        summary: one sentence for callers; with ``returns`` it is the description that agents read.
+        run: the robot method; None for a verb that the network's peer answers itself.
+        critical: False for a motion that no bystander has to fear.
+        drops_unknown: arguments that it does not have, or that are None, are left out instead of refused, and an
+            optional one that was not given stays out: the mesh's wire has it so.
+    """
+
+    name: str
+    kind: Kind
+    summary: str
+    parameters: tuple[Parameter, ...] = ()
+    returns: str = ""
+    run: Run | None = None
+    critical: bool = True
+    drops_unknown: bool = False
+    by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
+
+    def unfit(self, names: Collection[str]) -> str | None:
+        """Why arguments of these names do not fit the verb, or None."""
+        unknown = [name for name in names if name not in self.by_name]
+        missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
+        if not unknown and not missing:
+            return None
+        takes = ", ".join(self.by_name) or "no parameters"
+        problem = f"it has no {', '.join(unknown)}" if unknown else f"{', '.join(missing)} is missing"
+        return f"{self.name} takes {takes}: {problem}."
+
+    def checked(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The arguments in their domains, defaults filled in.
+
+        Raises:
+            ValidationError: naming the first argument that is unknown, missing or outside its domain.
+        """
+        if self.drops_unknown:
+            given = {name: value for name, value in given.items() if name in self.by_name and value is not None}
+        problem = self.unfit(given)
+        if problem is not None:
+            raise ValidationError(problem)
+        arguments = {
+            each.name: each.check(each.name, given[each.name]) if each.name in given else each.default
+            for each in self.parameters
+        }
+        return {name: value for name, value in arguments.items() if value is not None or not self.drops_unknown}
+
+
+def calls(method: str) -> Run:
+    """Carry a verb out by the robot's method of this name, with the checked arguments as its own."""
+
+    def run(robot: Any, arguments: Arguments) -> object:
+        return getattr(robot, method)(**arguments)
+
+    return run
+
+
+def table(verbs: Sequence[Verb]) -> dict[str, Verb]:
+    """The verbs by name."""
+    return {verb.name: verb for verb in verbs}
+
+
+def _text(longest: int, *, empty: bool = False) -> Check:
+    return lambda name, value: text(name, value, longest=longest, empty=empty)
+
+
+def between(low: int, high: int) -> Check:
+    """Check a whole number within these bounds."""
+    return lambda name, value: whole(name, value, low=low, high=high)
+
+
+INSTRUCTION = Parameter("instruction", str, "What to do, in plain language, 1 to 2000 characters", _text(2000))
+POLICY_PROVIDER = Parameter(
+    "policy_provider",
+    str,
+    "Policy that decides the actions, such as mock, remote or lerobot_local",
+    identifier,
+    default="mock",
+)
+DURATION = Parameter(
+    "duration",
+    float,
+    f"Longest time the motion may take, in seconds, above 0 and at most {DURATION_MAX_S:g}",
+    duration,
+    default=30.0,
+)
+POLICY_PORT = Parameter(
+    "policy_port",
+    int,
+    "TCP port of the policy's server, 1 to 65535; 0 for the provider's own",
+    between(0, 65535),
+    default=0,
+)
+ROBOT_NAME = Parameter(
+    "robot_name",
+    str,
+    "Which robot of the world; empty for the first one",
+    _text(128, empty=True),
+    default="",
+)
+STEPS_MAX = 100_000
+"""Physics steps of one ``step``: a few seconds of computing, within the time that a motion has to start."""
+
+N_STEPS = Parameter("n_steps", int, f"Physics steps to take, 1 to {STEPS_MAX}", between(1, STEPS_MAX), default=1)
+ASSERTION = Parameter(
+    "assertion",
+    dict,
+    "What the operator's resume key signed: v, epoch, targets, t, nonce and sig",
+    lambda name, value: value,  # whoever checks the signature counts what it refuses
+)
+
+RESUME = Verb(
+    "resume",
+    Kind.RESUME,
+    "Free the robot of one emergency stop with an assertion of the operator's key; nothing starts to move by it.",
+    (ASSERTION,),
+    returns="epoch, locked, epochs",
+)

@@ -1,0 +1,207 @@
+"""Threads for robot verbs, with a share for each robot, so that a wedged robot fills only its own.
+
+One pool serves the process and grows with the calls that run at the same moment; idle threads end by themselves. Its
+threads are daemons: a robot call that never returns must not keep the process from ending. Stops never come here; they
+have threads that stand ready (:mod:`strands_robots.safety.stop_executor`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
+
+from strands_robots.contract import body_of
+from strands_robots.errors import StrandsRobotsError
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Job = Callable[[], None]
+
+RUNNING_MAX = 4
+"""Calls of one kind that run at once on one robot."""
+
+WAITING_MAX = 32
+"""Calls of one kind that wait for one of those; the next is refused as busy."""
+
+
+class ShareFullError(StrandsRobotsError, RuntimeError):
+    """As many calls of this kind as one robot may have are running or waiting."""
+
+
+class WorkerPool:
+    """Daemon threads that appear when no idle one is left and end after ``idle_s`` without work."""
+
+    def __init__(self, idle_s: float = 2.0) -> None:
+        self._idle_s = idle_s
+        self._jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._free = 0
+
+    @property
+    def idle(self) -> int:
+        """Threads without work."""
+        return self._free
+
+    def submit(self, job: Job) -> None:
+        """Run ``job``, which may not raise, at once on some thread."""
+        with self._lock:
+            if self._free:
+                self._free -= 1
+                self._jobs.put(job)
+                return
+        thread = threading.Thread(target=self._work, args=(job,), name="robot-call", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:
+            # The interpreter is ending and starts no more threads.
+            job()
+
+    def _work(self, job: Job) -> None:
+        while True:
+            job()
+            del job
+            with self._lock:
+                self._free += 1
+            try:
+                job = self._jobs.get(timeout=self._idle_s)
+            except queue.Empty:
+                with self._lock:
+                    # A job that was put between the timeout and here counted on this thread.
+                    if self._free:
+                        self._free -= 1
+                        return
+                job = self._jobs.get()
+
+
+POOL = WorkerPool()
+"""The process's threads for robot verbs."""
+
+
+class Share:
+    """One robot's part of the pool for one kind of call: some run, some wait, one more is refused."""
+
+    def __init__(self, running: int = RUNNING_MAX, waiting: int = WAITING_MAX, pool: WorkerPool = POOL) -> None:
+        self._running_max, self._waiting_max = running, waiting
+        self._pool = pool
+        self._lock = threading.Lock()
+        self._waiting: deque[Job] = deque()
+        self._running = 0
+
+    @property
+    def waiting(self) -> int:
+        """Calls that wait for their turn."""
+        return len(self._waiting)
+
+    def submit(self, job: Job) -> None:
+        """Run ``job`` on a thread, after those that came before it when all turns are taken.
+
+        Raises:
+            ShareFullError: as many calls as may wait are waiting.
+        """
+        with self._lock:
+            if self._running >= self._running_max:
+                if len(self._waiting) >= self._waiting_max:
+                    raise ShareFullError
+                self._waiting.append(job)
+                return
+            self._running += 1
+        self._pool.submit(partial(self._work, job))
+
+    def call(self, call: Callable[[], T]) -> Future[T]:
+        """Run ``call`` likewise; the future has what it returns or raises.
+
+        Raises:
+            ShareFullError: as many calls as may wait are waiting.
+        """
+        done: Future[T] = Future()
+        self.submit(partial(_settle, done, call))
+        return done
+
+    def _work(self, job: Job) -> None:
+        while True:
+            try:
+                job()
+            except Exception:
+                logger.exception("A robot call failed outside its verb.")
+            with self._lock:
+                if not self._waiting:
+                    self._running -= 1
+                    return
+                job = self._waiting.popleft()
+
+
+class Shares:
+    """The shares of one robot: motions, reads, and resumes, none of which waits for another kind."""
+
+    def __init__(self, pool: WorkerPool = POOL) -> None:
+        self.motion = Share(pool=pool)
+        self.read = Share(pool=pool)
+        self.resume = Share(pool=pool)
+
+
+_SHARES: WeakKeyDictionary[Any, Shares] = WeakKeyDictionary()
+
+
+def shares_of(robot: object) -> Shares:
+    """The shares of a robot, the same on every network that serves it."""
+    body = body_of(robot)
+    try:
+        return _SHARES.setdefault(body, Shares())
+    except TypeError:  # no weak reference to it, or no hash
+        return Shares()
+
+
+async def awaited(start: Callable[[Callable[[T], None]], None], within: float) -> T:
+    """Return what ``start`` hands to the callback that it is given, from whatever thread; the loop is not blocked.
+
+    Raises:
+        TimeoutError: nothing came within ``within`` seconds.
+    """
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[T] = loop.create_future()
+
+    def settle(value: T) -> None:
+        if not answer.done():
+            answer.set_result(value)
+
+    def hand_over(value: T) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop closed while the robot was still busy
+            loop.call_soon_threadsafe(settle, value)
+
+    start(hand_over)
+    # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
+    async with asyncio.timeout(within):
+        return await answer
+
+
+async def called(share: Share, call: Callable[[], T], within: float) -> T:
+    """Return what ``call`` returns on a thread of ``share``, and raise what it raises.
+
+    Raises:
+        ShareFullError: the share is full.
+        TimeoutError: no answer within ``within`` seconds; the call goes on and keeps its turn until it returns.
+    """
+
+    def start(hand_over: Callable[[Future[T]], None]) -> None:
+        share.call(call).add_done_callback(hand_over)
+
+    return (await awaited(start, within)).result()
+
+
+def _settle(done: Future[T], call: Callable[[], T]) -> None:
+    try:
+        result = call()
+    except BaseException as exc:  # noqa: BLE001 - handed to the caller
+        done.set_exception(exc)
+    else:
+        done.set_result(result)
