@@ -12,7 +12,7 @@ from typing import Any
 from strands_robots.simulation.engine import mujoco
 from strands_robots.utils import ValidationError, shown
 
-MODELS = Path(__file__).parent / "models"
+MODELS = Path(__file__).parents[1] / "models"
 BUILT_IN = ("so100", "so101", "rover")
 """Models that come with the package; nothing is downloaded for them."""
 
