@@ -1,4 +1,4 @@
-"""A leader arm that leads a follower arm in another process, to the bytes on the follower's bus."""
+"""A leader arm that drives a follower arm in another process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fixtures.network_lab import NetworkLab, Weather, missing
 from benchmarks.table import Row
 
 SECONDS, SECONDS_QUICK = 600.0, 10.0
-FAR_SECONDS = 60.0
+NETWORK_SECONDS = 60.0
 DELAY_S = 0.05
 BOUND_MS = 12.0
 HZ = 50.0
@@ -19,16 +19,19 @@ RATE_SHARE = 0.98
 
 
 def leading(*, quick: bool) -> list[Row]:
-    """Over Zenoh on one machine, and over a network of 50 ms one way."""
-    return [near(SECONDS_QUICK if quick else SECONDS), far(SECONDS_QUICK if quick else FAR_SECONDS)]
+    """Measure over Zenoh on one machine, and over a network of 50 ms one way."""
+    return [
+        on_one_machine(SECONDS_QUICK if quick else SECONDS),
+        over_network(SECONDS_QUICK if quick else NETWORK_SECONDS),
+    ]
 
 
-def near(seconds: float) -> Row:
+def on_one_machine(seconds: float) -> Row:
     with tempfile.TemporaryDirectory(prefix="bench-pair-") as folder, ArmPair(Path(folder)) as pair:
         return _row("on one machine", seconds, pair.lead(seconds, HZ), 0.0)
 
 
-def far(seconds: float) -> Row:
+def over_network(seconds: float) -> Row:
     where = f"with {DELAY_S * 1000:g} ms of network delay, mutual TLS"
     if why := missing():
         return Row(f"leader to follower's bus {where}", f"not measured: {why}", "", None, "", ok=True)
@@ -39,7 +42,7 @@ def far(seconds: float) -> Row:
     ):
         lab.weather = Weather(delay_s=DELAY_S)
         row = _row(where, seconds, pair.lead(seconds, HZ), DELAY_S * 1000)
-        # Processes say goodbye, which needs a network.
+        # The processes leave by messages, which need a network.
         lab.weather = Weather()
         return row
 

@@ -1,4 +1,4 @@
-"""Reachy Mini under our driver, beside a bare ``websockets`` client of the same stand-in daemon in the same run."""
+"""Reachy Mini under our driver, beside a bare ``websockets`` client."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ reachy.disconnect()
 
 
 def run(quick: bool = False) -> list[Row]:
-    """Measure and give the rows of the table."""
+    """Measure and return the rows of the table."""
     calls, stops, restarts = (60, 10, 2) if quick else (400, 100, 5)
     with Daemon(Kind("1.13.0")) as daemon, _allowed(), _fleet(daemon) as (fleet, driver):
         rows = [_look(daemon, fleet, calls), _stop(daemon, fleet, driver, stops), _reconnect(daemon, driver, restarts)]
@@ -62,7 +62,7 @@ def run(quick: bool = False) -> list[Row]:
 
 @contextlib.contextmanager
 def _allowed() -> Iterator[None]:
-    """The bench is its own operator."""
+    """Approve the benchmark's own calls."""
     names = {"DEVICE_CONNECT_RPC_ALLOW": "bench", "BYPASS_TOOL_CONSENT": "1"}
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(names)
@@ -88,7 +88,7 @@ def _fleet(daemon: Daemon) -> Iterator[tuple[FleetClient, ReachyMiniDriver]]:
 
 
 def _look(daemon: Daemon, fleet: FleetClient, calls: int) -> Row:
-    """From the call to the frame at the daemon, in turns with a bare frame and a bare round trip of the device."""
+    """Time ``look`` until its frame is at the daemon, beside a bare frame and a call."""
     bare, trips, ours = [], [], []
     url = f"ws://127.0.0.1:{daemon.port}/ws/sdk"
     with connect(url, compression=None, ping_interval=None, proxy=None) as ws:
@@ -119,16 +119,16 @@ def _look(daemon: Daemon, fleet: FleetClient, calls: int) -> Row:
 
 
 def _first_since(daemon: Daemon, started: float) -> float:
-    """When the first head frame after ``started`` arrived, waited for."""
+    """Wait for the first head frame after ``started``; return its time of arrival."""
 
-    def found() -> list[float]:
+    def arrivals() -> list[float]:
         return [at for frame, at in daemon.arrivals(20) if at >= started and frame.get("head")]
 
-    return eventually(found, 2.0, "the frame at the daemon")[0]
+    return eventually(arrivals, 2.0, "the frame at the daemon")[0]
 
 
 def _stop(daemon: Daemon, fleet: FleetClient, driver: ReachyMiniDriver, stops: int) -> Row:
-    """From the call of ``stopMotion`` to the last frame that the daemon gets."""
+    """Time ``stopMotion`` until the last frame that the daemon receives."""
     late, answered = [], []
     for _ in range(stops):
         fleet.call("head", "shake", {})
@@ -151,7 +151,7 @@ def _stop(daemon: Daemon, fleet: FleetClient, driver: ReachyMiniDriver, stops: i
 
 
 def _reconnect(daemon: Daemon, driver: ReachyMiniDriver, restarts: int) -> Row:
-    """From the restart's request to joint data again, beside a bare client that connects anew all the time."""
+    """Time a restart until joint data arrives, beside a bare client that reconnects."""
     ours, bare = [], []
     for _ in range(restarts):
         before = driver.reachy.connection.connects
@@ -185,7 +185,7 @@ def _bare_data(daemon: Daemon, started: float) -> float:
 
 
 def _decode(daemon: Daemon, seconds: float) -> Row:
-    """Processor time of a process that does nothing but follow the robot."""
+    """Measure the processor time of a process that only reads the robot's stream."""
     url = f"ws://127.0.0.1:{daemon.port}/ws/sdk"
     bare = float(_child(BARE_READER, url, str(seconds)).split()[0]) / seconds
     spent, frames = _child(OUR_READER, str(daemon.port), str(seconds)).split()
@@ -206,15 +206,17 @@ def _child(code: str, *arguments: str) -> str:
 
 
 def _serve(daemon: Daemon, times: int) -> Row:
-    """From the start of ``strands-robots serve`` to the first answered call of a connected head."""
+    """Time the start of ``serve`` until the first answer of a connected head."""
     taken = []
     for _ in range(times):
         port = free_port()
-        words = f"serve reachy_mini --host 127.0.0.1 --set api_port={daemon.port} --peer-id head --port {port} --json"
+        arguments = (
+            f"serve reachy_mini --host 127.0.0.1 --set api_port={daemon.port} --peer-id head --port {port} --json"
+        )
         with FleetClient(loopback_config(port), "bench") as fleet:
             started = time.monotonic()
             serving = subprocess.Popen(
-                [sys.executable, "-m", "strands_robots.cli", *words.split()], stdout=subprocess.PIPE, text=True
+                [sys.executable, "-m", "strands_robots.cli", *arguments.split()], stdout=subprocess.PIPE, text=True
             )
             try:
                 assert serving.stdout is not None

@@ -1,4 +1,4 @@
-"""What it costs to record where robots are served: eight arms and a camera, beside the same messages written bare."""
+"""Cost of recording eight arms and a camera, beside the mcap library alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SAMPLED_SHARE = 0.98
 
 
 class Camera:
-    """Gives pictures as a scene does: smooth, with some noise, another one each time."""
+    """Camera of a smooth scene with some noise, with another picture each time."""
 
     def __init__(self) -> None:
         dice = np.random.default_rng(1)
@@ -58,14 +58,14 @@ class SeeingDevice(RecordingDevice):
 
 
 def run(*, quick: bool = False) -> list[Row]:
-    """The one row of this part."""
+    """Measure and return the one row of this part."""
     seconds = SECONDS_QUICK if quick else SECONDS
     with tempfile.TemporaryDirectory(prefix="bench-record-") as folder:
         return [recorded(Path(folder), seconds)]
 
 
 def recorded(folder: Path, seconds: float) -> Row:
-    """Joints of idle arms read at 50 Hz, the steps of their tasks told at 50 Hz, pictures at 15 Hz."""
+    """Record joints of idle arms and steps of tasks at 50 Hz, pictures at 15 Hz."""
     camera = Camera()
     path = folder / "run.mcap"
     robots = [HardwareRobot(SeeingDevice(None if number else camera), f"arm-{number}") for number in range(ARMS)]
@@ -82,7 +82,7 @@ def recorded(folder: Path, seconds: float) -> Row:
     for robot in robots:
         robot.cleanup()
     items = list(read_items(path))
-    told = sum(isinstance(item, RecordedEvent) and item.event == "streamStep" for item in items)
+    recorded_steps = sum(isinstance(item, RecordedEvent) and item.event == "streamStep" for item in items)
     joints = sum(isinstance(item, RecordedJoints) for item in items)
     pictures = sum(isinstance(item, RecordedPicture) for item in items)
     sent = int(seconds * HZ) * ARMS
@@ -92,21 +92,21 @@ def recorded(folder: Path, seconds: float) -> Row:
     least = SAMPLED_SHARE * seconds
     return Row(
         what=f"{ARMS} arms at {HZ:g} Hz, one {WIDTH} x {HEIGHT} camera at {CAMERA_HZ:g} Hz, {seconds:g} s",
-        ours=f"{share:.1f} % of a core; {told} steps, {joints} joint states, {pictures} pictures; "
+        ours=f"{share:.1f} % of a core; {recorded_steps} steps, {joints} joint states, {pictures} pictures; "
         f"{recorder.lost} lost, {late} beats skipped",
         against=f"{bare:.1f} %, steps, joints and pictures encoded and written in one loop",
         ratio=share / bare,
         must=f"under {PERCENT:g} % of a core, none lost, at most {1 - SAMPLED_SHARE:.0%} of the beats skipped",
         ok=share < PERCENT
         and recorder.lost == 0
-        and told == sent
+        and recorded_steps == sent
         and joints >= least * HZ * ARMS
         and pictures >= least * CAMERA_HZ,
     )
 
 
 def steps(recorder: Recorder, beat: int) -> None:
-    """What the observers of eight control loops do at one beat."""
+    """Record one step of each arm, as the observers of their control loops do."""
     for number in range(ARMS):
         recorder.take(f"arm-{number}", "streamStep", step(beat))
 
@@ -117,16 +117,16 @@ def step(beat: int) -> dict[str, Any]:
 
 
 def beats(seconds: float, act: Any) -> float:
-    """Act at 50 Hz for so long; the share of a core that the process took, in percent."""
-    cpu, began = time.process_time(), time.monotonic()
+    """Act at 50 Hz for some seconds; return the process's share of a core in percent."""
+    cpu, started = time.process_time(), time.monotonic()
     for beat in range(int(seconds * HZ)):
         act(beat)
-        time.sleep(max(0.0, began + (beat + 1) / HZ - time.monotonic()))
-    return (time.process_time() - cpu) / (time.monotonic() - began) * 100
+        time.sleep(max(0.0, started + (beat + 1) / HZ - time.monotonic()))
+    return (time.process_time() - cpu) / (time.monotonic() - started) * 100
 
 
 def bare_share(path: Path, seconds: float, camera: Camera) -> float:
-    """The same messages with the mcap library alone, in the loop that makes them."""
+    """Write the same messages with the mcap library alone; return the share."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -139,9 +139,9 @@ def bare_share(path: Path, seconds: float, camera: Camera) -> float:
 
         def act(beat: int) -> None:
             for _ in range(ARMS):
-                told = step(beat)
-                write(json.dumps(told).encode())
-                write(json.dumps(told["action"]).encode())
+                payload = step(beat)
+                write(json.dumps(payload).encode())
+                write(json.dumps(payload["action"]).encode())
             if int((beat + 1) * CAMERA_HZ / HZ) > int(beat * CAMERA_HZ / HZ):
                 write(jpeg("front", camera.read_latest()))
 

@@ -26,8 +26,8 @@ Sample = tuple[JointSample, float]
 """Joints, and the head's pitch in radians."""
 
 
-def recorded(daemon: Daemon) -> list[Sample]:
-    """The joints at 50 Hz from upright through a nod and a happy wiggle."""
+def record(daemon: Daemon) -> list[Sample]:
+    """Record the joints at 50 Hz from upright through a nod and a happy wiggle."""
     reachy = ReachyDriver("127.0.0.1", api_port=daemon.port)
     reachy.connect()
     try:
@@ -35,21 +35,21 @@ def recorded(daemon: Daemon) -> list[Sample]:
         eventually(lambda: reachy.facts()["moving"] == "", 15.0, "awake")
         reachy.go(Target(HeadPose(), 0.0, (-0.1745, 0.1745)))
         time.sleep(1.0)
-        seen: list[Sample] = []
+        samples: list[Sample] = []
         for gesture in ("nod", "happy"):
             print(reachy.gesture(gesture)["content"][0]["text"])
             while reachy.facts()["moving"]:
                 joints, pose = reachy.connection.feed.joints, reachy.connection.feed.pose()
-                if joints is not None and pose is not None and (not seen or joints.at > seen[-1][0].at):
-                    seen.append((joints, pose.pitch))
+                if joints is not None and pose is not None and (not samples or joints.at > samples[-1][0].at):
+                    samples.append((joints, pose.pitch))
                 time.sleep(0.01)
-        return seen
+        return samples
     finally:
         reachy.disconnect()
 
 
-def drawn(model_path: Path, seen: list[Sample], picture: Path) -> None:
-    """A strip of stills, and beside it the whole motion as an animation."""
+def draw(model_path: Path, samples: list[Sample], picture: Path) -> None:
+    """Draw a strip of stills, and the whole motion as an animation."""
     # MuJoCo reads this while it is imported.
     os.environ.setdefault("MUJOCO_GL", "egl")
     import mujoco  # noqa: PLC0415 - after the choice above
@@ -61,16 +61,16 @@ def drawn(model_path: Path, seen: list[Sample], picture: Path) -> None:
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0, 0, 0.19), 0.62, 225, -12
     images: list[Image.Image] = []
-    started = seen[0][0].at
+    started = samples[0][0].at
     with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
-        for joints, _ in seen:
+        for joints, _ in samples:
             # The daemon's MuJoCo counts the antennas the other way round.
             data.ctrl[:] = [*joints.head, *(-angle for angle in joints.antennas)]
             while data.time < 1.0 + joints.at - started:
                 mujoco.mj_step(model, data)
             renderer.update_scene(data, camera)
             images.append(Image.fromarray(renderer.render()))
-    pitches, antennas = [pitch for _, pitch in seen], [joints.antennas[0] for joints, _ in seen]
+    pitches, antennas = [pitch for _, pitch in samples], [joints.antennas[0] for joints, _ in samples]
     stills = [pitches.index(max(pitches)), pitches.index(min(pitches))]
     stills = [0, *stills, antennas.index(max(antennas)), antennas.index(min(antennas))]
     strip = Image.new("RGB", (SIZE[0] * len(stills), SIZE[1]))
@@ -80,7 +80,7 @@ def drawn(model_path: Path, seen: list[Sample], picture: Path) -> None:
     strip.save(picture, optimize=True)
     small = [image.resize((SIZE[0] // 2, SIZE[1] // 2)).quantize(64) for image in images[::3]]
     small[0].save(picture.with_suffix(".gif"), save_all=True, append_images=small[1:], duration=60, loop=0)
-    print(f"{picture} and {picture.with_suffix('.gif')} hold {len(images)} samples.")
+    print(f"{picture} and {picture.with_suffix('.gif')} have {len(images)} samples.")
 
 
 def main() -> None:
@@ -91,9 +91,9 @@ def main() -> None:
     if why := kind.missing():
         parser.error(why)
     with Daemon(kind) as daemon:
-        seen = recorded(daemon)
+        samples = record(daemon)
     scene = next(kind.venv.glob("lib/*/site-packages/reachy_mini/descriptions/reachy_mini/mjcf/scenes/empty.xml"))
-    drawn(scene, seen, options.picture)
+    draw(scene, samples, options.picture)
 
 
 if __name__ == "__main__":

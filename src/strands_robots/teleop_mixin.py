@@ -1,4 +1,4 @@
-"""Teleoperation for any robot: a leader drives a body through a rollout, with its permits and its write path."""
+"""Teleoperation for any robot: a leader drives a body through a rollout."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class TeleopMixin:
 
     @abstractmethod
     def body(self, robot_name: str | None = None) -> Body:
-        """Return the body of that name, or the host's first. Raises :class:`ValidationError` where there is none."""
+        """Return the body of that name, or the first; raises :class:`ValidationError`."""
 
     @abstractmethod
     def occupied(self, robot: str) -> str:
-        """Return the task that drives the body of that name, for a refusal; empty when none does."""
+        """Return the task that drives the body of that name, empty for none."""
 
     @answered
     def attach_teleop(
@@ -51,7 +51,7 @@ class TeleopMixin:
         method: str = "arm",
         max_speed: float = FULL_RANGES_PER_S,
     ) -> Envelope:
-        """Bind a leader to a body; nothing moves yet. A second leader of a name replaces the first.
+        """Bind a leader to a body, in place of an earlier one of that name.
 
         Args:
             leader: an object with ``get_action()``, connected.
@@ -107,7 +107,7 @@ class TeleopMixin:
         return success(f"{name} leads {session.robot}.", name=name, robot=session.robot, hz=rate)
 
     def stop_teleoperate(self, name: str | None = None, timeout: float = STOP_JOIN_S) -> Envelope:
-        """Stop one leader, or all. ``stopped`` is false when a loop outlived the ``timeout`` in seconds."""
+        """Stop one leader or all; ``stopped`` is false after ``timeout`` seconds."""
         self._teleop_waiting.void(name)
         running = self.teleoperating()
         stopping = running if name is None else {key: each for key, each in running.items() if key == name}
@@ -125,7 +125,7 @@ class TeleopMixin:
         return success(f"Stopped {', '.join(stopping)}.", **fields)
 
     def teleop_status(self) -> Envelope:
-        """Answer with one row for each leader that leads or has led: robot, frames, errors, state, steps and rate."""
+        """Answer with one row for each leader that leads or has led."""
         rows = self._teleop_rows({name: rollout for name, (rollout, _) in self._teleop_sessions.items()})
         return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
 
@@ -144,7 +144,7 @@ class TeleopMixin:
                 self._teleop_waiting.void(name)
 
     def teleop_stops(self, deadline: float) -> dict[str, Callable[[], object]]:
-        """Request the stop of every session; return the waits for their ends until ``deadline``, for a halt."""
+        """Request the stop of every session; return the waits until ``deadline``."""
         running = self.teleoperating()
         for session in running.values():
             session.request_stop()

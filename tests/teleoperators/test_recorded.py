@@ -1,4 +1,4 @@
-"""Recordings as leaders: playback, ``.csv`` files, and episodes of LeRobot's datasets."""
+"""Recordings as leaders: playback, ``.csv`` files and LeRobot's datasets."""
 
 from __future__ import annotations
 

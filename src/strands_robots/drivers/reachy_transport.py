@@ -1,4 +1,4 @@
-"""The documented door to talking with a Reachy Mini daemon; importable with the standard library alone.
+"""Documented access to a Reachy Mini daemon, with the standard library alone.
 
 Third parties (``httpx``, ``websockets``, ``zenoh``) are loaded by the first request or link.
 """

@@ -6,5 +6,5 @@ from typing import Any
 
 
 def close_chunk(writer: Any) -> None:
-    """Write the open chunk; the library itself closes one only when it is full, or at the end."""
+    """Write the open chunk, which the library closes only when full or at the end."""
     writer._Writer__finalize_chunk()

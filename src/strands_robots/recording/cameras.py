@@ -20,7 +20,7 @@ Frames = Callable[[], Mapping[str, Any]]
 
 
 class LazyFrames(Mapping[str, Any]):
-    """Pictures by camera name, each taken when it is read, so that a failing camera affects no other."""
+    """Pictures by camera name, each taken when read: a failure affects no other."""
 
     def __init__(self, sources: Mapping[str, Callable[[], Any]]) -> None:
         self._sources = dict(sources)
@@ -36,7 +36,7 @@ class LazyFrames(Mapping[str, Any]):
 
 
 def frames_of(robot: Any) -> Frames | None:
-    """Return a function that takes a picture with each camera of a robot; None for a robot without cameras.
+    """Return a function that takes a picture with each camera, or None without any.
 
     A robot's own ``camera_frames()`` comes first, then a simulation's ``render``, then the pictures in a device's
     ``get_observation()``. A camera ``arm/wrist`` is called ``arm.wrist`` on the wire, which allows no slash.

@@ -1,4 +1,4 @@
-"""MCAP files of recordings (mcap.dev/spec), written in small chunks and readable up to the last whole chunk."""
+"""MCAP files of recordings, readable up to the last whole chunk."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ JOINTS, CAMERA, LOG = "joint_states", "camera", "log"
 
 @dataclass(frozen=True, slots=True)
 class RecordedEvent:
-    """One event of a device; ``at`` is its time of arrival in seconds since the epoch."""
+    """One event of a device; ``at`` is its arrival in seconds since the epoch."""
 
     at: float
     device: str
@@ -59,7 +59,7 @@ class RecordedEvent:
 
 @dataclass(frozen=True, slots=True)
 class RecordedJoints:
-    """Positions by joint, in the robot's own units; ``device`` may be ``WORLD/ROBOT``."""
+    """Positions by joint in the robot's units; ``device`` may be ``WORLD/ROBOT``."""
 
     at: float
     device: str
@@ -80,7 +80,7 @@ RecordedItem = RecordedEvent | RecordedJoints | RecordedPicture
 
 
 class Recorder:
-    """Writer of one recording; it works on a thread of its own while it is entered as a context.
+    """Writer of one recording, on a thread of its own while entered as a context.
 
     Args:
         path: a new ``.mcap`` file.
@@ -185,7 +185,7 @@ class Recorder:
 
 
 class _Channels:
-    """Channels of a file that is being written, each registered with its first message."""
+    """Channels of an open file, each registered with its first message."""
 
     def __init__(self, file: Any, counts: Counter[str]) -> None:
         self._file = file
@@ -235,7 +235,7 @@ class _Channels:
 
 
 def read_items(path: Path) -> Iterator[RecordedItem]:
-    """Read a recording in the order in which it was written; of a cut file, all whole chunks.
+    """Read a recording in the order of writing; of a cut file, all whole chunks.
 
     Raises:
         MissingExtraError: the [record] extra is not installed.
@@ -265,7 +265,7 @@ def read_events(path: Path) -> Iterator[RecordedEvent]:
 
 
 def recorded_actions(path: Path, device: str | None = None) -> list[Frame]:
-    """Read the actions of one device as frames for a leader, in seconds since the first.
+    """Read one device's actions as a leader's frames, in seconds since the first.
 
     The joints serve as actions where the recording has none, as when the robot was moved by hand.
 

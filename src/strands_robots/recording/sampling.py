@@ -1,4 +1,4 @@
-"""Recording of a robot in the process that serves it: joints also while it stands, pictures, tasks, halts and locks."""
+"""Recording of a robot in the process that serves it."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class RobotRecording:
             self._take("locked" if lock else "unlocked", {"reason": lock} if lock else {})
 
     def _record(self, event: RolloutEvent) -> None:
-        """Record a rollout's event under the name and with the fields that it has on Device Connect."""
+        """Record a rollout's event with its name and fields on Device Connect."""
         world = isinstance(self._robot, WorldRobot)
         robot = {"robot_name": event.robot} if world else {}
         kind = "policy" if world else "task"

@@ -1,4 +1,4 @@
-"""Encoding of joint states, JPEG pictures and log lines, which Foxglove and Rerun draw without a plug-in.
+"""Encoding of joint states, JPEG pictures and log lines for Foxglove and Rerun.
 
 Sources: ``sensor_msgs/msg/JointState`` in CDR (OMG XTypes 1.3, plain CDR, little endian) with its definition as text;
 ``foxglove.CompressedImage`` and ``foxglove.Log`` as protobuf, field numbers from docs.foxglove.dev; a protobuf schema
@@ -50,7 +50,7 @@ class Schema:
 
 
 def joint_state(at_ns: int, joints: Mapping[str, float]) -> bytes:
-    """Encode a ``sensor_msgs/msg/JointState``: names and positions in the given order, in the robot's own units."""
+    """Encode a ``sensor_msgs/msg/JointState`` of names and positions."""
     out = bytearray(struct.pack("<iI", at_ns // _NS, at_ns % _NS))
     _text(out, "")
     _count(out, len(joints))
@@ -65,7 +65,7 @@ def joint_state(at_ns: int, joints: Mapping[str, float]) -> bytes:
 
 
 def read_joint_state(data: bytes) -> dict[str, float]:
-    """Decode a message of :func:`joint_state`. Raises :class:`struct.error` for any other."""
+    """Decode a message of :func:`joint_state`; raises ``struct.error`` otherwise."""
     body, at = data[len(_CDR_LITTLE_ENDIAN) :], 8
 
     def length(here: int) -> tuple[int, int]:
@@ -86,12 +86,12 @@ def read_joint_state(data: bytes) -> dict[str, float]:
 
 
 def compressed_image(at_ns: int, camera: str, jpeg: bytes) -> bytes:
-    """Encode a ``foxglove.CompressedImage``: timestamp 1, data 2, format 3, frame_id 4."""
+    """Encode a ``foxglove.CompressedImage``: time 1, data 2, format 3, frame_id 4."""
     return _time(at_ns) + _field(2, jpeg) + _field(3, b"jpeg") + _field(4, camera.encode())
 
 
 def read_compressed_image(data: bytes) -> bytes:
-    """Return the JPEG of a message of :func:`compressed_image`; empty where there is none."""
+    """Return the JPEG of a message of :func:`compressed_image`, empty for none."""
     at = 0
     while at < len(data):
         key, at = _read_varint(data, at)
@@ -158,13 +158,13 @@ def _time(at_ns: int) -> bytes:
 
 
 def _descriptor(number: int, name: str, kind: int, of: str = "") -> bytes:
-    """Encode a ``FieldDescriptorProto``: name 1, number 3, label 4 (1 is optional), type 5, type_name 6."""
+    """Encode a field: name 1, number 3, label 4 (optional), type 5, type_name 6."""
     field = _field(1, name.encode()) + _number(3, number) + _number(4, 1) + _number(5, kind)
     return _field(2, field + (_field(6, of.encode()) if of else b""))
 
 
 def _file(path: str, package: str, message: bytes, needs: str = "") -> bytes:
-    """Encode a ``FileDescriptorProto`` in its set: name 1, package 2, dependency 3, message_type 4, syntax 12."""
+    """Encode a file: name 1, package 2, dependency 3, message_type 4, syntax 12."""
     file = _field(1, path.encode()) + _field(2, package.encode())
     file += _field(3, needs.encode()) if needs else b""
     return _field(1, file + _field(4, message) + _field(12, b"proto3"))
@@ -178,7 +178,7 @@ def _set(name: str, fields: bytes) -> bytes:
 
 
 def _levels() -> bytes:
-    """Encode the nested enumeration of ``foxglove.Log`` (``EnumDescriptorProto``: name 1, value 2)."""
+    """Encode the enumeration of ``foxglove.Log``: name 1, value 2."""
     names = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
     values = b"".join(_field(2, _field(1, name.encode()) + _number(2, number)) for number, name in enumerate(names))
     return _field(4, _field(1, b"Level") + values)

@@ -1,1 +1,1 @@
-"""Leaders that drive a follower in place of a policy: an arm, a keyboard, a gamepad, a recorded file."""
+"""Leaders that drive a follower in place of a policy."""

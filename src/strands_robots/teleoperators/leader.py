@@ -1,4 +1,4 @@
-"""Leaders as policies that a follower can take, and a scripted leader for machines without hardware.
+"""Leaders as policies, and a scripted leader for machines without hardware.
 
 A leader is any object with ``get_action() -> dict`` of targets by action key (a LeRobot teleoperator, a gamepad). It
 may have ``is_connected`` and ``get_teleop_events()``, and raises :class:`LeaderFinished` at its end.
@@ -33,18 +33,18 @@ MAGNITUDE_MAX = 720.0
 
 
 class LeaderFinished(StrandsRobotsError):  # noqa: N818 - an end, not a fault
-    """The leader has no further action; raised by its ``get_action``, it completes the teleoperation."""
+    """End of a leader's actions; raised by ``get_action``, it ends the teleoperation."""
 
 
 class InputSink(Protocol):
-    """Second receiver of a leader's frames, given by a network. It returns at once and never blocks."""
+    """Second receiver of a leader's frames, given by a network; it never blocks."""
 
     def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
-        """Publish one frame; ``events`` is None when the leader has none or reading them failed."""
+        """Publish one frame; ``events`` is None where none could be read."""
 
 
 def teleop_events(leader: Any) -> dict[str, Any] | None:
-    """Return a leader's events by name, None where it has none; raises the leader's own exceptions."""
+    """Return a leader's events by name, or None; raises the leader's exceptions."""
     read = getattr(leader, "get_teleop_events", None)
     events = read() if callable(read) else None
     # LeRobot names events by a plain enumeration.
@@ -68,7 +68,7 @@ class ScriptedLeader:
         self.is_connected = True
 
     def get_action(self) -> Action:
-        """Return the present targets; time starts at the first call, with every key at its centre."""
+        """Return the present targets; the first call gives every key its centre."""
         if self._started_at is None:
             self._started_at = self._now()
         seconds = self._now() - self._started_at
@@ -79,7 +79,7 @@ class ScriptedLeader:
 
 
 class LeaderPolicy:
-    """A leader as a policy: frames are checked, renamed, clamped to the follower's ranges and bounded in speed.
+    """A leader as a policy: checked, renamed, clamped and bounded in speed.
 
     A frame that cannot be read or used is counted and not applied; after :data:`GIVE_UP_S` without a usable one the
     rollout ends with an error. A follower that starts apart from its leader moves there at the speed bound.
@@ -178,7 +178,7 @@ class LeaderPolicy:
                 logger.exception("The frames of %s do not reach the network; the follower goes on.", self._device)
 
     def events(self) -> dict[str, Any] | None:
-        """Return the leader's events, None where it has none. Raises the leader's own exceptions."""
+        """Return the leader's events, or None; raises the leader's exceptions."""
         return teleop_events(self._leader)
 
     def _readable_events(self) -> dict[str, Any] | None:
@@ -238,5 +238,5 @@ class BoundedLeader:
         return dict(self._last)
 
     def get_teleop_events(self) -> dict[str, Any] | None:
-        """Return the leader's own events. Raises the leader's own exceptions."""
+        """Return the leader's own events; raises the leader's exceptions."""
         return self._policy.events()

@@ -75,7 +75,7 @@ class Jog:
 
 
 class KeyboardLeader:
-    """A leader of single keys, read from a terminal while it is entered as a context; Escape or Ctrl-D ends it.
+    """A leader of a terminal's keys, while entered; Escape or Ctrl-D ends it.
 
     Args:
         start: the follower's position by action key; at most ten joints.
@@ -137,7 +137,7 @@ class KeyboardLeader:
 
 
 class GamepadLeader:
-    """A leader of stick axes: axis 0 pushes the first joint, axis 1 the second and so on; button 1 ends it.
+    """A leader of stick axes, one for each joint in order; button 1 ends it.
 
     Args:
         start: the follower's position by action key.
@@ -180,7 +180,7 @@ class GamepadLeader:
             os.close(fd)
 
     def get_action(self) -> Action:
-        """Return all targets, pushed by the sticks for the time since the last call, of which at most 0.1 s counts.
+        """Return all targets, pushed for the time since the last call, at most 0.1 s.
 
         Raises:
             LeaderFinished: button 1 was pressed.

@@ -1,4 +1,4 @@
-"""Recordings as leaders: frames of a file, played at the times at which they were recorded.
+"""Recordings as leaders: frames of a file, played at their recorded times.
 
 A ``.csv`` file has a first line of names: ``t`` (seconds, rising) and action keys, in the follower's units. An empty
 cell leaves its joint unchanged.
@@ -30,7 +30,7 @@ _COLUMNS = ("action", "timestamp", "episode_index")
 
 
 class RecordedLeader:
-    """Leader that plays frames from its first ``get_action`` and interpolates linearly between them.
+    """Leader that plays frames from its first ``get_action``, interpolated.
 
     Args:
         frames: at least one, in the order of their times.

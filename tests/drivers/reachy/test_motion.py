@@ -14,7 +14,7 @@ from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 
 
 class IdleConnection:
-    """The part of a connection that a write of the motors' torque uses; its daemon plays nothing."""
+    """The part of a connection that a write of the motors' torque uses."""
 
     connects, alive, motor_mode = 1, False, "enabled"
     last_poll = SimpleNamespace(moves=frozenset())

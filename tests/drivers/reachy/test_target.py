@@ -1,4 +1,4 @@
-"""Head poses and their matrices, the reach of targets, and the frames of ramps and gestures."""
+"""Head poses, the reach of targets, and the frames of ramps and gestures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Daemons for the tests: the stand-in always, the real ones where they are installed (`make test-all` does that)."""
+"""Daemons for the tests: the stand-in always, real ones where installed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def shared(request: pytest.FixtureRequest) -> Iterator[Daemon]:
 
 @pytest.fixture
 def daemon(shared: Daemon) -> Daemon:
-    """The shared daemon at rest: running, motors on, nothing moving, no fault switched on."""
+    """The shared daemon at rest: motors on, nothing moving, no fault switched on."""
     if not shared.kind.real:
         shared.control(slow_s=0.0, hub="cached", nan=False, holder="")
     if shared.request("GET", "/api/daemon/status").json()["state"] != "running":

@@ -1,4 +1,4 @@
-"""Behaviour of real daemons. Each test passes on the stand-in and on Pollen's own, which holds the stand-in to it."""
+"""Behaviour of real daemons, to which the stand-in is held by the same tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The driver on every daemon: the stand-in, the mock-up, MuJoCo, and a daemon that speaks Zenoh."""
+"""The driver on every daemon: stand-in, mock-up, MuJoCo, and one with Zenoh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rollouts on a Reachy Mini, as on any device with LeRobot's verbs, on every daemon."""
+"""Rollouts on a Reachy Mini, as on any device with LeRobot's verbs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driver of Pollen's Reachy Mini through its daemon; third parties are loaded by the first connection."""
+"""Driver of Pollen's Reachy Mini through its daemon; loads third parties on use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connection to a daemon that may be away, restart, be updated or fall silent, and the data it streams.
+"""Connection to a daemon that may restart or fall silent, and its data.
 
 One thread asks for the status, opens the link that the daemon speaks, and opens it again whenever joint frames stop
 for 1.5 seconds: after a restart an old socket stays open and silent, so the socket's own state proves nothing.
@@ -45,7 +45,7 @@ HEAD_JOINTS = ("body_yaw", "stewart_1", "stewart_2", "stewart_3", "stewart_4", "
 
 @dataclass(frozen=True, slots=True)
 class JointSample:
-    """Positions in radians: body yaw, the six legs of the head, and the antennas (right, left)."""
+    """Positions in radians: body yaw, six legs of the head, antennas (right, left)."""
 
     head: tuple[float, ...]
     antennas: tuple[float, float]
@@ -63,7 +63,7 @@ class JointSample:
 
 @dataclass(frozen=True, slots=True)
 class ImuSample:
-    """Accelerometer (m/s^2), gyroscope (rad/s), quaternion (w, x, y, z) and temperature (degrees Celsius)."""
+    """Inertial sample: m/s^2, rad/s, quaternion (w, x, y, z), degrees Celsius."""
 
     accelerometer: tuple[float, ...]
     gyroscope: tuple[float, ...]
@@ -73,7 +73,7 @@ class ImuSample:
 
 
 class Feed:
-    """Latest message of each kind of one robot. Written by the link's thread, read by any.
+    """Latest message of each kind, written by the link's thread and read by any.
 
     Both generations of the daemon send the same objects, over a WebSocket with a ``type`` and over Zenoh with a key.
     Joint frames are decoded on arrival, because they show whether the link is alive; the others when they are read.
@@ -88,7 +88,7 @@ class Feed:
         self.unusable_frames = 0
 
     def take(self, kind: str, payload: str | bytes) -> None:
-        """Store one message; one that cannot be decoded is dropped, as the daemon's clients do."""
+        """Store one message; a joint frame that cannot be decoded is dropped."""
         now = time.monotonic()
         if kind != "joint_positions":
             self._raw[kind] = (payload, now)
@@ -160,7 +160,7 @@ class Feed:
         return ImuSample(accelerometer, gyroscope, quaternion, temperature[0], self._raw["imu_data"][1])
 
     def status(self) -> dict[str, Any] | None:
-        """Return the daemon's status object unless it is older than three seconds (it comes every second)."""
+        """Return the daemon's status, sent every second, unless older than three."""
         return self._object("daemon_status", 3.0)
 
     def _object(self, kind: str, within_s: float) -> dict[str, Any] | None:
@@ -185,7 +185,7 @@ def _joints(payload: str | bytes, at: float) -> JointSample | None:
 
 
 def _numbers(values: object, length: int) -> tuple[float, ...] | None:
-    """Return ``length`` finite numbers, or None: NaN arrives as null over WebSocket and as a bare NaN over Zenoh."""
+    """Return ``length`` finite numbers, or None; NaN arrives as null or as bare NaN."""
     if not isinstance(values, list) or len(values) != length:
         return None
     good = all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values)
@@ -204,7 +204,7 @@ class PollResult:
 
 
 class Connection:
-    """Connection to one daemon; ``start`` it, then ask :meth:`refusal` before sending.
+    """Connection to one daemon; ``start`` it, and check ``refusal`` before sending.
 
     Args:
         host: bare hostname or IP literal of the daemon.
@@ -269,13 +269,13 @@ class Connection:
 
     @property
     def info(self) -> DaemonInfo | None:
-        """The daemon's newest status: from the stream where that is fresh, else the one of the last connection."""
+        """The daemon's newest status, from the stream or else of the last connection."""
         streamed = self.feed.status()
         return DaemonInfo.of(streamed) if streamed else self._info
 
     @property
     def motor_mode(self) -> str:
-        """The motors' mode: the daemon's last answer while that is newer than its status, which comes every second."""
+        """The motors' mode by the daemon's last answer or, if newer, its status."""
         mode, at = self._answered_mode
         if time.monotonic() - at < STATUS_LAG_S:
             return mode
@@ -386,7 +386,7 @@ class Connection:
         self.last_poll = PollResult(holder, running_moves(self.stop_rest.get(RUNNING_PATH)))
 
     def _holder(self, info: DaemonInfo) -> str:
-        """Return the application that holds the robot, by the daemon's lock where it has one or by its managed app."""
+        """Return the application that holds the robot, by the daemon's lock or app."""
         if info.since(APP_LOCK_SINCE):
             lock = self.rest.get(LOCK_PATH)
             if isinstance(lock, dict) and lock.get("state") not in ("free", None):
@@ -413,7 +413,7 @@ class Connection:
 
 
 def running_moves(answer: Any) -> frozenset[str]:
-    """Return the uuids of ``/api/move/running``. Raises :class:`ValidationError` for another shape."""
+    """Return the uuids of an answer of ``/api/move/running``; refuse another shape."""
     if not isinstance(answer, list) or not all(isinstance(move, dict) and "uuid" in move for move in answer):
         raise ValidationError("the daemon's list of running moves is no list of uuids.")
     return frozenset(str(move["uuid"]) for move in answer)

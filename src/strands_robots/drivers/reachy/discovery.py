@@ -1,4 +1,4 @@
-"""Discovery of a Reachy Mini on the local network by the mDNS service ``_reachy-mini._tcp`` of its daemon."""
+"""Discovery of a Reachy Mini by its daemon's mDNS service ``_reachy-mini._tcp``."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def make_reachy(
     driver: type[ReachyDriver] = ReachyDriver,
     **options: Any,
 ) -> ReachyDriver:
-    """Return a driver for ``host``, or for the one Reachy Mini that announces itself when no host is given.
+    """Return a driver for ``host``, or for the one Reachy Mini that announces itself.
 
     Args:
         host: bare hostname or IP literal; empty to discover it.

@@ -1,4 +1,4 @@
-"""Reachy Mini as a device with LeRobot's five verbs, and with the verbs of its own daemon."""
+"""Reachy Mini with LeRobot's five verbs and the verbs of its own daemon."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def motor_names(motor_ids: object) -> tuple[str, ...]:
 class Motors:
     """Torque of one robot's motors.
 
-    The mode of all motors is verified by asking back; the daemon never reports the torque of a single motor.
+    The mode of all motors is verified by asking back; the daemon never reports the torque of a single motor. Every
+    method raises :class:`DaemonError` where the daemon fails.
     """
 
     def __init__(self, connection: Connection, motions: MotionController) -> None:
@@ -83,14 +84,14 @@ class Motors:
         self._set_singly = False
 
     def mode(self, rest: RestClient | None = None, within_s: float | None = None) -> str:
-        """Ask for the mode: enabled, disabled or gravity_compensation. Raises :class:`DaemonError`."""
+        """Return the daemon's mode: enabled, disabled or gravity_compensation."""
         answer = (rest or self._connection.rest).get("/api/motors/status", within_s)
         mode = str(answer.get("mode")) if isinstance(answer, dict) else "unknown"
         self._connection.note_mode(mode)
         return mode
 
     def set_mode(self, mode: str) -> None:
-        """Set the mode of all motors and verify it. Raises :class:`DaemonError`."""
+        """Set the mode of all motors and verify it."""
         info = self._connection.info
         if mode == "enabled" and self._set_singly and info is not None and not info.since(STOP_MOVE_SINCE):
             # Before 1.10 a robot ignored this after torque was set motor by motor, unless all were off in between.
@@ -99,7 +100,7 @@ class Motors:
         self._set_singly = False
 
     def release(self, within_s: float = 1.0) -> None:
-        """Switch all motors off, for an emergency stop: no turn, no permit, its own connection."""
+        """Switch all motors off for an emergency stop, without a turn or a permit."""
         self._set("disabled", self._connection.stop_rest, within_s)
 
     def _set(self, mode: str, rest: RestClient, within_s: float | None = None) -> None:
@@ -109,7 +110,7 @@ class Motors:
             raise DaemonFaultError(f"the motors were to be {mode} and are {now}.")
 
     def torque(self, on: bool, motor_ids: str, name: str) -> Envelope:
-        """Switch torque on or off, of all motors or of some; ``name`` is the verb of the caller."""
+        """Switch the torque of all or some motors; ``name`` is the caller's verb."""
         names, mode = motor_names(motor_ids), "enabled" if on else "disabled"
         if not names:
             self._motions.torque(lambda: self.set_mode(mode), name)
@@ -140,7 +141,7 @@ class RecordedMoves:
         self._known: dict[str, tuple[int, tuple[str, ...]]] = {}
 
     def names(self, library: str) -> Envelope:
-        """Answer with the ``moves`` of a library, or with the reason why they are unknown."""
+        """Answer with the ``moves`` of a library, or why they are unknown."""
         checked = choice("library", library, tuple(LIBRARIES))
         refusal = self._fetch(checked)
         if refusal is not None:
@@ -149,7 +150,7 @@ class RecordedMoves:
         return success(f"{len(moves)} recorded moves in {checked}.", library=checked, moves=moves)
 
     def play(self, move_name: str, library: str) -> Envelope:
-        """Start a recorded move; an event and the status report its end."""
+        """Start a recorded move; an event reports its end."""
         name = identifier("move_name", move_name)
         checked = choice("library", library, tuple(LIBRARIES))
         reason = self._connection.refusal()
@@ -165,7 +166,7 @@ class RecordedMoves:
         return success(f"Playing {name}.", move=name, library=checked, uuid=uuid)
 
     def _fetch(self, library: str) -> Envelope | None:
-        """Make sure that the names are known and the daemon has the data set; return the refusal where not."""
+        """Fetch the names if needed, and with them the data set; return a refusal."""
         known = self._known.get(library)
         if known is not None and known[0] == self._connection.connects:
             return None
@@ -183,7 +184,7 @@ class RecordedMoves:
 
 
 class ReachyDriver:
-    """One Reachy Mini behind its daemon. Thread-safe; verbs that start a motion return at once.
+    """One Reachy Mini. Thread-safe; verbs that start a motion return at once.
 
     Args:
         host: bare hostname or IP literal of the daemon.
@@ -242,7 +243,7 @@ class ReachyDriver:
 
     @property
     def joint_ranges(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest value of each key of :meth:`send_action`: metres and radians."""
+        """Lowest and highest value of each action key, in metres and radians."""
         return dict(BOUNDS)
 
     @property
@@ -279,7 +280,7 @@ class ReachyDriver:
             time.sleep(POSE_EVERY_S)
 
     def connect_eagerly(self, within_s: float = 5.0) -> Envelope:
-        """Connect and answer with the result; never raises. The driver keeps trying to reach a robot that is away."""
+        """Connect and answer with the result; the driver goes on trying. Never raises."""
         self.connection.start()
         if self.connection.wait(within_s):
             return success("Connected.", **self.facts())
@@ -299,7 +300,7 @@ class ReachyDriver:
         self.disconnect()
 
     def get_observation(self) -> dict[str, float]:
-        """Return measured head pose, body yaw and antennas by action key, in metres and radians.
+        """Return the measured pose by action key, in metres and radians.
 
         Raises:
             DaemonUnreachableError: not connected, or the data is older than 1.5 s.
@@ -312,7 +313,7 @@ class ReachyDriver:
         return Target(pose, joints.body_yaw, joints.antennas).action()
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Send one frame and return the action sent: at most 0.3 rad and 10 mm from the last one, at 50 Hz.
+        """Send one frame, at most 0.3 rad and 10 mm from the last, and return it.
 
         Raises:
             ValidationError: a key or value outside the envelope.
@@ -322,7 +323,7 @@ class ReachyDriver:
         return self.motions.stream(target, "send_action").action()
 
     def hold(self) -> None:
-        """Stop every motion so that the robot keeps its pose, for a control loop around this driver.
+        """Stop every motion for a control loop around this driver; the pose is kept.
 
         Raises:
             DaemonError: it is not known to stand still.
@@ -334,11 +335,11 @@ class ReachyDriver:
     # Reachy's own verbs. A verb that fails raises MotionRefused, ValidationError or DaemonError.
 
     def checked(self, target: Target) -> Target:
-        """Return ``target`` when the robot can reach it from its position. Raises :class:`ValidationError`."""
+        """Return a reachable ``target``. Raises :class:`ValidationError` for any other."""
         return check(target, automatic_body_yaw=self._automatic, body_yaw=self.motions.present().body_yaw)
 
     def go(self, target: Target, name: str = "go") -> Envelope:
-        """Move to a target; a short way in one frame, a longer one by a ramp that goes on after the return."""
+        """Move to a target in one frame, or by a ramp that goes on after the return."""
         ramped = self.motions.go(self.checked(target), name)
         return success(f"{name}: {'moving there' if ramped else 'sent'}.", target=target.action(), ramp=ramped)
 
@@ -348,14 +349,14 @@ class ReachyDriver:
         return success(f"{name}: started.", motion=name)
 
     def wake_up(self) -> Envelope:
-        """Enable and verify the motors and play the daemon's wake-up; an event and the status report its end."""
+        """Enable the motors and start the daemon's wake-up; an event reports its end."""
         uuid = self.motions.daemon_move(
             "wakeUp", "/api/move/play/wake_up", arrived=self._awake, before=lambda: self.motors.set_mode("enabled")
         )
         return success("Motors enabled; waking up.", motor_mode="enabled", uuid=uuid)
 
     def sleep(self) -> Envelope:
-        """Play the daemon's way to sleep, which ends with the motors off; an event and the status report its end."""
+        """Start the daemon's way to sleep, which ends with motors off, and an event."""
         uuid = self.motions.daemon_move("sleep", "/api/move/play/goto_sleep", arrived=self._asleep)
         return success("Going to sleep.", uuid=uuid)
 
@@ -364,7 +365,7 @@ class ReachyDriver:
         return self.motions.observers.subscribe(observer)
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop every motion source: gestures, ramps, streams, and every move that the daemon runs."""
+        """Stop gestures, ramps, streams, and every move that the daemon runs."""
         return self.motions.halt(reason)
 
     def emergency_stop(self, reason: str = "", *, release: bool = False) -> Envelope:
@@ -379,7 +380,7 @@ class ReachyDriver:
         return {**verdict, "torque": "released"}
 
     def get_joints(self) -> Envelope:
-        """Answer with joint positions by motor name, in radians, and their age; stale ones are refused."""
+        """Answer with fresh joint positions by motor name in radians, and their age."""
         joints = self.connection.feed.joints
         age = time.monotonic() - joints.at if joints else None
         if joints is None or age is None or age > FRESH_S or not self.connection.alive:
@@ -387,7 +388,7 @@ class ReachyDriver:
         return success("Joint positions in radians.", joints=joints.named(), age_s=round(age, 4))
 
     def get_imu(self) -> Envelope:
-        """Answer with the inertial sample and its age; refused when stale or on a robot without a sensor."""
+        """Answer with a fresh inertial sample and its age."""
         imu = self.connection.feed.imu()
         if imu is None:
             reason = self.connection.refusal()
@@ -405,7 +406,7 @@ class ReachyDriver:
         )
 
     def facts(self) -> dict[str, Any]:
-        """Return the state of link, daemon, motors, application, data, motion, and the head's error in radians."""
+        """Return the state of link, daemon, motors, application, data and motion."""
         connection, info, feed = self.connection, self.connection.info, self.connection.feed
         motion, joints = self.motions.current, feed.joints
         sent, measured = self.motions.sent_head, feed.pose()

@@ -1,4 +1,4 @@
-"""Streams to a daemon: a WebSocket since 1.5, Zenoh before, chosen by the status that the daemon reports.
+"""Streams to a daemon: a WebSocket since 1.5, Zenoh before.
 
 A link sends, and hands every received message to a sink; the connection judges liveness and reconnects. The daemon
 acknowledges nothing on either. Third parties are loaded by ``open``.
@@ -56,7 +56,7 @@ class Link(Protocol):
     kind: str
 
     def open(self, sink: Sink) -> None:
-        """Connect and hand every message to ``sink``. Raises :class:`DaemonUnreachableError`."""
+        """Connect and hand every message to ``sink``."""
 
     def close(self) -> None:
         """Disconnect; sending afterwards raises :class:`DaemonUnreachableError`."""
@@ -79,7 +79,7 @@ class Link(Protocol):
 
 
 def open_socket(stack: contextlib.ExitStack, host: str, api_port: int, path: str) -> Any:
-    """Open a WebSocket that closes with ``stack``. Raises :class:`DaemonUnreachableError`."""
+    """Open a WebSocket that closes with ``stack``; raises ``DaemonUnreachableError``."""
     try:
         from websockets.exceptions import WebSocketException  # noqa: PLC0415 - optional, loaded by the first link
         from websockets.sync.client import connect  # noqa: PLC0415 - the same
@@ -154,7 +154,7 @@ class WebSocketLink:
         return self._can_stop
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send one object as a text frame: the daemon drops the connection at a binary one."""
+        """Send one object as text; the daemon closes the connection at a binary frame."""
         current = self._socket
         if current is None or self._closed.is_set():
             raise DaemonUnreachableError("The link to the daemon is closed.")
@@ -176,7 +176,7 @@ class WebSocketLink:
 
 
 def _kind(frame: str | bytes) -> str:
-    """Return the ``type`` of a frame; it is the first key of every frame but the IMU's, where it is the last."""
+    """Return the ``type`` of a frame: its first key, but the IMU frame's last."""
     if isinstance(frame, bytes):
         return ""
     if frame.startswith('{"type":"'):
@@ -202,7 +202,7 @@ class PubSub(Protocol):
 
 
 def key_prefix(value: object) -> str:
-    """Return a ``/``-joined sequence of identifiers; a wildcard would reach every robot under it.
+    """Return a ``/``-joined sequence of identifiers, none of them a wildcard.
 
     Raises:
         ValidationError: naming the part that is no identifier.
@@ -215,7 +215,7 @@ def key_prefix(value: object) -> str:
 
 
 class ZenohLink:
-    """Keys under a prefix, on a given session or on a client session of its own to the daemon.
+    """Keys under a prefix, on a given session or on one of its own to the daemon.
 
     Args:
         host: of the daemon's Zenoh router, port 7447, when no ``session`` is given.
@@ -286,7 +286,7 @@ class ZenohLink:
 
 
 class ClientSession:
-    """A Zenoh session in client mode to one endpoint, scouting off: two robots of one prefix never cross-talk."""
+    """A Zenoh client session to one endpoint without scouting, against cross-talk."""
 
     def __init__(self, endpoint: str) -> None:
         try:
@@ -342,12 +342,12 @@ class DaemonInfo:
         return cls(status, tuple(int(part or 0) for part in match.groups()) if match else ())
 
     def since(self, version: tuple[int, ...]) -> bool:
-        """Whether the daemon is that version or newer; without a version, whether its status has the new type."""
+        """Return True for that version or newer; without one, for the new status type."""
         return self.version >= version if self.version else self.raw.get("type") == "daemon_status"
 
     @property
     def state(self) -> str:
-        """One of not_initialized, starting, running, stopping, stopped, error; empty where none is reported."""
+        """State by the daemon's name, such as running or stopped; empty for none."""
         return str(self.raw.get("state") or "")
 
     @property
@@ -368,7 +368,7 @@ class DaemonInfo:
         return "zenoh" if self.version or self.raw.get("wireless_version") is True else "websocket"
 
     def prefix(self, requested: str) -> str:
-        """Return the prefix of the robot's keys: the caller's own, else the robot's name where the daemon uses it."""
+        """Return the key prefix: the caller's own, else the robot's name if in use."""
         name = self.raw.get("robot_name")
         if requested != DEFAULT_PREFIX or not isinstance(name, str) or self.version < PREFIX_SINCE:
             return requested
@@ -388,7 +388,7 @@ def make_link(
     session: PubSub | None = None,
     zenoh_port: int = ZENOH_PORT,
 ) -> Link:
-    """Return the link for a daemon, not yet open; ``transport`` other than auto overrides the rule."""
+    """Return the link for a daemon, not yet open; ``transport`` may override it."""
     kind = info.link if transport == "auto" else transport
     if kind == "zenoh":
         return ZenohLink(host, info.prefix(prefix), session=session, zenoh_port=zenoh_port)

@@ -100,7 +100,7 @@ class DaemonMoves:
                 raise
 
     def stop_all(self, own: str, deadline: float) -> tuple[frozenset[str], frozenset[str]]:
-        """Stop the move ``own`` (may be empty) first, then every other one, and list again.
+        """Stop the move ``own`` (may be empty), then every other one, and list again.
 
         Returns:
             The uuids that were asked to stop, and those that still run.
@@ -126,7 +126,7 @@ class MoveEnd:
 
 
 class MoveUpdates:
-    """Subscription to ``/api/move/ws/updates``, the only place where the daemon reports how a move ended.
+    """Subscription to the only place where the daemon reports how a move ended.
 
     It is opened before a move is asked for, so that not even a short one is missed.
     """
@@ -160,7 +160,7 @@ class MoveUpdates:
 
 
 class MotionController:
-    """The motions of one robot: frames that are streamed, and moves that the daemon plays."""
+    """Motions of one robot: streamed frames, and moves that the daemon plays."""
 
     def __init__(self, connection: Connection, gate: MotionGate, robot: str, *, automatic_body_yaw: bool) -> None:
         self._connection, self._gate, self._robot = connection, gate, robot
@@ -188,7 +188,7 @@ class MotionController:
         return self._sent.head if self._sent_on == self._connection.connects else None
 
     def present(self) -> Target:
-        """Return the robot's position: the last target sent while nothing else moved it, else the measured one."""
+        """Return the last target sent, or the measured position after any other move."""
         feed = self._connection.feed
         joints = feed.fresh_joints
         measured = Target(feed.pose(), joints.body_yaw if joints else None, (joints.antennas if joints else None))
@@ -197,12 +197,12 @@ class MotionController:
         return self._sent.over(measured)
 
     def moving(self) -> bool:
-        """Whether a motion of ours runs or the daemon plays a move now. Raises :class:`DaemonError`."""
+        """Return True while a motion runs here or at the daemon (asked now)."""
         motion = self._current
         return (motion is not None and motion.running) or bool(self._moves.running(time.monotonic() + 1.0))
 
     def stream(self, target: Target, name: str) -> Target:
-        """Send one frame now; a longer way is cut to one frame's. Returns the target that was sent."""
+        """Send one frame now, cut to one frame's way; return the target sent."""
         with self._started(name) as motion:
             start = self.present()
             steps = target.step_from(start)
@@ -213,7 +213,7 @@ class MotionController:
             return sent
 
     def go(self, target: Target, name: str) -> bool:
-        """Go there: at once where one frame may, else by a ramp whose first frame is sent now. True for a ramp."""
+        """Go there by one frame now, or by a ramp that starts now; True for a ramp."""
         with self._started(name) as motion:
             start = self.present()
             ramped = target.step_from(start) > 1
@@ -284,7 +284,7 @@ class MotionController:
             self._end(motion, "completed")
 
     def halt(self, reason: str) -> StopVerdict:
-        """Stop every motion source and grade the result. Any thread; never waits for another motion's start."""
+        """Stop every motion, from any thread, without waiting for a motion's start."""
         self._gate.revoke()
         deadline = time.monotonic() + 0.85 * settings.number("STRANDS_HALT_DEADLINE_S")
         motion = self._current if self._current is not None and self._current.running else None
@@ -333,7 +333,7 @@ class MotionController:
             self._body_yaw_sent_on = self._connection.connects
 
     def _replace(self, name: str) -> None:
-        """Stop our own running motion, and the moves of the daemon that another client started."""
+        """Stop our own motion, and the daemon's moves of other clients."""
         before = self._current
         running = before is not None and before.running
         if before is not None and running:
@@ -425,7 +425,7 @@ class MotionController:
         self._end(motion, "completed")
 
     def _forget_sent(self) -> None:
-        """Forget the last target: the robot was moved by something else, so only measuring gives its position."""
+        """Forget the last target, because something else moved the robot."""
         self._sent = Target()
 
     def _watch(self, motion: ReachyMotion, updates: MoveUpdates, arrived: ArrivalCheck) -> None:
@@ -452,7 +452,7 @@ class MotionController:
             self._end(motion, end.state, end.detail or ("another client stopped it" if end.state == "stopped" else ""))
 
     def _stop_frames(self, motion: ReachyMotion | None, deadline: float) -> object:
-        """Wait for the write in flight; afterwards no frame of an earlier permit reaches the link.
+        """Wait for the write in flight; no later frame of an earlier permit is sent.
 
         Returns None when nothing was streaming.
         """
@@ -463,7 +463,7 @@ class MotionController:
         return success("no frame is sent any more", stopped=True) if streaming else None
 
     def _stop_moves(self, motion: ReachyMotion | None, deadline: float) -> object:
-        """List the running moves, stop each, read every answer, and list again. Returns None when there was none."""
+        """Stop every running move and list again; None when there was none."""
         if motion is not None and motion.of_daemon:
             motion.posted.wait(max(0.0, deadline - time.monotonic()))
         if self._connection.connects == 0 and (motion is None or not motion.of_daemon):

@@ -1,4 +1,4 @@
-"""Client of the daemon's REST interface, with an error for each kind of failure and short time limits.
+"""Client of the daemon's REST interface, with an error for each kind of failure.
 
 Importable with the standard library alone; ``httpx`` is loaded by the first request. The daemon has no
 authentication: every client that reaches its port controls the motors.
@@ -53,7 +53,7 @@ class DaemonFaultError(DaemonError):
 
 
 class BackendDownError(DaemonError):
-    """503: the daemon answers but drives no robot; it is stopped, failed or not started."""
+    """503: the daemon drives no robot; it is stopped, failed or not started."""
 
 
 _KINDS: dict[int, type[DaemonError]] = {
@@ -68,7 +68,7 @@ _KINDS: dict[int, type[DaemonError]] = {
 
 
 def checked_host(value: object) -> str:
-    """Return a bare hostname or IP literal. Raises :class:`ValidationError` for anything else."""
+    """Return a bare hostname or IP literal; refuse anything else."""
     reason = dial_host_error(value)
     if reason is not None:
         raise ValidationError(reason)
@@ -76,9 +76,10 @@ def checked_host(value: object) -> str:
 
 
 def url_host(host: str) -> str:
-    """Return the name to use in a URL: since 1.12 the daemon answers only to IPs, localhost and ``*.local``.
+    """Return the host for a URL: an IP, localhost or ``*.local``.
 
-    Any other name is resolved here, so that the Host header is an IP. Raises :class:`DaemonUnreachableError`.
+    Since 1.12 the daemon answers to no other Host header, so any other name is resolved here.
+    Raises :class:`DaemonUnreachableError` for a name without an address.
     """
     bare = host.strip("[]")
     try:
@@ -122,7 +123,7 @@ class RestClient:
         return self.request("POST", path, body, within_s=within_s)
 
     def request(self, method: str, path: str, body: Any = None, *, within_s: float | None = None) -> Any:
-        """Send one request and return its decoded JSON; ``within_s`` replaces the client's time limits.
+        """Send one request and return its JSON; ``within_s`` replaces the time limits.
 
         Raises:
             DaemonError: by kind: unreachable, refused, not found, busy, backend down, fault.
@@ -150,7 +151,7 @@ class RestClient:
             raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
 
     def close(self) -> None:
-        """Drop the connections, those in use when their requests end; the next request opens new ones."""
+        """Close the connections, each when its requests end; a later request opens new ones."""
         pool = self._pool
         if pool is not None:
             self._retire(pool)
@@ -196,7 +197,7 @@ class _Pool:
 def api(  # noqa: PLR0917 - the documented order
     host: str, api_port: int, path: str, method: str = "GET", data: Any = None, timeout: float = READ_S
 ) -> Any:
-    """Send one request over a connection of its own; never raises for an error on the wire.
+    """Send one request over a connection of its own; never raises.
 
     Args:
         host: bare hostname or IP literal of the daemon.
@@ -236,7 +237,7 @@ def _httpx() -> Any:
 
 
 def _detail(answer: httpx.Response) -> str:
-    """Return the daemon's message: ``detail`` as text, the first of a validation list, or the bare body."""
+    """Return the daemon's ``detail``, the first of a validation list, or the body."""
     try:
         detail = json.loads(answer.text).get("detail")
     except (ValueError, AttributeError):

@@ -1,4 +1,4 @@
-"""Head poses and targets of a Reachy Mini, their reach, and the frames of ramps and gestures. Metres and radians.
+"""Head poses and targets of a Reachy Mini, in metres and radians, and gestures.
 
 A pose is relative to the head's upright rest. Angles are extrinsic x-y-z, ``R = Rz(yaw) Ry(pitch) Rx(roll)``: positive
 pitch looks down, positive yaw looks left (the daemon's REST convention).
@@ -111,7 +111,7 @@ class HeadPose:
         return cls(m[3], m[7], m[11], roll, pitch, yaw)
 
     def angle_to(self, other: HeadPose) -> float:
-        """Return the angle of the one rotation that turns this head into ``other``, in radians."""
+        """Return the angle of the one rotation to ``other``, in radians."""
         a, b = self.matrix(), other.matrix()
         # The chord keeps small angles exact where the arc cosine of a trace near 3 loses half its digits:
         # |A - B| in the Frobenius norm is sqrt(8) sin(angle / 2).
@@ -119,7 +119,7 @@ class HeadPose:
         return 2 * math.asin(min(1.0, chord / math.sqrt(8)))
 
     def turn_to(self, other: HeadPose) -> float:
-        """Return the changes of roll, pitch and yaw added up, in radians: never less than :meth:`angle_to`."""
+        """Return the changes of roll, pitch and yaw added up: at least ``angle_to``."""
         return abs(self.roll - other.roll) + abs(self.pitch - other.pitch) + abs(self.yaw - other.yaw)
 
     def distance_to(self, other: HeadPose) -> float:
@@ -127,7 +127,7 @@ class HeadPose:
         return math.dist((self.x, self.y, self.z), (other.x, other.y, other.z))
 
     def toward(self, other: HeadPose, share: float) -> HeadPose:
-        """Return the pose ``share`` (0 to 1) of the way to ``other``, number by number; exactly ``other`` at 1."""
+        """Return the pose at ``share`` (0 to 1) of the way, exactly ``other`` at 1."""
         if share >= 1:
             return other
         return HeadPose(*(a + (b - a) * share for a, b in zip(self.numbers(), other.numbers(), strict=True)))
@@ -135,7 +135,7 @@ class HeadPose:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Targets of the head, the body's yaw and the antennas (right, left), each optional; metres and radians."""
+    """Targets of head, body yaw and antennas (right, left), in metres and radians."""
 
     head: HeadPose | None = None
     body_yaw: float | None = None
@@ -150,7 +150,7 @@ class Target:
         )
 
     def step_from(self, start: Target) -> float:
-        """Return the largest way from ``start`` in any part, in steps that one frame may do."""
+        """Return the largest way of any part from ``start``, in steps of one frame."""
         steps = [0.0]
         if self.head and start.head:
             # The sum of the angles bounds the turn and, unlike it, divides evenly over the frames of a ramp. The body
@@ -164,7 +164,7 @@ class Target:
         return max(steps)
 
     def toward(self, end: Target, share: float) -> Target:
-        """Return the target ``share`` (0 to 1) of the way to ``end``, in the parts that ``end`` has."""
+        """Return the target at ``share`` (0 to 1) of the way, in the parts of ``end``."""
         if share >= 1:
             return end
         head, body, antennas = end.head, end.body_yaw, end.antennas
@@ -190,7 +190,7 @@ class Target:
 
 
 def bounded(key: str, value: object, *, unit: str = "", scale: float = 1.0, name: str = "") -> float:
-    """Return ``value`` in metres or radians; refuse it outside the bounds of an action key.
+    """Return ``value`` in metres or radians, inside the bounds of an action key.
 
     Args:
         key: the action key.
@@ -230,7 +230,7 @@ def check(target: Target, *, automatic_body_yaw: bool, body_yaw: float | None = 
 
 
 def from_action(action: dict[str, object], start: Target) -> Target:
-    """Return the target of an action in metres and radians; missing head numbers come from ``start``.
+    """Return the target of an action; missing head numbers come from ``start``.
 
     Raises:
         ValidationError: an unknown key, an empty action, or a value out of its bounds.
@@ -257,7 +257,7 @@ Gesture = Callable[[Target], Frames]
 
 
 def ramp(start: Target, end: Target) -> Frames:
-    """Yield even steps of at most ``RAMP_STEP`` radians a frame; the last one is ``end`` itself."""
+    """Yield even steps of at most ``RAMP_STEP``; the last one is ``end`` itself."""
     frames = max(1, math.ceil(end.step_from(start) * FRAME_STEP / RAMP_STEP))
     for i in range(1, frames + 1):
         yield start.toward(end, i / frames)
@@ -293,7 +293,7 @@ GESTURES: dict[str, Gesture] = {"nod": nod, "shake": shake, "happy": happy}
 
 
 def _swings(times: int, period_s: float) -> Iterator[float]:
-    """Yield a sine from 0 to 0, sampled at the stream's rate, that starts and ends without a jerk."""
+    """Yield a sine at the stream's rate that starts and ends at 0 without a jerk."""
     frames = round(times * period_s * STREAM_HZ)
     for i in range(1, frames + 1):
         share = i / frames
