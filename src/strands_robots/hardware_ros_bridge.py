@@ -1,4 +1,4 @@
-"""Bridge of a real robot to a ROS 2 graph through rclpy: its joints and cameras, and joint commands for it."""
+"""Bridge of a real robot to a ROS 2 graph through rclpy."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from strands_robots.ros_telemetry import RosTelemetryBridge
 
 
 class HardwareRosBridge(RosTelemetryBridge):
-    """Publishes joints and images, and forwards ``/<robot>/joint_command`` to ``robot.send_action``.
+    """Publisher of joints and images that takes ``/<robot>/joint_command``.
 
     Commands are taken as :class:`~strands_robots.ros_telemetry.RosTelemetryBase` describes. For the arguments see
     :class:`~strands_robots.ros_telemetry.RosTelemetryBridge`; the node is called ``strands_hardware`` by default.

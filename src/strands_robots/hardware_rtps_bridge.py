@@ -1,4 +1,4 @@
-"""Bridge of a real robot to a ROS 2 graph over bare DDS: its joints and cameras, and joint commands for it."""
+"""Bridge of a real robot to a ROS 2 graph over bare DDS."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from strands_robots.utils import missing_extra
 
 
 class HardwareRtpsBridge(RosTelemetryBase):
-    """Publishes joints and images, and forwards ``/<robot>/joint_command`` to ``robot.send_action``.
+    """Publisher of joints and images that takes ``/<robot>/joint_command``.
 
     Commands are taken as :class:`~strands_robots.ros_telemetry.RosTelemetryBase` describes.
 

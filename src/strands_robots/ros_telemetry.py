@@ -1,4 +1,4 @@
-"""Bridges of joint robots to ROS: their topics, their refusals, and the path of a joint command."""
+"""Bridges of joint robots to ROS: topics, refusals and joint commands."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def segment(name: str) -> str:
 
 
 def checked_limits(limits: object) -> Limits:
-    """Check ``{"<motor>.pos": (min, max)}`` of finite numbers. Raises :class:`ValidationError` naming the joint."""
+    """Check ``{"<motor>.pos": (min, max)}`` of finite numbers."""
     if limits is None:
         return {}
     if not isinstance(limits, dict):
@@ -57,7 +57,7 @@ def checked_limits(limits: object) -> Limits:
 
 
 def refuse_unsecured(why: str | None) -> None:
-    """Refuse commands from a graph on which anyone could drive the robot, unless the operator opted out.
+    """Refuse commands from an unsecured graph, unless the operator opted out.
 
     Args:
         why: reason why the graph is not secured; None where it is.
@@ -118,7 +118,7 @@ class RosTelemetryBase:
         self._publisher: threading.Thread | None = None
 
     def publish(self, cameras: Sequence[str] = ()) -> None:
-        """Publish the robot's joints once, and the newest picture of each of these cameras of it.
+        """Publish the joints once, and the newest picture of each of these cameras.
 
         Joints that could not be read are not published: a message of now would hold positions of the past.
 
@@ -140,7 +140,7 @@ class RosTelemetryBase:
             self.publish_image(name, camera, frames[camera])
 
     def start(self, rate_hz: float = 20.0, cameras: Sequence[str] = ()) -> None:
-        """:meth:`publish` at ``rate_hz``, above 0 and at most 200, on a thread, until :meth:`shutdown`.
+        """Publish at ``rate_hz``, above 0 and at most 200, until :meth:`shutdown`.
 
         Raises:
             ValidationError: a rate outside its domain, nothing to publish, or started already.
@@ -155,7 +155,7 @@ class RosTelemetryBase:
         self._publisher.start()
 
     def publish_joint_states(self, robot: str, names: list[str], positions: list[float]) -> None:
-        """Publish joint positions in the robot's own unit; lists of different length are dropped with a warning."""
+        """Publish positions in the robot's unit; drop lists of different length."""
         if len(names) != len(positions):
             logger.warning("%d names and %d positions of %s are not published.", len(names), len(positions), robot)
             return
@@ -163,7 +163,7 @@ class RosTelemetryBase:
         self._send(self.joint_states_topic(robot), JOINT_STATE, fields)
 
     def publish_image(self, robot: str, camera: str, image: Any) -> None:
-        """Publish one RGB picture of shape (height, width, 3) and type uint8; any other is dropped with a warning."""
+        """Publish one RGB picture of shape (height, width, 3) and type uint8."""
         shape = tuple(getattr(image, "shape", ()))
         if len(shape) != 3 or shape[2] != 3 or str(getattr(image, "dtype", "")) != "uint8":
             logger.warning("An image of %s must have shape (height, width, 3) and type uint8; not published.", camera)
@@ -179,7 +179,7 @@ class RosTelemetryBase:
         self._send(self.image_topic(robot, camera), IMAGE, fields)
 
     def shutdown(self) -> None:
-        """Take no more commands, publish no more and leave the graph. A second call does nothing."""
+        """Take no more commands and leave the graph. A second call does nothing."""
         self._done.set()
         for thread in (self._thread, self._publisher):
             if thread is not None and thread is not threading.current_thread():
@@ -215,7 +215,7 @@ class RosTelemetryBase:
         return None
 
     def apply(self, command: Mapping[str, Any]) -> bool:
-        """Hand a ``JointState`` to the robot as a command, whole or not at all; return whether the robot took it."""
+        """Command the robot by a whole ``JointState``; return True if it took it."""
         names, positions = list(command.get("name", ())), list(command.get("position", ()))
         problem = self.command_error(names, positions)
         if problem is not None:
@@ -233,7 +233,7 @@ class RosTelemetryBase:
         return True
 
     def _begin(self, link: BroadcastLink, name: str, *, open_now: bool = False) -> None:
-        """Use this link from now on, and take commands from it on a thread of this name where they are enabled.
+        """Use this link from now on, and take commands from it where enabled.
 
         Args:
             link: closed again where this raises.
@@ -320,7 +320,7 @@ class RosTelemetryBridge(RosTelemetryBase):
 
 
 def rclpy_security_gap() -> str | None:
-    """Return in a sentence why the graph that rclpy joins is not secured, or None: it is.
+    """Return why the graph that rclpy joins is not secured, or None: it is.
 
     ROS 2 compares the two values letter by letter and falls back to an open graph on any other, so this does too.
     """

@@ -1,4 +1,4 @@
-"""ROS graphs: names, the command gate, and the links to them. Importing this package loads no link."""
+"""ROS graphs: names, the command gate, and links that are loaded when used."""
 
 from __future__ import annotations
 

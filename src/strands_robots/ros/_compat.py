@@ -1,4 +1,4 @@
-"""Private members of cyclonedds that we use: of 11.0, which is pinned for it, and of 0.10.5."""
+"""Private members of cyclonedds 11.0 (pinned for them) and 0.10.5."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MACHINES = ("v0_machine", "v1_machine", "v2_machine")
 
 
 def pack_as_bytes(struct: Any, *members: str) -> None:
-    """Serialize these ``sequence[byte]`` members of an IDL struct from and to ``bytes``, in one piece.
+    """Serialize these ``sequence[byte]`` members of a struct as ``bytes``.
 
     The library packs one Python integer at a time, tens of milliseconds for a small image. The bytes on the wire
     and the type that peers see are the same.
@@ -27,7 +27,7 @@ def pack_as_bytes(struct: Any, *members: str) -> None:
 
 
 def subscribed(writer: Any) -> bool:
-    """Return True while a subscription matches this writer, which 0.10.5 offers in C only."""
+    """Return True while a subscription matches; 0.10.5 offers this in C only."""
     if hasattr(writer, "get_matched_subscriptions"):
         return bool(writer.get_matched_subscriptions())
     return int(writer._dll_handle.dds_get_matched_subscriptions(writer._ref, None, ctypes.c_size_t(0))) > 0

@@ -1,4 +1,4 @@
-"""``ros_action``: inspect, read and write a ROS graph by rclpy, over bare DDS or through a rosbridge server."""
+"""``ros_action``: inspect, read and write a ROS graph over any link."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Browsable(Protocol):
     """A link that can list its graph."""
 
     def topics(self) -> list[dict[str, Any]]:
-        """Return ``topic`` and ``type`` of each topic, with what else the link knows of it."""
+        """Return ``topic`` and ``type`` of each topic, and what else is known."""
 
     def nodes(self) -> list[str]:
         """Return the names of the nodes."""
@@ -58,7 +58,7 @@ _links_lock = threading.Lock()
 
 
 def link_for(backend: str, host: str, port: int, domain_id: int | None) -> RosLink:
-    """Return the process's link to a graph, made at its first use and kept; ``auto`` asks :func:`ros2_backend`.
+    """Return the process's link to a graph; ``auto`` asks :func:`ros2_backend`.
 
     Raises:
         ValidationError: an address or a domain outside its domain.
@@ -205,7 +205,7 @@ def _browsable(link: RosLink) -> Browsable:
 
 
 def _jsonable(value: Any) -> Any:
-    """Return a message as JSON can carry it: bytes become a sentence with their number."""
+    """Return a message for JSON, with the number of bytes in place of bytes."""
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     if isinstance(value, Mapping):

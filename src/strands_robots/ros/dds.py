@@ -1,4 +1,4 @@
-"""Link to a ROS 2 graph over bare DDS: Cyclone DDS from a wheel, no ROS 2 on this side."""
+"""Link to a ROS 2 graph over bare DDS, without ROS 2 on this side."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _domains_lock = threading.Lock()
 
 
 class DdsLink:
-    """A :class:`~strands_robots.ros.link.RosLink` of topics. Nothing is opened before the first use.
+    """A :class:`~strands_robots.ros.link.RosLink` of topics, opened by first use.
 
     A published message needs a subscription: while no subscription matches, a publish waits ``match_s`` and fails.
 
@@ -142,7 +142,7 @@ class DdsLink:
         return unwatch
 
     def endpoints(self) -> list[dict[str, str]]:
-        """Return ``topic``, ``type`` and ``role`` (publisher, subscription) of each endpoint discovered so far."""
+        """Return ``topic``, ``type`` and ``role`` of each endpoint discovered so far."""
         builtin, core = _dds("builtin"), _dds("core")
         sources = {
             "publisher": builtin.BuiltinTopicDcpsPublication,
@@ -165,7 +165,7 @@ class DdsLink:
         return found
 
     def topics(self) -> list[dict[str, Any]]:
-        """Return ``topic``, ``type``, and the number of its ``publishers`` and ``subscriptions``, by topic and type.
+        """Return ``topic``, ``type``, ``publishers`` and ``subscriptions`` of each topic.
 
         A domain that was joined just now has ``match_s`` to be discovered.
         """
@@ -249,7 +249,7 @@ def _write(writer: Any, message: Any, topic: str, kind: str) -> None:
 
 
 def confine(module: ModuleType, domain_id: int) -> None:
-    """Give the domain its loopback configuration, once a process, where ``ROS_LOCALHOST_ONLY`` asks for it."""
+    """Confine the domain to loopback where ``ROS_LOCALHOST_ONLY`` is set."""
     if settings.is_set("CYCLONEDDS_URI") or not settings.boolean("ROS_LOCALHOST_ONLY", safe=True):
         return
     with _domains_lock:
@@ -276,7 +276,7 @@ def _dds(module: str) -> ModuleType:
 
 
 def _arrived(reader: Any, topic: str, lost: type[Exception], done: threading.Event) -> Iterator[dict[str, Any]]:
-    """Take what has arrived, one by one, so that an unreadable message costs neither the others nor the thread."""
+    """Yield the messages that have arrived, and log those that are unreadable."""
     level = logging.WARNING
     while not done.is_set():
         try:
@@ -303,7 +303,7 @@ def _deliver(on_message: OnMessage, message: dict[str, Any], topic: str) -> None
 
 
 def filled(struct: type[Any], fields: Mapping[str, Any], place: str = "") -> Any:
-    """Return a struct with these fields; what is left out is zero. Raises :class:`RosError` naming the field."""
+    """Return a struct with these fields, else zeros; a wrong one is a RosError."""
     hints = get_type_hints(struct, include_extras=True)
     message = struct()
     for name, value in fields.items():

@@ -1,4 +1,4 @@
-"""DDS Security of a participant: its credentials, the plugins of Cyclone DDS, and the governance of a topic.
+"""DDS Security of a participant: credentials, plugins and governance.
 
 The names of the properties are those of the OMG's DDS Security 1.1; the plugins are the ones built with Cyclone DDS.
 """
@@ -45,7 +45,7 @@ _presenting = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class DdsCredentials:
-    """The checked credentials of one participant, as URIs. They may hold a private key and are never printed."""
+    """The checked credentials of one participant, as URIs; never printed."""
 
     uris: Mapping[str, str] = field(repr=False)
 
@@ -55,7 +55,7 @@ class DdsCredentials:
         return uri.removeprefix(_DATA).encode() if uri.startswith(_DATA) else Path(uri.removeprefix(_FILE)).read_bytes()
 
     def properties(self) -> dict[str, str]:
-        """Return the properties of a participant that presents them to the plugins of the loaded library.
+        """Return the properties of a participant that presents them.
 
         Raises:
             ValidationError: the loaded Cyclone DDS has no DDS Security.
@@ -69,7 +69,7 @@ class DdsCredentials:
 
 
 def checked_credentials(config: object) -> DdsCredentials | None:
-    """Check a ``dds_security_config`` and return its credentials; None stays None. Opens the named files only.
+    """Check a ``dds_security_config`` and return its credentials; None stays None.
 
     Values are paths or ``file:`` or ``data:,`` URIs. The permissions CA is the identity CA unless it is given. No
     message shows a value that may be a key.
@@ -137,7 +137,7 @@ def _check_key(credentials: DdsCredentials) -> None:
 
 
 def policies(qos: Any, credentials: DdsCredentials) -> list[Any]:
-    """Return the property policies of ``credentials``, made with the given ``cyclonedds.qos`` module."""
+    """Return property policies, made with the given ``cyclonedds.qos`` module."""
     return [qos.Policy.Property(key, value) for key, value in credentials.properties().items()]
 
 
@@ -173,7 +173,7 @@ def _plugin_folder() -> Path:
 
 
 def _loaded_library() -> Path | None:
-    """Return the file of the loaded Cyclone DDS, which its binding finds in several places; for Linux."""
+    """Return the file of the loaded Cyclone DDS, on Linux."""
     maps = Path("/proc/self/maps")
     lines = maps.read_text().splitlines() if maps.exists() else []
     paths = (Path(line.split(maxsplit=5)[5]) for line in lines if "/libddsc" in line)
@@ -181,7 +181,7 @@ def _loaded_library() -> Path | None:
 
 
 def governance_gap(document: bytes, domain_id: int, topic: str) -> str | None:
-    """Return how a signed governance document lets a stranger write ``topic``, or None: it does not.
+    """Return how a governance document lets a stranger write ``topic``, or None.
 
     The documents are those of DDS Security 1.1, section 9.4.1.2: XML inside S/MIME. The plugins check the signature.
 

@@ -1,4 +1,4 @@
-"""ROS 2 messages as IDL types of Cyclone DDS, named on the wire as ROS 2 names them.
+"""ROS 2 messages as IDL types of Cyclone DDS, with their names on the wire.
 
 Fields and their order are those of the public ``.msg`` files of common_interfaces and geometry2. A ROS ``uint8``
 is declared ``byte``: with ``uint8`` a peer on Cyclone DDS 0.10, which many ROS 2 installations ship, fails to match

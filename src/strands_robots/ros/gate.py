@@ -1,4 +1,4 @@
-"""Command gate: recognizes the ROS topics, services and actions that move a robot, and asks the operator.
+"""Command gate of a ROS graph: asks the operator before a robot is moved.
 
 A surface is known by a word of its name, such as ``cmd_vel`` in ``/turtle1/cmd_vel``, or by its interface type,
 whatever it is called. The order is: not gated; ``STRANDS_ROS2_COMMAND_ALLOW``; ``BYPASS_TOOL_CONSENT``; the
@@ -79,7 +79,7 @@ _YES = frozenset({"y", "yes", "a", "approve", "approved", "true"})
 
 @lru_cache(maxsize=256)
 def surface_of(name: str, kind: str | None = None) -> str | None:
-    """Return the command surface that a graph name or its type stands for, or None: it is not known to move a robot."""
+    """Return the command surface of a graph name or type, or None: it is none."""
     for word in reversed(name.lower().strip("/~").split("/")):
         if word in SURFACES:
             return word
@@ -135,7 +135,7 @@ class CommandGate:
 
 
 class Approved:
-    """Stand-in for the operator where a network has obtained the approval of the verb already."""
+    """Stand-in for the operator where a network has already asked for approval."""
 
     def interrupt(self, name: str, reason: Any = None) -> bool:
         """Approve the command."""

@@ -1,4 +1,4 @@
-"""The contract of a link to a ROS graph: topics, services, and action goals from their sending to their end."""
+"""Contract of a link to a ROS graph: topics, services and action goals."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RosError(StrandsRobotsError, RuntimeError):
 
 
 class EarlierRefusedError(RosError):
-    """A message was not sent, because the server refused an earlier one of its topic; the next one will be sent."""
+    """A message was not sent, because the server refused an earlier one."""
 
 
 def never() -> bool:
@@ -42,26 +42,26 @@ def never() -> bool:
 
 
 class RosLink(Protocol):
-    """One connection to a ROS graph. Thread-safe; opened by the first use; every verb raises :class:`RosError`."""
+    """A thread-safe connection to a ROS graph; every verb raises :class:`RosError`."""
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
         """Hand one message to the graph; returns within the link's own time-out."""
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
-        """Return the next message of a topic; without ``kind`` the graph is asked for its type."""
+        """Return the next message of a topic; ``kind`` None: ask the graph for it."""
 
     def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
         """Call a service and return its response."""
 
     def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
-        """Call ``on_message`` with every message from now on, on the link's thread; it must return at once."""
+        """Call ``on_message`` on the link's thread; it must return at once."""
 
     def close(self) -> None:
         """Leave the graph. A later use opens the link anew."""
 
 
 class BroadcastLink(RosLink, Protocol):
-    """A link that can publish without waiting for a subscription, and that can be opened ahead of its first use."""
+    """A link that can publish without waiting for a subscription."""
 
     def open(self) -> Any:
         """Join the graph now. Raises :class:`RosError` where that fails."""
@@ -72,16 +72,16 @@ class BroadcastLink(RosLink, Protocol):
 
 @runtime_checkable
 class UrgentLink(Protocol):
-    """A link with a second connection, for zeros alone, which the traffic of the first cannot hold up."""
+    """A link with a second connection, for zeros alone, that nothing delays."""
 
     def prepare_urgent(self, topic: str, kind: str) -> None:
         """Have the second connection ready for ``topic``; returns at once."""
 
     def publish_urgent(self, topic: str, kind: str, fields: Message) -> None:
-        """Send one message by it. Raises :class:`RosError` where that cannot be done without waiting."""
+        """Send one message by it, or raise :class:`RosError` instead of waiting."""
 
     def cut(self) -> None:
-        """Drop everything that the first connection has not sent yet, so that none of it arrives later."""
+        """Drop everything that the first connection has not sent yet."""
 
 
 @runtime_checkable
@@ -98,7 +98,7 @@ class GoalLink(Protocol):
         feedback: OnMessage | None = None,
         cancelled: CancelCheck = never,
     ) -> Goal:
-        """Send a goal and return once the server took it, time is over, or ``cancelled`` returns True.
+        """Send a goal; return once it is accepted, out of time or ``cancelled``.
 
         A goal that is cancelled before the server took it is cancelled once it does.
 
@@ -108,7 +108,7 @@ class GoalLink(Protocol):
 
 
 class Goal:
-    """A goal that was sent: ``done`` is set once its end is known, or once it can no longer become known.
+    """A goal that was sent; ``done`` once its end is known or cannot be known.
 
     Args:
         cancel: asks the server to end it; returns at once, raises :class:`RosError` when it cannot be asked.
@@ -123,7 +123,7 @@ class Goal:
         self.cancel = cancel
 
     def end(self, status: int, values: Any) -> None:
-        """Record the end that the server reported: a ``GoalStatus`` and the result's fields."""
+        """Record the reported end: a ``GoalStatus`` and the result's fields."""
         if not self.done.is_set():
             self.status, self.values = status, values
             self.done.set()
@@ -142,10 +142,11 @@ class Goal:
 
 @dataclass(frozen=True, slots=True)
 class GoalReport:
-    """Outcome of a goal. ``state``: one of :data:`STATUS_NAMES`, ``rejected``, or ``lost`` where its end is unknown.
+    """Outcome of a goal.
 
-    ``over`` is True when the server reported its end, so that nothing goes on; ``ended_by`` names what cut it short,
-    "" nothing; ``lost_goal`` is a lost goal itself, whose end may still come.
+    ``state``: one of :data:`STATUS_NAMES`, ``rejected``, or ``lost`` where its end is unknown. ``over``: the server
+    reported the end, so that nothing goes on. ``ended_by``: what cut the goal short, "" nothing. ``lost_goal``: a lost
+    goal itself, whose end may still come.
     """
 
     state: str
@@ -177,7 +178,7 @@ def run_goal(
     feedback: OnMessage | None = None,
     cancelled: CancelCheck = never,
 ) -> GoalReport:
-    """Send a goal and wait for its end; cancel it after ``within_s`` seconds or once ``cancelled`` returns True.
+    """Send a goal and wait for its end; cancel it in time or by ``cancelled``.
 
     Raises:
         RosError: the goal never began.
@@ -221,7 +222,7 @@ def _cancel(sent: Goal) -> str:
 def next_message(
     watch: Callable[[str, str | None, OnMessage], Unwatch], topic: str, kind: str | None, within_s: float
 ) -> dict[str, Any]:
-    """Return the first message that a link's ``watch`` delivers. Raises :class:`RosError` where none comes in time."""
+    """Return the next message, for a link by its ``watch``; none is a RosError."""
     arrived, messages = threading.Event(), list[Message]()
 
     def keep(message: Message) -> None:

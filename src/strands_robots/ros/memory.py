@@ -1,4 +1,4 @@
-"""A ROS graph in this process's memory, for newcomers and tests: no ROS and no network."""
+"""Link to a graph in this process's memory, for newcomers and tests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MemoryAction = Callable[[Message, OnMessage, Goal], None]
 
 
 class MemoryLink:
-    """A graph inside this process: what is published is kept in ``sent`` and handed to the watchers.
+    """A graph inside this process, which keeps published messages in ``sent``.
 
     Args:
         services: a callable by service name, which gets the request's fields and returns the response's.
@@ -39,7 +39,7 @@ class MemoryLink:
         self._services[service] = answer
 
     def serve(self, action: str, run: MemoryAction) -> None:
-        """Serve an action: ``run`` gets the goal's fields, the callback for feedback, and the goal to end."""
+        """Serve an action: ``run`` gets fields, feedback callback and goal to end."""
         self._actions[action] = run
 
     def send_goal(

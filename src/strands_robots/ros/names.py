@@ -20,7 +20,7 @@ _KIND = re.compile(r"([a-z][a-z0-9_]*)/(?:(?:msg|srv|action)/)?([A-Z][A-Za-z0-9]
 
 
 def graph_name(name: str, value: object) -> str:
-    """Check the name of a topic, service or action: words with ``/`` between, none starting with a digit."""
+    """Check the name of a topic, service or action, such as /cmd_vel."""
     if not isinstance(value, str) or len(value) > NAME_MAX or not _NAME.match(value) or "__" in value:
         raise ValidationError(
             f"{name} must be a ROS name of letters, digits, '_' and '/', such as /cmd_vel, not {shown(value)}."
@@ -29,7 +29,7 @@ def graph_name(name: str, value: object) -> str:
 
 
 def interface(name: str, value: object) -> str:
-    """Check an interface type: ``pkg/Name`` (ROS 1), or with ``msg``, ``srv`` or ``action`` in between (ROS 2)."""
+    """Check an interface type: ``pkg/Name`` (ROS 1) or ``pkg/msg/Name`` (ROS 2)."""
     if not isinstance(value, str) or len(value) > NAME_MAX or not _KIND.match(value):
         raise ValidationError(
             f"{name} must be a ROS type such as geometry_msgs/msg/Twist or geometry_msgs/Twist, not {shown(value)}."
@@ -45,7 +45,7 @@ def bare_kind(kind: str) -> str:
 
 
 def class_place(kind: str, section: str) -> tuple[str, str]:
-    """Return the Python module and class of an interface; ``section`` is msg, srv or action.
+    """Return module and class of an interface; ``section``: msg, srv or action.
 
     Raises:
         ValidationError: ``kind`` is no interface type.
@@ -72,5 +72,5 @@ def domain(domain_id: int | None) -> int:
 
 
 def absolute(name: str) -> str:
-    """Return a graph name with the leading slash that a caller may leave out; a private ``~`` name stays."""
+    """Return a graph name with its leading slash; a private ``~`` name stays."""
     return name if name.startswith(("/", "~")) else f"/{name}"

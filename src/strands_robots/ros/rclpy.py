@@ -1,4 +1,4 @@
-"""Link to a ROS 2 graph through rclpy, the Python client of the ROS 2 that is sourced."""
+"""Link to a ROS 2 graph through rclpy of the ROS 2 that is sourced."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _NUMBERS: dict[str, type] = {"float": float, "double": float, "long double": flo
 
 
 class RclpyLink:
-    """A :class:`~strands_robots.ros.link.RosLink` of topics, services and actions. Opened by the first use.
+    """A link of topics, services and actions, opened by the first use.
 
     A published message needs a subscription: while no subscription matches, a publish waits ``match_s`` and fails.
 
@@ -166,7 +166,7 @@ class RclpyLink:
         return sending.goal
 
     def topics(self) -> list[dict[str, Any]]:
-        """Return ``topic``, ``type``, and the number of its ``publishers`` and ``subscriptions``, by topic and type."""
+        """Return ``topic``, ``type``, ``publishers`` and ``subscriptions`` of each topic."""
         node = self._settled_node()
         return [
             {
@@ -234,7 +234,7 @@ class RclpyLink:
         return found[0]
 
     def _settled_node(self) -> Any:
-        """Return our node once it has had ``match_s`` since it joined to discover the graph."""
+        """Return our node once it has had ``match_s`` to discover the graph."""
         node = self.open().node
         left = self._opened_at + self._match_s - time.monotonic()
         self._wait_for(lambda: len(node.get_node_names_and_namespaces()) > 1, left)
@@ -250,7 +250,7 @@ class RclpyLink:
 
 
 class _Sending:
-    """A goal being sent. The send, the acceptance, a cancel and the end all happen on the executor's thread."""
+    """A goal being sent; all its steps happen on the executor's thread."""
 
     def __init__(self, session: RclpySession, action: str) -> None:
         self._session = session
@@ -328,7 +328,7 @@ def _send(publisher: Any, message: Any, topic: str, kind: str) -> None:
 
 
 def interface_class(kind: str, section: str) -> Any:
-    """Return the Python class of an interface; ``section`` is msg, srv or action. Raises :class:`RosError`."""
+    """Return the class of an interface; ``section`` is msg, srv or action."""
     module, name = class_place(kind, section)
     try:
         found = getattr(import_module(module), name, None)
@@ -340,7 +340,7 @@ def interface_class(kind: str, section: str) -> Any:
 
 
 def filled(message: Any, fields: Mapping[str, Any], place: str = "") -> Any:
-    """Set fields of ``message`` and return it. Raises :class:`RosError` naming the field.
+    """Set fields of ``message`` and return it; a wrong one is a RosError.
 
     A message class describes its fields by ``get_fields_and_field_types``, in the terms of the ROS 2 interface
     definition: ``double``, ``string<10>``, ``sequence<uint8>``, ``double[36]``, ``geometry_msgs/Vector3``.
@@ -423,7 +423,7 @@ def _plain(kind: str, value: Any) -> Any:
 
 
 def _several(kind: str) -> tuple[str, int | None] | None:
-    """Return the item type of a list, and its length where that is fixed; None for any other type."""
+    """Return the item type and the fixed length of a list; None for other types."""
     if (found := _SEQUENCE.match(kind)) is not None:
         return found[1], None
     if (found := _ARRAY.match(kind)) is not None:

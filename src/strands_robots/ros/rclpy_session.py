@@ -1,4 +1,4 @@
-"""Our node in the ROS 2 that is sourced: its context, its executor and the thread that spins it."""
+"""Node in the ROS 2 that is sourced, with its context, executor and thread."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ NO_RCLPY = (
 
 
 def sourced() -> bool:
-    """Return True where a ROS 2 is sourced in this process: its Python client is on the path."""
+    """Return True where the Python client of a ROS 2 is on the path."""
     return find_spec("rclpy") is not None
 
 
 def ros2(module: str) -> ModuleType:
-    """Import a module of the ROS 2 client, such as ``rclpy.qos``. Raises :class:`RosError` where none is sourced."""
+    """Import a module of the ROS 2 client, or raise :class:`RosError`."""
     try:
         return import_module(module)
     except ImportError as exc:
@@ -87,7 +87,7 @@ class RclpySession:
         self._executor.create_task(run)
 
     def close(self, parts: Sequence[Any] = ()) -> None:
-        """End the thread and take the node off the graph; not to be called by a callback of this node.
+        """End the thread and take the node off the graph; not from a callback.
 
         A second call does nothing; the interpreter's exit calls it for every session that is still open.
 

@@ -1,4 +1,4 @@
-"""Choice of the link to a ROS 2 graph: rclpy where a ROS 2 is sourced, else bare DDS."""
+"""Link to a ROS 2 graph by rclpy where a ROS 2 is sourced, else by bare DDS."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NO_LINK = (
 
 
 def ros2_backend() -> str:
-    """Return ``rclpy`` where a ROS 2 is sourced, else ``dds``. Raises :class:`RosError` where there is neither."""
+    """Return ``rclpy`` or else ``dds``; :class:`RosError` where there is neither."""
     if sourced():
         return "rclpy"
     if find_spec("cyclonedds") is None:
@@ -39,7 +39,7 @@ def ros2_backend() -> str:
 
 
 class Ros2Link:
-    """A link by :func:`ros2_backend`, chosen by the first use; until then nothing has to be installed.
+    """A link that the first use chooses; until then nothing has to be installed.
 
     Args:
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
@@ -54,7 +54,7 @@ class Ros2Link:
         self._link: RosLink | None = None
 
     def open(self) -> RosLink:
-        """Choose the link now and return it. Raises :class:`RosError` where there is neither."""
+        """Choose the link now, by :func:`ros2_backend`, and return it."""
         with self._lock:
             if self._link is None:
                 self._link = (RclpyLink if ros2_backend() == "rclpy" else DdsLink)(self.domain_id)

@@ -1,4 +1,4 @@
-"""Link to a ROS 1 or ROS 2 graph behind a rosbridge server, without ROS on this side."""
+"""Link to a ROS 1 or ROS 2 graph behind a rosbridge server."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class _Subscription:
 
 
 class RosbridgeLink:
-    """A :class:`~strands_robots.ros.link.RosLink` over one connection, opened by the first use and kept until closed.
+    """A :class:`~strands_robots.ros.link.RosLink` over a connection that is kept.
 
     Urgent messages have a second connection of their own.
 
@@ -156,7 +156,7 @@ class RosbridgeLink:
         feedback: OnMessage | None = None,
         cancelled: CancelCheck = never,
     ) -> Goal:
-        """Send an action goal. The protocol reports its end and not its acceptance, so this returns at once."""
+        """Send an action goal and return at once: acceptance is not reported."""
         if cancelled():
             raise RosError(f"{action} was given up before its goal was sent.")
         del within_s

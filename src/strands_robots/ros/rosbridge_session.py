@@ -48,7 +48,7 @@ BYTE_FIELDS = {
 
 
 def encoded(op: str, **fields: Any) -> str:
-    """Encode one frame. Raises :class:`RosError` for what JSON cannot carry, NaN and infinities among it."""
+    """Encode a frame; NaN and other non-JSON values raise :class:`RosError`."""
     try:
         return _encoder.encode({"op": op, **fields})
     except (TypeError, ValueError, RecursionError) as exc:
@@ -56,7 +56,7 @@ def encoded(op: str, **fields: Any) -> str:
 
 
 def decoded(frame: str | bytes) -> dict[str, Any]:
-    """Decode one frame. Raises :class:`RosError` where it is no JSON object with an ``op``."""
+    """Decode a frame; :class:`RosError` where it is no object with an ``op``."""
     try:
         found = json.loads(frame)
     except (ValueError, RecursionError) as exc:
@@ -67,7 +67,7 @@ def decoded(frame: str | bytes) -> dict[str, Any]:
 
 
 def with_bytes(kind: str | None, message: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the message with its ``uint8[]`` as ``bytes``, where its type is known to hold one."""
+    """Return the message with the ``uint8[]`` of a known type as ``bytes``."""
     plain = dict(message)
     field = BYTE_FIELDS.get(bare_kind(kind)) if kind else None
     if field is not None and field in plain:
@@ -94,7 +94,7 @@ class Fragments:
         self._partial: dict[str, dict[int, str]] = {}
 
     def add(self, frame: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Add a fragment; return the whole message once it is complete. Raises :class:`RosError` for nonsense."""
+        """Add a fragment; return the whole message once it is complete."""
         key, number, total, data = (frame.get(name) for name in ("id", "num", "total", "data"))
         numbered = type(number) is int and type(total) is int and 0 <= number < total <= FRAGMENTS_MAX
         if not (isinstance(key, str) and numbered and isinstance(data, str)):
@@ -166,7 +166,7 @@ class RosbridgeSession:
 
     @property
     def up(self) -> bool:
-        """Whether there is a connection."""
+        """True while there is a connection."""
         return self._socket is not None
 
     def start(self) -> None:
@@ -183,9 +183,9 @@ class RosbridgeSession:
             self._thread.start()
 
     def cut(self) -> None:
-        """Drop the connection with what it holds unsent: a blocked :meth:`send` fails, and nothing stale arrives.
+        """Drop the connection and all that it has not sent; then reconnect.
 
-        A new one is made as after any loss.
+        A blocked :meth:`send` fails, and nothing stale arrives.
         """
         socket = self._socket
         if socket is not None:
@@ -194,7 +194,7 @@ class RosbridgeSession:
                 socket.socket.shutdown(SHUT_RDWR)
 
     def open(self) -> None:
-        """Connect when nothing was connected yet. Raises :class:`RosError` while there is no connection."""
+        """Connect at the first call; :class:`RosError` while there is no connection."""
         self._current()
 
     def send(self, frame: str) -> None:
@@ -275,7 +275,7 @@ class RosbridgeSession:
 
 
 class UrgentConnection:
-    """A second connection, for zeros alone, opened and advertised ahead of need and never waited for.
+    """A second connection, for zeros alone, opened ahead of need.
 
     Args:
         host: of the server, with its ``port``.
@@ -291,7 +291,7 @@ class UrgentConnection:
         self._complaint = ""
 
     def prepare(self, topic: str, kind: str) -> None:
-        """Start the connection and the topic's advertisement on it, without waiting for either."""
+        """Start the connection and advertise the topic, without waiting."""
         known = self._kinds.get(topic) == kind
         self._kinds[topic] = kind
         if self._session.up:
@@ -301,7 +301,7 @@ class UrgentConnection:
             self._session.start()
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
-        """Send one message now. Raises :class:`RosError` where that cannot be done without waiting."""
+        """Send one message now, or raise :class:`RosError` instead of waiting."""
         complaint, self._complaint = self._complaint, ""
         if complaint:
             raise RosError(complaint)

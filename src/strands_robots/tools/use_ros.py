@@ -1,4 +1,4 @@
-"""``use_ros``: an agent's tool for a ROS 2 graph, by rclpy where a ROS 2 is sourced, else over bare DDS."""
+"""``use_ros``: an agent's tool for a ROS 2 graph, by rclpy or bare DDS."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Robots that already live on a ROS graph: one drive contract, and a class for each way to reach them."""
+"""Robots that already live on a ROS graph, behind one drive contract."""

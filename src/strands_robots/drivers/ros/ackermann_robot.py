@@ -1,4 +1,4 @@
-"""A car with Ackermann steering on a ROS graph, driven by speed and yaw rate through the bicycle model."""
+"""Car with Ackermann steering on a ROS graph, by the kinematic bicycle model."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ SERVICE_S = 5.0
 class AckermannRosRobot(MobileBaseRobot):
     """A car whose servo message holds ``angle`` and ``throttle``, each from -1 to 1.
 
-    At speed v and yaw rate w the front wheels stand at atan(wheelbase * w / v), the kinematic bicycle model; beyond
-    ``max_steering_rad`` they stand at their stop, and the car turns as tightly as it can. It cannot turn in place, so a
-    yaw rate without a speed is refused. The car tells no odometry: a stop is known to be sent, not to be done.
+    At speed v and yaw rate w the front wheels stand at atan(wheelbase * w / v), the kinematic bicycle model, at most
+    ``max_steering_rad``. The car cannot turn in place, so a yaw rate without a speed is refused. It has no odometry:
+    a stop is known to be sent, not to be done.
 
     Args:
-        node_name: what the robot and its tools are called.
-        servo_topic: where the servo messages go, of ``servo_type``.
+        node_name: name of the robot and of its tools.
+        servo_topic: topic of the servo messages, of ``servo_type``.
         wheelbase_m: distance of the axles in metres, above 0.
         max_speed: m/s at full throttle, above 0; faster drives are clamped to it.
         max_steering_rad: steering angle at full deflection, above 0 and below pi/2.
-        max_duration: longest drive in seconds. ``publish_rate``: Hz of a drive that is held.
+        max_duration: longest drive in seconds. ``publish_rate``: Hz of a timed or repeated drive.
         init_services: the handshake, in order: ``{"service", "type", "fields"}``. It runs once, before the first drive.
-        link: the road to the graph; it has to carry services where there is a handshake. By default rclpy, where a
-            ROS 2 is sourced; bare DDS carries no services and knows no servo message, so that without a ROS 2 a
-            DeepRacer is reached through a ``RosbridgeLink``.
-        command_gate: asks the operator's leave; that of the settings by default.
+        link: the link to the graph; a handshake needs one that carries services. By default rclpy, where a ROS 2 is
+            sourced; bare DDS carries neither services nor servo messages, so without a ROS 2 use a
+            ``RosbridgeLink``.
+        command_gate: asks the operator; that of the settings by default.
 
     Raises:
         ValidationError: an argument outside its domain.
@@ -84,7 +84,7 @@ class AckermannRosRobot(MobileBaseRobot):
 
     @classmethod
     def from_deepracer(cls, node_name: str, **overrides: Any) -> AckermannRosRobot:
-        """The stock software of an AWS DeepRacer: its manual mode, then its servos enabled, then manual drive.
+        """Construct an AWS DeepRacer with its stock software.
 
         The names are those of its web server's package; no car was available to check them.
         """
@@ -118,7 +118,7 @@ class AckermannRosRobot(MobileBaseRobot):
         )
 
     def check_motion(self, linear: float, angular: float) -> None:
-        """Refuse a yaw rate without a speed: it would be sent as the message that a stop sends."""
+        """Refuse a yaw rate without a speed: its message would be that of a stop."""
         if angular != 0 and linear == 0:
             raise ValidationError(
                 f"angular must be 0 at standstill, not {angular:g}: the car steers with its front wheels and cannot "
@@ -126,7 +126,7 @@ class AckermannRosRobot(MobileBaseRobot):
             )
 
     def command_message(self, linear: float, angular: float) -> dict[str, Any]:
-        """``angle`` and ``throttle``, each from -1 to 1, of a speed in m/s and a yaw rate in rad/s."""
+        """Return ``angle`` and ``throttle``, from -1 to 1, for m/s and rad/s."""
         if linear == 0:
             return {"angle": 0.0, "throttle": 0.0}
         # atan2 with a positive second argument is atan of the quotient, without overflow at a crawl.
@@ -137,7 +137,7 @@ class AckermannRosRobot(MobileBaseRobot):
         }
 
     def enable(self, tool_context: Any = None) -> Envelope:
-        """Run the handshake, unless it has succeeded before. It ends at the first call that fails.
+        """Run the handshake up to its first failure, unless it succeeded before.
 
         An answer with ``success`` false or an ``error`` that is not zero is a call that failed.
         """
@@ -145,17 +145,17 @@ class AckermannRosRobot(MobileBaseRobot):
             permit = self.gate.permit("enable")
         except MotionRefused as locked:
             return locked.envelope
-        return self._shake(permit, tool_context) or success(f"{self.node_name} takes commands.", enabled=True)
+        return self._run_handshake(permit, tool_context) or success(f"{self.node_name} takes commands.", enabled=True)
 
     def handshake(self, tool_context: Any = None) -> Envelope | None:
         answer = self.enable(tool_context)
         return answer if answer["status"] == "error" else None
 
-    def _shake(self, permit: Permit, tool_context: Any) -> Envelope | None:
+    def _run_handshake(self, permit: Permit, tool_context: Any) -> Envelope | None:
         with self._enabling:
             if self._enabled:
                 return None
-            # Everybody is asked before anything is armed, because asking may leave this call and repeat it.
+            # Ask for all approvals before arming anything, because asking may leave this call and repeat it.
             for service, kind, _ in self._services:
                 refusal = self.command_gate.refusal(service, kind, "enable", tool_context)
                 if refusal is not None:

@@ -43,7 +43,7 @@ _Motion = TypeVar("_Motion", bound=BaseMotion)
 
 
 def tool_suffix(node_name: str) -> str:
-    """Return the robot's part of a tool's name: its own name where model APIs take it, else a unique other one."""
+    """Return the robot's unique part of a tool's name that model APIs accept."""
     plain = node_name.replace(".", "_")
     if plain == node_name and len(plain) <= TOOL_SUFFIX_MAX:
         return plain
@@ -115,7 +115,7 @@ class MobileBaseRobot:
     # Overridden by a platform.
 
     def command_message(self, linear: float, angular: float) -> dict[str, Any]:
-        """Return the fields of the message that commands these velocities, in m/s and rad/s, or of the zero."""
+        """Return the message that commands these velocities, in m/s and rad/s."""
         twist = {
             "linear": {"x": linear, "y": 0.0, "z": 0.0},
             "angular": {"x": 0.0, "y": 0.0, "z": angular},
@@ -126,7 +126,7 @@ class MobileBaseRobot:
         """Raise :class:`ValidationError` where the platform cannot execute this motion."""
 
     def handshake(self, tool_context: Any = None) -> Envelope | None:
-        """Make the vehicle ready for commands; return the error where that failed, else None."""
+        """Make the vehicle ready for commands; return the error, or None."""
         return None
 
     def motion_note(self) -> str:
@@ -163,7 +163,7 @@ class MobileBaseRobot:
         count: int = 1,
         tool_context: Any = None,
     ) -> Envelope:
-        """Send velocities (m/s forwards, rad/s to the left) and return once they are sent.
+        """Send velocities in m/s forwards and rad/s to the left, then return.
 
         With ``duration`` in seconds they are repeated for that long and a zero follows; else ``count`` messages are
         sent. A single message latches until :meth:`stop`, as a raw command does. Every refusal and failure is an
@@ -173,7 +173,7 @@ class MobileBaseRobot:
         return self._run(drive) if isinstance(drive, Drive) else drive
 
     def start_drive(self, linear: float, angular: float, duration: float, tool_context: Any = None) -> Envelope:
-        """Start a timed drive and return; observers and :meth:`get_task_status` report its end.
+        """Start a timed drive; :meth:`get_task_status` and observers report its end.
 
         Args:
             linear: Speed forwards in m/s; negative reverses.
@@ -197,7 +197,7 @@ class MobileBaseRobot:
         )
 
     def stop(self, tool_context: Any = None) -> Envelope:
-        """Stop the base: a zero at once and more until it is still; return the verdict. Needs no approval.
+        """Send zeros until the base is still, without approval; return the verdict.
 
         Where odometry is silent this is an error with ``stopped`` None.
         """
@@ -205,7 +205,7 @@ class MobileBaseRobot:
         return self.halt("stop").envelope()
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Void every permit, send zeros until the base is still, and return the verdict within the deadline.
+        """Void every permit, send zeros until the base is still, return the verdict.
 
         With odometry, stopped means that two samples after the first zero are still; a base that moves on did not
         stop, and one whose odometry is silent is unknown. Without odometry, stopped means that the link accepted the
@@ -237,7 +237,7 @@ class MobileBaseRobot:
 
     @property
     def tools(self) -> list[Any]:
-        """The robot's verbs as Strands agent tools with its name in theirs. Needs the [agent] extra.
+        """The robot's verbs as Strands agent tools, which need the [agent] extra.
 
         The ``drive`` tool needs a duration and returns at once, so that an agent can stop the drive that it began.
         """
@@ -251,7 +251,7 @@ class MobileBaseRobot:
 
     @property
     def holding(self) -> bool:
-        """Whether zeros still go out after a halt."""
+        """True while zeros still go out after a halt."""
         return self._hold.running
 
     # The robot contract, so that every network takes a base.
@@ -268,13 +268,13 @@ class MobileBaseRobot:
         return self.stop()
 
     def get_task_status(self) -> Envelope:
-        """Return ``task_status`` (idle, running, completed, stopped, error) and the progress of the last motion."""
+        """Return ``task_status`` and the progress of the last motion."""
         if self._motion is None:
             return success("Idle.", task_status="idle", instruction="", step_count=0, duration=0.0)
         return self._motion.status()
 
     def get_features(self) -> Envelope:
-        """Return ``observation_features`` and ``action_features`` as data, with the declared limits."""
+        """Return ``observation_features``, ``action_features`` and ``limits``."""
         limits = {"linear": self.max_linear, "angular": self.max_angular, "duration": self.max_duration}
         return success(
             "A mobile base: linear in m/s, angular in rad/s.",
@@ -284,23 +284,23 @@ class MobileBaseRobot:
         )
 
     def get_state(self) -> Envelope:
-        """Return ``joints`` (none), the status of the drive as ``task``, and ``still``: True, False or None."""
+        """Return ``joints`` (none), ``task`` and ``still``: True, False or None."""
         task = self.get_task_status()["task_status"]
         return success(f"{task}.", joints={}, task=task, still=self._odometry.still)
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Call ``observer`` when a motion begins and when it ends, the zero of a drive included."""
+        """Call ``observer`` when a motion begins and after its end."""
         return self._observers.subscribe(observer)
 
     def cleanup(self) -> Envelope:
-        """Stop and leave the graph. A base that is not known to be still stays connected, to be stopped again."""
+        """Stop, then leave the graph unless the base may still move."""
         verdict = self.halt("cleanup")
         if verdict.stopped:
             self.disconnect()
         return verdict.envelope()
 
     def disconnect(self) -> None:
-        """Send nothing more, not even zeros, and leave the graph. :meth:`cleanup` stops the base first."""
+        """Leave the graph without a stop; :meth:`cleanup` stops the base first."""
         self.gate.revoke()
         self._hold.close()
         try:
@@ -314,7 +314,7 @@ class MobileBaseRobot:
     def _begin(
         self, verb: str, target: tuple[str, str], tool_context: Any, make: Callable[[Permit], _Motion]
     ) -> _Motion | Envelope:
-        """Take the base's one slot for a motion that may begin; return it, or the refusal.
+        """Return a motion that may begin and has the base's one slot, or the refusal.
 
         Args:
             verb: name of the motion in refusals.
@@ -344,7 +344,7 @@ class MobileBaseRobot:
         return motion
 
     def _run_in_background(self, motion: BaseMotion) -> Envelope | None:
-        """Run on a thread; without one, return the error and leave the base as free and as still as before."""
+        """Run on a thread; without one, undo :meth:`_begin` and return the error."""
         name = f"{motion.policy}-{self.node_name}"
         try:
             threading.Thread(target=self._run, args=(motion,), name=name, daemon=True).start()
@@ -436,7 +436,7 @@ class MobileBaseRobot:
 
 
 class PosedBaseRobot(MobileBaseRobot):
-    """A :class:`MobileBaseRobot` of a platform with odometry, whose topic can be read too."""
+    """A mobile base with odometry, whose topic can be read too."""
 
     def get_pose(self, timeout: float = 5.0) -> Envelope:
         """Return the next sample of the odometry topic.

@@ -1,4 +1,4 @@
-"""Motions of a base: the common part of a drive and a navigation goal, and the drive itself."""
+"""Motions of a base: their common part, and the drive."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COUNT_MAX = 10**12
 
 
 class BaseMotion:
-    """One motion of a base: its order, progress and outcome. :meth:`run` once, on any thread.
+    """One motion of a base, which :meth:`run` carries out once, on any thread.
 
     ``state`` is running, completed, stopped or error; ``answer`` is the envelope that ends it; ``sent`` counts the
     messages sent or the samples of feedback received. The base sets ``ended`` once it is free for the next motion.
@@ -43,7 +43,7 @@ class BaseMotion:
 
     @property
     def velocities(self) -> Mapping[str, float]:
-        """Ordered ``linear`` (m/s) and ``angular`` (rad/s) velocity, where the order has them."""
+        """Ordered ``linear`` (m/s) and ``angular`` (rad/s) velocity, or empty."""
         return {}
 
     @property
@@ -60,7 +60,7 @@ class BaseMotion:
         return {}
 
     def status(self) -> Envelope:
-        """Return ``task_status`` and the progress; the motion is running until the base is free for the next one."""
+        """Return the progress, and running until the base is free for the next one."""
         state = self.state if self.ended.is_set() else "running"
         return success(
             f"The last {self.noun} is {state}.",
@@ -72,7 +72,7 @@ class BaseMotion:
         )
 
     def fail_to_begin(self, why: str, **fields: Any) -> Envelope:
-        """End the motion in place of :meth:`run`, before anything was sent; return the error to answer."""
+        """End the motion before anything was sent; return the error to answer."""
         self.state = "error"
         self.answer = error(f"The {self.noun} could not begin: {why}.", **fields)
         self._took_s = 0.0
@@ -95,7 +95,7 @@ class BaseMotion:
 
 
 class DriveOrder(NamedTuple):
-    """A checked drive: velocities as sent (m/s, rad/s), the message that carries them, how often and how fast."""
+    """A checked drive: velocities as sent (m/s, rad/s), their message and rate."""
 
     linear: float
     angular: float
@@ -106,17 +106,17 @@ class DriveOrder(NamedTuple):
 
     @property
     def zero(self) -> bool:
-        """Whether the order is to stand still."""
+        """True for an order to stand still."""
         return not (self.linear or self.angular)
 
     @property
     def trailing_zero(self) -> bool:
-        """Whether a zero ends the drive: not after zeros, and not after a single message, which latches."""
+        """True where a zero ends the drive: not after zeros or a latching message."""
         return not (self.latches or self.zero)
 
 
 class Drive(BaseMotion):
-    """Velocity messages at a rate, and one zero after them whatever happened. :meth:`interrupt` from any thread."""
+    """Velocity messages at a rate, and one zero after them whatever happened."""
 
     noun = policy = "drive"
 
@@ -136,7 +136,7 @@ class Drive(BaseMotion):
 
     @property
     def latched(self) -> bool:
-        """Whether the base may go on at this velocity after the drive.
+        """True where the base may go on at this velocity after the drive.
 
         A single message that failed, or that a Ctrl-C interrupted, may have reached the base all the same.
         """
@@ -215,7 +215,7 @@ class Drive(BaseMotion):
 
 
 def messages_for(name: str, seconds: float, rate_hz: float) -> int:
-    """Return how many messages keep a velocity for so long. Raises :class:`ValidationError` beyond ``COUNT_MAX``."""
+    """Return how many messages keep a velocity for so long, up to ``COUNT_MAX``."""
     wanted = seconds * rate_hz
     if wanted > COUNT_MAX:
         most = COUNT_MAX / rate_hz

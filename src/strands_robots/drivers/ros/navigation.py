@@ -1,4 +1,4 @@
-"""Goal of a robot's own navigation stack, from its sending to what is known of its end."""
+"""Goal of a robot's own navigation stack."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FEEDBACK_KEPT = 5
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """A checked goal: metres and radians in a frame, and the seconds that it may take."""
+    """A checked goal in metres and radians, and the seconds that it may take."""
 
     x: float
     y: float
@@ -32,7 +32,7 @@ class Destination:
     timeout_s: float
 
     def fields(self) -> dict[str, Any]:
-        """Return the goal of ``nav2_msgs/NavigateToPose``; a heading is a rotation about the vertical axis."""
+        """Return the goal of ``nav2_msgs/NavigateToPose``."""
         return {
             "pose": {
                 "header": {"frame_id": self.frame_id},

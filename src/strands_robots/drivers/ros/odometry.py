@@ -31,7 +31,7 @@ RETRY_S = 0.5
 
 
 def speeds(message: Message) -> tuple[float, float] | None:
-    """Return the linear (m/s) and angular (rad/s) speed in a message, or None where it carries no usable velocity.
+    """Return the linear (m/s) and angular (rad/s) speed in a message, or None.
 
     The message is a ``nav_msgs/Odometry``, a ``TwistStamped`` or a ``turtlesim/Pose``.
     """
@@ -48,7 +48,7 @@ def speeds(message: Message) -> tuple[float, float] | None:
 
 
 class OdometryMonitor:
-    """Watches an odometry topic once :meth:`start` was called; without a topic its answers are None."""
+    """Monitor of an odometry topic; without a topic its answers are None."""
 
     def __init__(self, link: RosLink, topic: str | None, kind: str | None) -> None:
         self._link = link
@@ -67,15 +67,15 @@ class OdometryMonitor:
 
     @property
     def watched(self) -> bool:
-        """Whether the topic is watched, or there is none to watch."""
+        """True while the topic is watched, and where there is none."""
         return self.topic is None or self._unwatch is not None
 
     def start(self) -> None:
-        """Watch from now on; a second call does nothing. A topic that cannot be watched is logged."""
+        """Watch from now on, or log why not; a second call does nothing."""
         self._start(self._closings)
 
     def start_in_background(self) -> None:
-        """Do the same on a thread of its own, because finding out the topic's type may take seconds."""
+        """Start on a thread, because the topic's type may take seconds to find."""
         if self.watched or time.monotonic() - self._tried_at < RETRY_S or not self._starting.acquire(blocking=False):
             return
         closings = self._closings

@@ -1,4 +1,4 @@
-"""ROS 2 mobile base, driven by velocities and, where it has a navigation stack, by goals."""
+"""ROS 2 mobile base, driven by velocities and by navigation goals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DISCONNECT_S = 1.0
 
 
 class RosBridgedRobot(PosedBaseRobot):
-    """A base on a ROS 2 graph, reached by rclpy where a ROS 2 is sourced, else over bare DDS (topics only).
+    """A base on a ROS 2 graph, reached by rclpy or, for topics only, bare DDS.
 
     Constructing it needs neither; the first verb names what is missing. It declares no limits unless they are
     given. A stop cancels a navigation goal besides sending its zeros, and says when the server did not confirm it.
@@ -105,7 +105,7 @@ class RosBridgedRobot(PosedBaseRobot):
         timeout: float = 120.0,
         tool_context: Any = None,
     ) -> Envelope:
-        """Give the navigation stack a goal and return when it has ended; after ``timeout`` seconds it is cancelled.
+        """Give the navigation stack a goal and return when it has ended.
 
         Obstacles, path and recovery are the robot's own. Success means that the server reported the goal as reached;
         every other end, refusal and failure is an error envelope with ``goal_state``: not sent, rejected, aborted,
@@ -131,7 +131,7 @@ class RosBridgedRobot(PosedBaseRobot):
         timeout: float = 120.0,
         tool_context: Any = None,
     ) -> Envelope:
-        """Start what :meth:`navigate_to` waits for; observers and :meth:`get_task_status` report its end."""
+        """Start a goal; :meth:`get_task_status` and observers report its end."""
         goal = self._begin_navigation(x, y, yaw, frame_id, timeout, tool_context)
         if not isinstance(goal, Navigation):
             return goal
@@ -163,7 +163,7 @@ class RosBridgedRobot(PosedBaseRobot):
         )
 
     def disconnect(self) -> None:
-        """Cancel the navigation goal too, and give it a moment to end; see :meth:`MobileBaseRobot.disconnect`."""
+        """Cancel the navigation goal too, and give it a moment to end."""
         self.gate.revoke()
         if self._navigation is not None:
             self._navigation.ended.wait(DISCONNECT_S)
@@ -200,7 +200,7 @@ class RosBridgedRobot(PosedBaseRobot):
         return self._begin("navigate_to", target, tool_context, make)
 
     def _cancel_again(self, goal: Navigation) -> str:
-        """Cancel a lost goal again; return what to add to its doubt when that is not possible.
+        """Cancel a lost goal again; return what to add to its doubt, or "".
 
         On a thread, because a broken link may block it; beside the zeros, because its stack may drive against them.
         """

@@ -1,4 +1,4 @@
-"""A mobile base behind a rosbridge server: ROS 1 or ROS 2 on its side, nothing on ours but a WebSocket."""
+"""Mobile base behind a rosbridge server, reached without ROS on this side."""
 
 from __future__ import annotations
 
@@ -16,22 +16,21 @@ CURIOSITY = "/curiosity_mars_rover"
 
 
 class RosbridgeRobot(PosedBaseRobot):
-    """A base that is driven through rosbridge; its limits are this class's unless others are given.
+    """A ROS 1 or ROS 2 base behind a rosbridge server, with limits by default.
 
-    Nothing is dialled before the first verb. The connection proves nothing and is not encrypted: a server elsewhere
-    is reached through a tunnel.
+    The first verb connects. The connection is neither authenticated nor encrypted: reach a remote server by a tunnel.
 
     Args:
-        node_name: what the robot and its tools are called.
+        node_name: name of the robot and of its tools.
         cmd_vel_topic: the velocity topic, a ``geometry_msgs/Twist`` unless ``cmd_vel_type`` says otherwise.
-        odom_topic: odometry or pose; with it a stop waits to see the base still. The server finds the types of
-            this topic and of ``scan_topic`` where they are not given.
+        odom_topic: odometry or pose; with it a stop waits to see the base still. The server knows the
+            types of this topic and of ``scan_topic`` where they are omitted.
         host: bare hostname or IP address of the server. ``port``: 1 to 65535.
         max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds. All three
-            are above 0 and owed: this class has no unlimited drive.
-        publish_rate: Hz of a drive that is held.
-        link: another road in place of the connection to ``host`` and ``port``.
-        command_gate: asks the operator's leave; that of the settings by default.
+            are above 0 and required: this class has no unlimited drive.
+        publish_rate: Hz of a timed or repeated drive.
+        link: a link to use in place of the connection to ``host`` and ``port``.
+        command_gate: asks the operator; that of the settings by default.
 
     Raises:
         ValidationError: an argument outside its domain.
@@ -56,10 +55,10 @@ class RosbridgeRobot(PosedBaseRobot):
         link: RosLink | None = None,
         command_gate: CommandGate | None = None,
     ) -> None:
-        road = RosbridgeLink(host, port)
+        default = RosbridgeLink(host, port)
         super().__init__(
             node_name,
-            link or road,
+            link or default,
             cmd_vel_topic,
             cmd_vel_type,
             odom_topic=graph_name("odom_topic", odom_topic),
@@ -72,13 +71,13 @@ class RosbridgeRobot(PosedBaseRobot):
             max_duration=number("max_duration", max_duration, above=0),
             command_gate=command_gate,
         )
-        self.safety_key = f"rosbridge:{road.url}{cmd_vel_topic}"
+        self.safety_key = f"rosbridge:{default.url}{cmd_vel_topic}"
 
     @classmethod
     def from_curiosity(
         cls, node_name: str = "curiosity", host: str = "localhost", port: int = 9090, **overrides: Any
     ) -> RosbridgeRobot:
-        """The Curiosity rover of the Gazebo simulation for ROS 1 Noetic, whose controller takes a Twist as it is."""
+        """Construct the Curiosity rover of the Gazebo simulation for ROS 1 Noetic."""
         wiring: dict[str, Any] = {
             "cmd_vel_topic": f"{CURIOSITY}/ackermann_drive_controller/cmd_vel",
             "odom_topic": f"{CURIOSITY}/odom",

@@ -1,4 +1,4 @@
-"""A ROS 2 mobile base over bare DDS: no ROS 2 on this side."""
+"""ROS 2 mobile base over bare DDS, reached without ROS 2 on this side."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from strands_robots.ros.gate import CommandGate
 
 
 class RtpsRobot(PosedBaseRobot):
-    """A base that subscribes to velocities in a DDS domain. It declares no limits unless they are given.
+    """A base that subscribes to velocities in a DDS domain, without default limits.
 
-    Nothing joins the domain before the first verb. A drive that nobody subscribes to is an error, and so is a stop.
+    The first verb joins the domain. A drive without a subscription is an error, and so is a stop.
 
     Args:
-        node_name: what the robot and its tools are called.
+        node_name: name of the robot and of its tools.
         cmd_vel_topic: the velocity topic, of ``cmd_vel_type`` (a Twist or a TwistStamped).
-        publish_rate: Hz of a drive that is held.
+        publish_rate: Hz of a timed or repeated drive.
         max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds.
         odom_topic: a ``nav_msgs/Odometry``; with it a stop waits to see the base still.
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
-        command_gate: asks the operator's leave; that of the settings by default.
+        command_gate: asks the operator; that of the settings by default.
         dds_security_config: credentials for a secured graph, as those of
             :class:`~strands_robots.hardware_rtps_bridge.HardwareRtpsBridge`; without, the participant has none.
 
@@ -70,11 +70,11 @@ class RtpsRobot(PosedBaseRobot):
 
     @classmethod
     def from_rtps(cls, node_name: str, cmd_vel_topic: str, **kwargs: Any) -> RtpsRobot:
-        """The constructor, by the name that matches the other classes'."""
+        """Construct the robot, by a name that matches the other classes."""
         return cls(node_name, cmd_vel_topic, **kwargs)
 
     def advertise(self) -> Envelope:
-        """Join the domain and appear as a publisher of the velocity topic, without sending anything."""
+        """Join the domain as a publisher of the velocity topic; send nothing."""
         try:
             self.link.advertise(*self._advertised)
         except LINK_ERRORS as exc:

@@ -1,4 +1,4 @@
-"""Velocity topic of a base: its only writer, and the zeros that keep the base still after a stop."""
+"""Velocity topic of a base: its only writer, and the zeros after a stop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CLOGGED_S = 0.1
 
 
 class VelocityPublisher:
-    """Writes commands under a permit, and zeros without one: a stop needs no permission to move."""
+    """Writer of commands under a permit, and of zeros without one."""
 
     def __init__(self, link: RosLink, topic: str, kind: str, zero: Mapping[str, Any]) -> None:
         self.link = link
@@ -35,7 +35,7 @@ class VelocityPublisher:
         self._clogged = False
 
     def send(self, fields: Mapping[str, Any], permit: Permit) -> None:
-        """Send one command. Raises :class:`PermitVoidError` when a stop came first, else what the link raises."""
+        """Send one command; :class:`PermitVoidError` when a stop came first."""
         with self._lock:
             if not permit.valid:
                 raise PermitVoidError("the drive was stopped")
@@ -47,7 +47,7 @@ class VelocityPublisher:
             self.link.publish(self.topic, self.kind, fields)
 
     def zero(self) -> None:
-        """Send one zero after the write that may be in flight. Raises what the link raises."""
+        """Send one zero after the write that may be in flight."""
         with self._lock:
             try:
                 self.link.publish(self.topic, self.kind, self._zero)
@@ -57,7 +57,7 @@ class VelocityPublisher:
                 raise
 
     def urgent_zero(self) -> None:
-        """Send one zero that nothing delays, and one after the commands. Raises what the link raises.
+        """Send one zero that nothing delays, and one after the commands.
 
         Where the link has a second connection, the first zero goes there and the other one is not waited for. A first
         connection that does not accept its zero in time is cut, so that no command in it arrives after the zeros.
@@ -79,7 +79,7 @@ class VelocityPublisher:
 
 
 class _BackgroundZero:
-    """Sends one zero at a time after the commands, on a thread, however long the write before it takes.
+    """One zero at a time after the commands, sent on a thread.
 
     Args:
         zero: sends it; may block for as long as the connection is clogged.
@@ -93,7 +93,7 @@ class _BackgroundZero:
         self._problem = ""
 
     def start(self) -> float:
-        """Start sending a zero, unless one is still being sent; return for how many seconds it has been.
+        """Start sending a zero; return for how many seconds one is being sent.
 
         Without a thread to be had nothing is sent; :meth:`wait` then sends the zero.
         """
@@ -110,7 +110,7 @@ class _BackgroundZero:
             return 0.0
 
     def wait(self, within_s: float) -> None:
-        """Wait until the zero is sent, or send the one without a thread. Raises :class:`RosError` where it was not."""
+        """Wait until the zero is sent, or send it; :class:`RosError` where it was not."""
         thread = self._thread
         if thread is None:
             self._run()
@@ -129,7 +129,7 @@ class _BackgroundZero:
 
 
 class ZeroVelocityHold:
-    """Zeros at the base's publish rate on a thread of their own, the first at once, until the base is still.
+    """Zeros at the base's publish rate, the first at once, until it is still.
 
     ``still`` answers True, False or, where odometry is silent, None, and returns at once. None ends the hold after
     :data:`BLIND_HOLD_S`, counted from the first zero that was accepted, the last one that was not, or the last
@@ -156,7 +156,7 @@ class ZeroVelocityHold:
 
     @property
     def running(self) -> bool:
-        """Whether zeros still go out."""
+        """True while zeros go out."""
         return self._thread.is_alive()
 
     def cancel(self) -> None:
@@ -199,7 +199,7 @@ class ZeroVelocityHold:
 
 
 class CurrentHold:
-    """The one hold of a base: every stop begins it, and a motion that was allowed after the stop ends it."""
+    """The one hold of a base, begun by every stop and ended by the next motion."""
 
     def __init__(self, start: Callable[[], ZeroVelocityHold]) -> None:
         self._start = start
@@ -209,7 +209,7 @@ class CurrentHold:
 
     @property
     def running(self) -> bool:
-        """Whether zeros still go out."""
+        """True while zeros go out."""
         current = self._current
         return current is not None and current.running
 
@@ -231,7 +231,7 @@ class CurrentHold:
                 self._current = None
 
     def resume(self) -> None:
-        """Begin the hold again that the last motion ended without beginning. A newer stop has begun its own."""
+        """Begin again the hold that was ended for a motion which did not begin."""
         with self._lock:
             if self._ended_for is not None and self._ended_for.valid and self._current is None:
                 self._current = self._start()
