@@ -1,10 +1,10 @@
-"""Drive a robot from an agent's tools: find it, start a motion, follow it, stop it.
+"""Drive a robot with an agent's tools: find it, start a motion, follow it, stop it.
 
 Serve one in another terminal first::
 
     strands-robots serve so100
 
-Nothing of ours is on this side: these are the tools of Device Connect itself, which every agent framework can load.
+This side needs only Device Connect's own tools, which every agent framework can load.
 With Strands: ``Agent(tools=[robot_mesh])`` from ``strands_robots.tools`` does the same with one tool.
 """
 
@@ -14,7 +14,7 @@ import os
 import sys
 import time
 
-# Where local robots meet; a server or a router on the network takes its place.
+# The loopback port where local robots meet; on a network, name a server or a router instead.
 os.environ.setdefault("ZENOH_CONNECT", f"tcp/127.0.0.1:{os.environ.get('STRANDS_DC_PORT', '7447')}")
 os.environ.setdefault("DEVICE_CONNECT_DISCOVERY_MODE", "d2d")
 

@@ -1,4 +1,4 @@
-"""The decorator that makes a function an agent's tool, or one sentence that says which extra has it."""
+"""Decorator of agent tools; importing it without the ``agent`` extra raises an error that names the extra."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def test_stop_prints_each_verdict_and_exits_with_the_worst(run: Run, fleet: Fake
     fleet.stops["b"] = error("no answer in 5 s", stopped=None)
     result = run("stop", "--all")
     assert result.exit_code == 3
-    assert "silent" in result.stdout
+    assert "NO ANSWER" in result.stdout
     assert "b" in result.stderr
     fleet.stops["c"] = error("the bus is wedged", stopped=False)
     result = run("stop", "--all", "--json")

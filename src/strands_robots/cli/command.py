@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from strands_robots.cli.network import NETWORK_OPTIONS, Network
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.utils import MissingExtraError, ValidationError, shown
 
@@ -42,16 +42,15 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
     """
 
     def register(body: Body) -> Body:
-        declared = inspect.signature(body, eval_str=True).parameters.values()
-        own = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in declared if each.name not in ("screen", "network")]
+        own = {name: each for name, each in _parameters(body).items() if name not in ("screen", "network")}
         # A command may define a network flag of its own meaning, as serve does with --port.
-        shared = [each for each in NETWORK_OPTIONS if network and each.name not in {mine.name for mine in own}]
-        parameters = [*own, *shared, _JSON]
+        shared = {name: each for name, each in _parameters(Network).items() if network and name not in own}
+        parameters = [*own.values(), *shared.values(), _JSON]
 
         def run(**arguments: Any) -> None:
             screen = Screen(arguments.pop("machine"))
             if network:
-                arguments["network"] = Network(**{each.name: arguments.pop(each.name) for each in shared})
+                arguments["network"] = Network(**{name: arguments.pop(name) for name in shared})
             raise typer.Exit(int(_exit_code(screen, lambda: body(screen, **arguments))))
 
         run.__name__ = body.__name__
@@ -62,6 +61,11 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
         return body
 
     return register
+
+
+def _parameters(function: Callable[..., Any]) -> dict[str, Parameter]:
+    signature = inspect.signature(function, eval_str=True)
+    return {name: each.replace(kind=Parameter.KEYWORD_ONLY) for name, each in signature.parameters.items()}
 
 
 def assignments(arguments: Iterable[str]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
-from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,21 +31,29 @@ _NEEDS = (
 )
 
 
+def _option(flag: str, text: str, **more: Any) -> Any:
+    return typer.Option(flag, help=text, rich_help_panel="Network", **more)
+
+
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Network flags as the user gave them."""
+    """Network flags as the user gave them, the same for every command that uses a network."""
 
-    nats: str | None = None
-    connect: list[str] | None = None
-    listen: list[str] | None = None
-    multicast: bool = False
-    port: int | None = None
-    tenant: str | None = None
-    insecure: bool = False
-    tls_ca: Path | None = None
-    tls_cert: Path | None = None
-    tls_key: Path | None = None
-    credentials: Path | None = None
+    nats: Annotated[str | None, _option("--nats", "NATS server, such as nats://host:4222.", metavar="URL")] = None
+    connect: Annotated[
+        list[str] | None, _option("--connect", "Zenoh endpoint to connect to (repeat).", metavar="EP")
+    ] = None
+    listen: Annotated[list[str] | None, _option("--listen", "Zenoh endpoint to listen on (repeat).", metavar="EP")] = (
+        None
+    )
+    multicast: Annotated[bool, _option("--multicast", "Find peers on the local network by multicast.")] = False
+    port: Annotated[int | None, _option("--port", "Loopback port where local robots meet.", min=1, max=65535)] = None
+    tenant: Annotated[str | None, _option("--tenant", "Device Connect tenant.")] = None
+    insecure: Annotated[bool, _option("--insecure", "Accept a transport without authentication.")] = False
+    tls_ca: Annotated[Path | None, _option("--tls-ca", "Authority that peers are checked against (PEM).")] = None
+    tls_cert: Annotated[Path | None, _option("--tls-cert", "This side's certificate (PEM).")] = None
+    tls_key: Annotated[Path | None, _option("--tls-key", "This side's private key (PEM).")] = None
+    credentials: Annotated[Path | None, _option("--credentials", "Device Connect credentials file (JSON).")] = None
 
     @property
     def opted_in(self) -> bool:
@@ -103,27 +110,18 @@ class Network:
         if self.credentials:
             settings.put("MESSAGING_CREDENTIALS_FILE", str(self.credentials))
         if self.nats or self.connect or self.listen or self.multicast:
-            mode = "peer" if self.listen or self.multicast else "auto"
-            reached: LinkConfig = backends.LinkConfig(
-                transport="nats" if self.nats else "zenoh",
-                mode="auto" if self.nats else mode,
+            transport = "nats" if self.nats else "zenoh"
+            link: LinkConfig = backends.LinkConfig(transport=transport, tenant=tenant)
+            if self.credentials:
+                link = backends.link_from_environment(tenant, transport)
+            return replace(
+                link,
+                mode="peer" if self.listen or self.multicast else "auto",
                 connect=(self.nats,) if self.nats else _endpoints(self.connect),
                 listen=_endpoints(self.listen),
                 multicast=True if self.multicast else None,
-                tenant=tenant,
+                verify_hostname=True,
             )
-            if self.credentials:
-                stated = backends.link_from_environment(tenant, reached.transport)
-                reached = replace(
-                    reached,
-                    jwt=stated.jwt,
-                    nkey_seed=stated.nkey_seed,
-                    ca=stated.ca,
-                    cert=stated.cert,
-                    key=stated.key,
-                    tenant=stated.tenant,
-                )
-            return reached
         from strands_robots.device_connect.links import usual_link  # noqa: PLC0415 - loaded when a network is used
 
         return usual_link(tenant, self.port)
@@ -213,24 +211,3 @@ def _endpoints(given: list[str] | None) -> tuple[str, ...]:
     from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
 
     return endpoints([part for each in given or [] for part in each.split(",")])
-
-
-def _option(name: str, annotation: Any, flag: str, text: str, default: Any = None, **more: Any) -> Parameter:
-    described = Annotated[annotation, typer.Option(flag, help=text, rich_help_panel="Network", **more)]
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=described)
-
-
-NETWORK_OPTIONS: tuple[Parameter, ...] = (
-    _option("nats", str | None, "--nats", "NATS server, such as nats://host:4222.", metavar="URL"),
-    _option("connect", list[str] | None, "--connect", "Zenoh endpoint to connect to (repeat).", metavar="EP"),
-    _option("listen", list[str] | None, "--listen", "Zenoh endpoint to listen on (repeat).", metavar="EP"),
-    _option("multicast", bool, "--multicast", "Find peers on the local network by multicast.", False),
-    _option("port", int | None, "--port", "Loopback port where local robots meet.", min=1, max=65535),
-    _option("tenant", str | None, "--tenant", "Device Connect tenant."),
-    _option("insecure", bool, "--insecure", "Accept a transport without authentication.", False),
-    _option("tls_ca", Path | None, "--tls-ca", "Authority that peers are checked against (PEM)."),
-    _option("tls_cert", Path | None, "--tls-cert", "This side's certificate (PEM)."),
-    _option("tls_key", Path | None, "--tls-key", "This side's private key (PEM)."),
-    _option("credentials", Path | None, "--credentials", "Device Connect credentials file (JSON)."),
-)
-"""Flags that choose the network, the same for every command that uses one."""

@@ -58,9 +58,7 @@ def stop(
     if not answers:
         raise CliError(f"No robot that can be stopped answered. {describe(fleet.link)}", Exit.SILENT, devices={})
     outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
-    marks = {True: label("stopped", "green"), False: label("DID NOT STOP", "bold red"), None: label("silent", "yellow")}
-    rows = ((name, marks[stopped], said) for name, (stopped, said) in outcomes.items())
-    screen.show(table("", ("device", "stopped", "what it said"), rows))
+    _show_outcomes(screen, outcomes)
     devices = {name: {"stopped": stopped, "said": said} for name, (stopped, said) in outcomes.items()}
     moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
     silent = [name for name, (stopped, _) in outcomes.items() if stopped is None]
@@ -269,17 +267,24 @@ def _halted(facts: Mapping[str, Any]) -> str:
     return f"halted {names}" if names else "locked; nothing was moving"
 
 
+def _show_outcomes(screen: Screen, outcomes: Mapping[str, tuple[bool | None, str]]) -> None:
+    marks = {
+        True: label("stopped", "green"),
+        False: label("DID NOT STOP", "bold red"),
+        None: label("NO ANSWER", "bold red"),
+    }
+    rows = ((name, marks[stopped], said) for name, (stopped, said) in outcomes.items())
+    screen.show(table("", ("robot", "answer", "what it said"), rows))
+
+
 def _report_mesh_stop(screen: Screen, answer: Envelope, then: str = "") -> None:
     """Print the answers to a stop on the mesh. Raises :class:`CliError` unless every robot confirmed it."""
     moving, silent = answer.get("not_stopped", []), answer.get("silent", [])
 
-    def row(name: str, said: str) -> tuple[Any, ...]:
-        if name in moving:
-            return name, label("DID NOT STOP", "bold red"), said
-        return name, label("NO ANSWER", "bold red") if name in silent else label("stopped", "green"), said
+    def outcome(name: str) -> bool | None:
+        return False if name in moving else None if name in silent else True
 
-    rows = (row(*each) for each in answer.get("robots", {}).items())
-    screen.show(table("", ("robot", "answer", "what it said"), rows))
+    _show_outcomes(screen, {name: (outcome(name), text) for name, text in answer.get("robots", {}).items()})
     facts = _facts(answer)
     if answer["status"] != "success":
         raise CliError(plain(text_of(answer), 2000), Exit.REFUSED if moving else Exit.SILENT, **facts)

@@ -21,6 +21,7 @@ from strands_robots.cli.teleop_mesh import (
     MESH_PREFIX,
     NO_FOLLOWER,
     NoFollower,
+    TeleopOptions,
     announce,
     check_keys,
     follow_peer,
@@ -75,26 +76,19 @@ def teleop(
     record: Annotated[Path | None, typer.Option("--record", help="Also record the follower: a new .mcap.")] = None,
 ) -> None:
     """Let a leader drive a follower until it ends or Ctrl-C, which stops the follower first."""
-    options = _arm_options("", follower_id, calibration)
+    arm = _arm_options("", follower_id, calibration)
+    options = TeleopOptions(leader if leader in _MANUAL else "arm", seconds, hz, max_speed)
     if leader.startswith(MESH_PREFIX):
         if follower.startswith(MESH_PREFIX) or publish is not None:
             raise ValidationError("a leader of the mesh leads a follower of this machine, and publishes itself.")
         peer = identifier("leader", leader.removeprefix(MESH_PREFIX))
-        _follow(screen, peer, follower, options=options, seconds=seconds, max_speed=max_speed, record=record)
+        _follow(screen, peer, follower, arm, options=options, record=record)
         return
-    _drive(
-        screen,
-        leader,
-        follower,
-        lambda robot: _connected_leader(leader, robot, _arm_options("", leader_id, leader_calibration)),
-        options=options,
-        method=leader if leader in _MANUAL else "arm",
-        seconds=seconds,
-        hz=hz,
-        max_speed=max_speed,
-        publish=publish,
-        record=record,
-    )
+
+    def connected(robot: Any) -> AbstractContextManager[Any]:
+        return _connected_leader(leader, robot, _arm_options("", leader_id, leader_calibration))
+
+    _drive(screen, leader, follower, connected, arm, options=options, publish=publish, record=record)
 
 
 def replay(
@@ -109,7 +103,8 @@ def replay(
 ) -> None:
     """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""
     leader = _recorded_leader(file, device, speed)
-    _drive(screen, file.name, to, lambda _: nullcontext(leader), options=_arm_options("", follower_id, calibration))
+    arm = _arm_options("", follower_id, calibration)
+    _drive(screen, file.name, to, lambda _: nullcontext(leader), arm, options=TeleopOptions())
 
 
 def calibrate(
@@ -146,12 +141,9 @@ def _drive(
     leader: str,
     follower: str,
     connected: Callable[[Any], AbstractContextManager[Any]],
+    arm: dict[str, Any],
     *,
-    options: dict[str, Any],
-    method: str = "arm",
-    seconds: float | None = None,
-    hz: float = 50.0,
-    max_speed: float = FULL_RANGES_PER_S,
+    options: TeleopOptions,
     publish: str | None = None,
     record: Path | None = None,
 ) -> None:
@@ -164,39 +156,34 @@ def _drive(
         if publish is not None or record is not None:
             raise ValidationError("--publish and --record are for a follower of this machine, not of the mesh.")
         peer = identifier("follower", follower.removeprefix(MESH_PREFIX))
-        lead_peer(screen, leader, peer, connected, method=method, seconds=seconds, hz=hz, max_speed=max_speed)
+        lead_peer(screen, leader, peer, connected, options)
         return
     if follower == NO_FOLLOWER:
         if publish is None or record is not None:
             raise ValidationError(f"the follower {NO_FOLLOWER} goes with --publish PEER, and has nothing to --record.")
         peer = identifier("--publish", publish)
         with connected(NoFollower()) as source:
-            publish_leader(screen, leader, peer, source, method=method, seconds=seconds, hz=hz)
+            publish_leader(screen, leader, peer, source, options)
         return
     on_mesh = {} if publish is None else {"peer_id": identifier("--publish", publish), "mesh": True}
-    robot = _make_follower(follower, options, **on_mesh)
-    try:
-        with record_robot(screen, robot, publish or robot.tool_name_str, record), connected(robot) as source:
-            check_keys(follower, source, robot.body().bounds)
-            for answer in (
-                robot.attach_teleop(source, _NAME, method=method, max_speed=max_speed),
-                robot.teleoperate(_NAME, duration=seconds, hz=hz, publish=publish is not None),
-            ):
-                if is_error(answer):
-                    raise CliError(text_of(answer))
-            announce(screen, leader, follower, source)
-            if publish is not None:
-                screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
-            wait_until(
-                screen,
-                lambda: "" if _NAME in robot.teleoperating() else "It has ended.",
-                getattr(source, "duration", None) or 0.0,
-            )
-            verdict = _stop(screen, robot)
-            row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
-    finally:
-        robot.halt("teleop ended")
-        robot.cleanup()
+    with _made_follower(screen, follower, arm, record, publish, **on_mesh) as robot, connected(robot) as source:
+        check_keys(follower, source, robot.body().bounds)
+        for answer in (
+            robot.attach_teleop(source, _NAME, method=options.method, max_speed=options.max_speed),
+            robot.teleoperate(_NAME, duration=options.seconds, hz=options.hz, publish=publish is not None),
+        ):
+            if is_error(answer):
+                raise CliError(text_of(answer))
+        announce(screen, leader, follower, source)
+        if publish is not None:
+            screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
+        wait_until(
+            screen,
+            lambda: "" if _NAME in robot.teleoperating() else "It has ended.",
+            getattr(source, "duration", None) or 0.0,
+        )
+        verdict = _stop(screen, robot)
+        row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
     screen.data({"event": "ended", **row, "stopped": verdict.stopped})
     if row["state"] == "error":
         raise CliError(f"The teleoperation failed: {row['error']}", **row)
@@ -205,24 +192,12 @@ def _drive(
 
 
 def _follow(
-    screen: Screen,
-    peer: str,
-    follower: str,
-    *,
-    options: dict[str, Any],
-    seconds: float | None,
-    max_speed: float,
-    record: Path | None,
+    screen: Screen, peer: str, follower: str, arm: dict[str, Any], *, options: TeleopOptions, record: Path | None
 ) -> None:
     """Let a leader that a peer of the mesh publishes drive a follower of this machine."""
-    robot = _make_follower(follower, options, mesh=True, peer_id=temporary_mesh_id("follow"))
-    try:
-        with record_robot(screen, robot, robot.tool_name_str, record):
-            why, stats = follow_peer(screen, peer, robot, seconds=seconds, max_speed=max_speed)
-            verdict = _stop(screen, robot)
-    finally:
-        robot.halt("teleop ended")
-        robot.cleanup()
+    with _made_follower(screen, follower, arm, record, mesh=True, peer_id=temporary_mesh_id("follow")) as robot:
+        why, stats = follow_peer(screen, peer, robot, options)
+        verdict = _stop(screen, robot)
     row = {key: stats[key] for key in ("frames_received", "errors", "rejected", "slew_rejected", "rate_dropped")}
     screen.data({"event": "ended", **row, "why": why, "stopped": verdict.stopped})
     _check_stopped(verdict)
@@ -230,18 +205,27 @@ def _follow(
     screen.say(f"{why} {row['frames_received']} frames arrived, {left_out} of them were not applied.", "green")
 
 
-def _make_follower(follower: str, options: dict[str, Any], **more: Any) -> Any:
-    """Make the follower of this machine: ``TYPE@PORT``, or a model in simulation."""
+@contextmanager
+def _made_follower(
+    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, name: str | None = None, **more: Any
+) -> Iterator[Any]:
+    """Make the follower of this machine, ``TYPE@PORT`` or a model; record it, and halt it at the end."""
     from strands_robots.robot import NO_SUCH_MODEL, Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
     try:
-        return Robot(kind, mode="real" if at else "sim", **more, **({**options, "port": port} if at else {}))
+        robot: Any = Robot(kind, mode="real" if at else "sim", **more, **({**arm, "port": port} if at else {}))
     except ValidationError as exc:
         if exc.code != NO_SUCH_MODEL or "/" in kind or "." in kind:
             raise
         hint = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
         raise ValidationError(f"{exc} {hint}") from exc
+    try:
+        with record_robot(screen, robot, name or robot.tool_name_str, record):
+            yield robot
+    finally:
+        robot.halt("teleop ended")
+        robot.cleanup()
 
 
 def _stop(screen: Screen, robot: Any) -> StopVerdict:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.cli.network import mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, wait_until
 from strands_robots.envelope import is_error, text_of
 from strands_robots.policies.base import Ranges, SpeedLimit, checked_action, numbers
-from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, LeaderFinished, LeaderPolicy
+from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, UNBOUNDED_PER_S, LeaderFinished, LeaderPolicy
 from strands_robots.utils import ValidationError, number
 
 if TYPE_CHECKING:
@@ -40,6 +41,23 @@ _REASONS = {
     "rejected_expired": "the stream outlived its lifetime",
     "rejected_source": "another session took the leader's name",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class TeleopOptions:
+    """Options of one teleoperation.
+
+    Args:
+        method: arm, gamepad or keyboard.
+        seconds: end after so many; None for no limit.
+        hz: frames a second.
+        max_speed: whole joint ranges a second that the follower may cross.
+    """
+
+    method: str = "arm"
+    seconds: float | None = None
+    hz: float = 50.0
+    max_speed: float = FULL_RANGES_PER_S
 
 
 class RemoteFollower:
@@ -187,11 +205,7 @@ def lead_peer(
     leader: str,
     peer: str,
     connected: Callable[[Any], AbstractContextManager[Any]],
-    *,
-    method: str,
-    seconds: float | None,
-    hz: float,
-    max_speed: float,
+    options: TeleopOptions,
 ) -> None:
     """Let a leader drive a peer of the mesh until it ends, and stop the peer in every case.
 
@@ -200,10 +214,7 @@ def lead_peer(
         leader: name of the leader on the screen.
         peer: the follower's id.
         connected: returns the leader for a body that has ``bounds`` and ``get_joints``.
-        method: arm, gamepad or keyboard.
-        seconds: end after so many.
-        hz: frames a second.
-        max_speed: whole joint ranges a second that the follower may cross.
+        options: of the teleoperation.
 
     Raises:
         CliError: it was refused, it failed, or the follower did not confirm its stop.
@@ -211,22 +222,23 @@ def lead_peer(
     from strands_robots.mesh.input import InputPublisher  # noqa: PLC0415 - loaded when it is used
     from strands_robots.teleoperators.leader import BoundedLeader  # noqa: PLC0415 - as above
 
-    rate, speed = number("hz", hz, low=1, high=1000), number("max_speed", max_speed, above=0, high=20)
+    rate = number("hz", options.hz, low=1, high=1000)
+    speed = number("max_speed", options.max_speed, above=0, high=20)
     with mesh_peer(None, temporary_mesh_id("lead"), "tool") as mesh:
         if not peer_in_reach(mesh, peer):
             raise CliError(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
         follower = RemoteFollower(mesh, peer)
         with connected(follower) as source:
             check_keys(peer, source, follower.bounds)
-            policy = LeaderPolicy(source, device=DEVICE, method=method, max_speed=speed, period=1 / rate)
+            policy = LeaderPolicy(source, device=DEVICE, method=options.method, max_speed=speed, period=1 / rate)
             bounded = BoundedLeader(policy, follower.get_joints(), follower.bounds)
-            publisher = InputPublisher(mesh, bounded, DEVICE, method, rate)
+            publisher = InputPublisher(mesh, bounded, DEVICE, options.method, rate)
             follower.open_stream(mesh.peer_id)
             counters: dict[str, Any] = {}
             try:
                 publisher.start()
                 announce(screen, leader, peer, source)
-                over = _leading_over(follower, mesh.peer_id, bounded, seconds, counters)
+                over = _leading_over(follower, mesh.peer_id, bounded, options.seconds, counters)
                 why = wait_until(screen, over, getattr(source, "duration", None) or 0.0)
             finally:
                 # The follower is stopped first; publishing ends even when it does not answer.
@@ -243,9 +255,7 @@ def lead_peer(
     _report_sent(screen, why, row)
 
 
-def publish_leader(
-    screen: Screen, leader: str, peer: str, source: Any, *, method: str, seconds: float | None, hz: float
-) -> None:
+def publish_leader(screen: Screen, leader: str, peer: str, source: Any, options: TeleopOptions) -> None:
     """Publish a leader on the mesh as ``peer``, for followers elsewhere, until it ends.
 
     Raises:
@@ -253,16 +263,16 @@ def publish_leader(
     """
     from strands_robots.mesh.input import InputPublisher  # noqa: PLC0415 - loaded when it is used
 
-    rate = number("hz", hz, low=1, high=1000)
+    rate = number("hz", options.hz, low=1, high=1000)
     with mesh_peer(None, peer, "tool") as mesh:
         published = _PublishedLeader(source)
-        publisher = InputPublisher(mesh, published, DEVICE, method, rate)
+        publisher = InputPublisher(mesh, published, DEVICE, options.method, rate)
         publisher.start()
         screen.say(f"{leader} is published as {peer}/{DEVICE}. Ctrl-C ends it.")
         began = time.monotonic()
 
         def over() -> str:
-            return "The leader has finished." if published.finished else _time_over(began, seconds)
+            return "The leader has finished." if published.finished else _time_over(began, options.seconds)
 
         try:
             why = wait_until(screen, over, getattr(source, "duration", None) or 0.0)
@@ -275,17 +285,14 @@ def publish_leader(
     _report_sent(screen, why, row)
 
 
-def follow_peer(
-    screen: Screen, peer: str, robot: Any, *, seconds: float | None, max_speed: float
-) -> tuple[str, dict[str, Any]]:
+def follow_peer(screen: Screen, peer: str, robot: Any, options: TeleopOptions) -> tuple[str, dict[str, Any]]:
     """Let a leader that another peer publishes drive a robot of this machine.
 
     Args:
         screen: where it is reported.
         peer: the publisher; its device is called ``leader``.
         robot: joined to the mesh.
-        seconds: end after so many.
-        max_speed: whole joint ranges a second that the robot may cross.
+        options: of the teleoperation.
 
     Returns:
         Why it ended, and the counters of the stream.
@@ -299,13 +306,13 @@ def follow_peer(
         raise CliError("The mesh has no session, or STRANDS_MESH switches it off.")
     if not peer_in_reach(robot.mesh, peer):
         raise CliError(f"No peer {peer!r} is on the mesh of this machine.", Exit.SILENT)
-    receiver = InputReceiver(robot.mesh, robot, peer, DEVICE, LimitedFollower(robot.body(), max_speed))
+    receiver = InputReceiver(robot.mesh, robot, peer, DEVICE, LimitedFollower(robot.body(), options.max_speed))
     receiver.start()
     if receiver.start_refusal is not None:
         raise CliError(f"{peer} cannot lead: {receiver.start_refusal}.")
     try:
         announce(screen, f"{peer}/{DEVICE}", robot.tool_name_str, receiver)
-        return wait_until(screen, _following_over(peer, receiver, seconds)), receiver.stats
+        return wait_until(screen, _following_over(peer, receiver, options.seconds)), receiver.stats
     finally:
         receiver.stop()
 

@@ -1,4 +1,4 @@
-"""Tools for agents. Importing this package needs no extra; a tool is loaded when it is asked for."""
+"""Tools for agents. Importing this package needs no extra; a tool is loaded on first access."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ __all__ = ["robot_mesh", "use_ros", "use_rosbridge", "use_rtps"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    # The tool takes the place of the module of the same name, which the import has just put here.
+    # The tool replaces the module of the same name, which the import has just bound here.
     tool = globals()[name] = getattr(import_module(f"{__name__}.{name}"), name)
     return tool

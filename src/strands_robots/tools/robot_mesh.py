@@ -1,4 +1,4 @@
-"""``robot_mesh``: the one tool with which an agent finds robots, drives them and stops them.
+"""``robot_mesh``: one agent tool that finds robots, drives them and stops them.
 
 ::
 
@@ -30,30 +30,29 @@ def robot_mesh(
     policy_provider: str = "mock",
     duration: float = 30.0,
 ) -> dict[str, Any]:
-    """Find robots, tell them what to do, ask what they do, and stop them.
+    """Find robots, give them instructions, ask for their status, and stop them.
 
-    A robot that does not answer, or does not confirm that it stopped, is an error: never take it as standing still.
+    A robot that does not answer, or does not confirm that it stopped, is an error: never assume that it stands still.
 
     Args:
-        action: peers lists the robots; tell gives one an instruction and returns once it has begun; status asks what
-            one is doing; stop stops one, or all without a target; emergency_stop stops all at once.
+        action: peers lists the robots; tell gives one an instruction and returns once the motion has started; status
+            returns what one is doing; stop stops one, or all without a target; emergency_stop stops and locks all.
         target: The robot's id, as peers lists it. Needed by tell and status.
-        instruction: What to do, in plain language, 1 to 2000 characters. For emergency_stop: the reason.
+        instruction: The motion in plain language, 1 to 2000 characters. For emergency_stop: the reason.
         policy_provider: Policy that decides the robot's actions, such as mock, remote or lerobot_local.
         duration: Longest time the motion may take, in seconds, above 0 and at most 3600.
     """
     try:
-        wanted = choice("action", action, ACTIONS)
-        who = device_id("target", target) if target or wanted in ("tell", "status") else ""
-        if wanted == "tell":
-            what = text("instruction", instruction)
-            provider = text("policy_provider", policy_provider, longest=100)
+        verb = choice("action", action, ACTIONS)
+        robot = device_id("target", target) if target or verb in ("tell", "status") else ""
+        if verb == "tell":
+            what, provider = text("instruction", instruction), text("policy_provider", policy_provider, longest=100)
             seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
-            return networks.network().tell(who, what, provider, seconds)
-        if wanted == "emergency_stop":
+            return networks.network().tell(robot, what, provider, seconds)
+        if verb == "emergency_stop":
             return networks.network().emergency_stop(text("instruction", instruction, empty=True))
     except ValidationError as refused:
         return error(str(refused))
-    if wanted == "stop":
-        return networks.network().stop(who)
-    return networks.network().status(who) if wanted == "status" else networks.network().peers()
+    if verb == "stop":
+        return networks.network().stop(robot)
+    return networks.network().status(robot) if verb == "status" else networks.network().peers()

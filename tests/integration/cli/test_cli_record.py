@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from fixtures.command_line import COMMAND
 from fixtures.waiting import eventually, free_port
 from typer.testing import CliRunner
 
@@ -20,10 +20,8 @@ from strands_robots.simulation import Simulation
 pytest.importorskip("mcap")
 pytestmark = pytest.mark.timeout(300)
 
-COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
-
-def test_what_an_arm_did_is_recorded_and_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorded_motion_is_replayed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     run = tmp_path / "run.mcap"
     world = Simulation("bench")
@@ -47,7 +45,7 @@ def test_what_an_arm_did_is_recorded_and_done_again(tmp_path: Path, monkeypatch:
     assert (told["state"], told["stopped"], told["errors"]) == ("completed", True, 0)
 
 
-def test_who_serves_an_arm_records_it_also_while_it_stands(tmp_path: Path) -> None:
+def test_serve_records_its_arm_also_while_it_stands(tmp_path: Path) -> None:
     run, port = tmp_path / "run.mcap", str(free_port())
     line = [*COMMAND, "serve", "so100", "--port", port, "--peer-id", "sim-1", "--record", str(run), "--json"]
     serving = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
@@ -75,7 +73,7 @@ def test_who_serves_an_arm_records_it_also_while_it_stands(tmp_path: Path) -> No
     assert recorded_actions(run)
 
 
-def test_nothing_heard_is_a_failure_and_not_an_empty_success(tmp_path: Path) -> None:
+def test_recording_without_messages_fails_and_leaves_no_file(tmp_path: Path) -> None:
     line = ["record", "nobody-1", "--out", str(tmp_path / "run.mcap"), "--for", "0.3", "--port", str(free_port())]
     done = CliRunner().invoke(build(), [*line, "--json"])
     assert done.exit_code == 3

@@ -1,76 +1,32 @@
-"""A stop, its lockout and its resume as an operator does them: real processes on one free loopback port."""
+"""Emergency stop, lockout and resume as an operator does them: real processes on one free loopback port."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.command_line import COMMAND, WITHIN_S, Machine, on_a_terminal
 from fixtures.nats_server import NatsServer
-from fixtures.terminal import on_a_terminal
 from fixtures.waiting import eventually, free_port
 
-from strands_robots import settings
 from strands_robots.safety.ed25519 import keygen
 
-WITHIN_S = 100.0
 pytestmark = pytest.mark.timeout(600)
 PASSPHRASE = "Plenty of 4 different words"
 WAVE = ("instruction=wave", "duration=600")
 PATIENT = ("--deadline", "30")
 
 
-class Site:
-    """One machine with a state folder of its own, and an operator's key whose public half its robots know."""
+class Site(Machine):
+    """A machine with an operator's key; its robots have the public half."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.key, self.passphrase = folder, folder / "operator.pem", folder / "passphrase"
         self.passphrase.write_text(PASSPHRASE + "\n", encoding="utf-8")
-        ours = {setting.name for setting in settings.declared()}
-        self.environment = {name: value for name, value in os.environ.items() if name not in ours}
-        self.environment |= {
-            "STRANDS_DC_PORT": str(free_port()),
-            "STRANDS_STATE_DIR": str(folder / "state"),
-            "STRANDS_HALT_DEADLINE_S": "20",
-            "STRANDS_MESH_RESUME_PUBLIC_KEY": keygen(self.key, PASSPHRASE),
-        }
-
-    def words(self, *words: str) -> list[str]:
-        return [sys.executable, "-m", "strands_robots.cli", *words]
-
-    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            self.words(*words), env=self.environment, capture_output=True, text=True, timeout=WITHIN_S, check=False
-        )
-
-    def json(self, *words: str) -> tuple[int, dict[str, Any]]:
-        result = self.run(*words, "--json")
-        assert result.stdout, result.stderr
-        return result.returncode, json.loads(result.stdout)
-
-    @contextmanager
-    def serving(self, peer_id: str, *words: str, **settings: str) -> Iterator[subprocess.Popen[str]]:
-        served = subprocess.Popen(
-            self.words("serve", "so100", "--peer-id", peer_id, "--json", *words),
-            env=self.environment | settings,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        try:
-            assert served.stdout is not None
-            assert json.loads(served.stdout.readline())["event"] == "serving"
-            yield served
-        finally:
-            served.terminate()
-            served.communicate(timeout=WITHIN_S)
+        super().__init__(folder / "state", STRANDS_MESH_RESUME_PUBLIC_KEY=keygen(self.key, PASSPHRASE))
 
     def wave(self, peer_id: str) -> tuple[int, dict[str, Any]]:
         return self.json("call", peer_id, "execute", *WAVE)
@@ -78,8 +34,8 @@ class Site:
     def moving(self, peer_id: str) -> bool:
         return bool(self.json("call", peer_id, "getStatus")[1]["running_policies"])
 
-    def signed(self, *words: str) -> tuple[int, dict[str, Any]]:
-        return self.json("resume", "--key", str(self.key), "--passphrase-file", str(self.passphrase), *words)
+    def signed(self, *arguments: str) -> tuple[int, dict[str, Any]]:
+        return self.json("resume", "--key", str(self.key), "--passphrase-file", str(self.passphrase), *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +49,7 @@ def arms(site: Site) -> Iterator[tuple[str, str]]:
         yield "arm-1", "arm-2"
 
 
-def test_an_emergency_stop_latches_until_the_operators_key_frees_it(site: Site, arms: tuple[str, str]) -> None:
+def test_emergency_stop_locks_until_the_operators_key_resumes(site: Site, arms: tuple[str, str]) -> None:
     for arm in arms:
         assert site.wave(arm)[0] == 0
         eventually(partial(site.moving, arm))
@@ -117,7 +73,7 @@ def test_an_emergency_stop_latches_until_the_operators_key_frees_it(site: Site, 
     assert not any(robot["locked"] for robot in site.json("lockout")[1]["live"].values())
 
 
-def test_a_key_that_the_robots_do_not_know_frees_nothing(site: Site, arms: tuple[str, str]) -> None:
+def test_unknown_key_frees_no_robot(site: Site, arms: tuple[str, str]) -> None:
     assert site.json("estop", *arms, *PATIENT)[0] == 0
     stranger = site.folder / "stranger.pem"
     keygen(stranger, PASSPHRASE)
@@ -128,8 +84,8 @@ def test_a_key_that_the_robots_do_not_know_frees_nothing(site: Site, arms: tuple
     assert site.signed()[0] == 0
 
 
-def test_a_stop_on_a_terminal_is_a_table_that_ends_with_counts(site: Site, arms: tuple[str, str]) -> None:
-    with on_a_terminal(site.words("estop", *arms, "arm-9", "--deadline", "5"), site.environment) as terminal:
+def test_estop_on_a_terminal_is_a_table_that_ends_with_counts(site: Site, arms: tuple[str, str]) -> None:
+    with on_a_terminal([*COMMAND, "estop", *arms, "arm-9", "--deadline", "5"], site.environment) as terminal:
         assert terminal.process.wait(WITHIN_S) == 3
         eventually(lambda: "2 stopped, 1 silent, in" in terminal.drawn)
         assert "unconfirmed" in terminal.drawn and "NO ANSWER" in terminal.drawn
@@ -137,7 +93,7 @@ def test_a_stop_on_a_terminal_is_a_table_that_ends_with_counts(site: Site, arms:
     assert site.signed()[0] == 0
 
 
-def test_over_a_broker_a_robot_that_asks_for_signed_stops_heeds_no_others(site: Site) -> None:
+def test_robot_that_requires_signed_stops_ignores_others_over_a_broker(site: Site) -> None:
     public = keygen(site.folder / "stop.pem", PASSPHRASE)
     signed = ("--key", str(site.folder / "stop.pem"), "--passphrase-file", str(site.passphrase))
     with NatsServer() as server:
@@ -152,7 +108,7 @@ def test_over_a_broker_a_robot_that_asks_for_signed_stops_heeds_no_others(site: 
             assert site.signed(*there)[0] == 0
 
 
-def test_a_robot_that_is_expected_and_silent_is_exit_3_by_name(site: Site, arms: tuple[str, str]) -> None:
+def test_expected_but_silent_robot_is_named_with_exit_3(site: Site, arms: tuple[str, str]) -> None:
     result = site.run("estop", "arm-1", "arm-9", "--deadline", "0.6")
     assert result.returncode == 3
     assert "arm-9" in result.stdout and "NO ANSWER" in result.stdout
@@ -160,10 +116,8 @@ def test_a_robot_that_is_expected_and_silent_is_exit_3_by_name(site: Site, arms:
     assert site.signed()[0] == 0
 
 
-def test_an_operator_at_the_machine_clears_robots_that_run_and_those_that_do_not(
-    site: Site, arms: tuple[str, str]
-) -> None:
-    with site.serving("arm-3") as served:
+def test_local_resume_clears_running_and_stopped_processes(site: Site, arms: tuple[str, str]) -> None:
+    with site.serving("arm-3") as (served, _):
         assert site.json("estop", *arms, "arm-3", *PATIENT)[0] == 0
         served.kill()
         served.wait()
@@ -175,17 +129,17 @@ def test_an_operator_at_the_machine_clears_robots_that_run_and_those_that_do_not
     assert site.json("resume", "--local", "arm-1")[0] == 1
 
 
-def test_nobody_there_is_exit_3(site: Site) -> None:
+def test_estop_without_any_robot_is_exit_3(site: Site) -> None:
     code, said = site.json("estop", "--deadline", "0.3", "--tenant", "elsewhere", "--port", str(free_port()))
     assert code == 3
     assert said["stopped"] == {}
 
 
-def test_the_space_bar_stops_every_robot(site: Site, arms: tuple[str, str]) -> None:
+def test_space_bar_stops_every_robot(site: Site, arms: tuple[str, str]) -> None:
     for arm in arms:
         assert site.wave(arm)[0] == 0
-    words = site.words("safety-controller", "--id", "desk-2", "--check-in", "0.5")
-    with on_a_terminal(words, site.environment) as terminal:
+    line = [*COMMAND, "safety-controller", "--id", "desk-2", "--check-in", "0.5"]
+    with on_a_terminal(line, site.environment) as terminal:
         before = terminal.modes()
         eventually(lambda: all(arm in terminal.drawn for arm in arms), within=WITHIN_S)
         eventually(lambda: "the stop link is up; checks in every 0.5 s" in terminal.drawn)
@@ -207,27 +161,26 @@ def test_the_space_bar_stops_every_robot(site: Site, arms: tuple[str, str]) -> N
     assert site.signed()[0] == 0
 
 
-def test_a_controller_without_a_terminal_is_refused(site: Site) -> None:
+def test_safety_controller_without_a_terminal_is_refused(site: Site) -> None:
     result = site.run("safety-controller")
     assert result.returncode == 2
     assert "needs a terminal" in result.stderr
 
 
-def test_a_robot_that_needs_a_controller_locks_when_the_last_one_leaves(site: Site) -> None:
-    def held() -> list[dict[str, Any]]:
+def test_robot_that_requires_check_ins_locks_when_the_controller_leaves(site: Site) -> None:
+    def lockouts() -> list[dict[str, Any]]:
         found: list[dict[str, Any]] = site.json("lockout")[1]["live"]["arm-6"]["holds"]
         return found
 
-    with on_a_terminal(
-        site.words("safety-controller", "--id", "desk-3", "--check-in", "0.2"), site.environment
-    ) as terminal:
+    line = [*COMMAND, "safety-controller", "--id", "desk-3", "--check-in", "0.2"]
+    with on_a_terminal(line, site.environment) as terminal:
         eventually(lambda: "checks in every 0.2 s" in terminal.drawn, within=WITHIN_S)
         with site.serving("arm-6", STRANDS_CHECKIN_TIMEOUT_S="8"):
             eventually(lambda: "s left" in terminal.drawn, within=WITHIN_S)
-            assert held() == []
+            assert lockouts() == []
             terminal.press("q")
             assert terminal.process.wait(WITHIN_S) == 0
-            eventually(held, within=60)
-            assert "desk-3" in str(held())
+            eventually(lockouts, within=60)
+            assert "desk-3" in str(lockouts())
             assert site.wave("arm-6")[0] == 1
     assert site.json("resume", "--local", "arm-6")[0] == 0

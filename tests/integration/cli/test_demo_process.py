@@ -1,36 +1,27 @@
-"""The demo as a stranger runs it, and the demo with one thing spoiled."""
+"""The demo as a new user runs it, and the demo with one fault."""
 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 
 import psutil
 import pytest
+from fixtures.command_line import COMMAND, Machine
 from fixtures.waiting import eventually
-
-from strands_robots import settings
 
 WITHIN_S = 200.0
 pytestmark = pytest.mark.timeout(600)
 
 
-def environment(state: Path, **more: str) -> dict[str, str]:
-    ours = {setting.name for setting in settings.declared()}
-    kept = {name: value for name, value in os.environ.items() if name not in ours}
-    return {**kept, "STRANDS_STATE_DIR": str(state), "STRANDS_HALT_DEADLINE_S": "20", **more}
-
-
-def start(folder: Path, *words: str, **more: str) -> subprocess.Popen[str]:
+def start(folder: Path, *arguments: str, **more: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "strands_robots.cli", "demo", *words],
+        [*COMMAND, "demo", *arguments],
         cwd=folder,
-        env=environment(folder / "state", **more),
+        env={**Machine(folder / "state").environment, **more},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -38,7 +29,7 @@ def start(folder: Path, *words: str, **more: str) -> subprocess.Popen[str]:
 
 
 def served_by(run: subprocess.Popen[str]) -> psutil.Process | None:
-    """The process in which the demo serves its robot."""
+    """Return the process in which the demo serves its robot."""
     for child in psutil.Process(run.pid).children():
         with suppress(psutil.NoSuchProcess):  # a child of another kind that has just ended
             if "serve" in child.cmdline():
@@ -50,7 +41,7 @@ def gone(process: psutil.Process) -> bool:
     return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
 
 
-def test_the_demo_happens_and_leaves_its_pictures(tmp_path: Path) -> None:
+def test_demo_runs_every_step_and_writes_its_pictures(tmp_path: Path) -> None:
     # A network of the user's own must not get in its way.
     run = start(tmp_path, "--record", "demo.svg", "--json", NATS_URL="nats://192.0.2.1:4222", TENANT="elsewhere")
     told, complaints = run.communicate(timeout=WITHIN_S)
@@ -58,8 +49,8 @@ def test_the_demo_happens_and_leaves_its_pictures(tmp_path: Path) -> None:
     report = json.loads(told)
     assert report["status"] == "success"
     steps = {step["step"]: step for step in report["steps"]}
-    ending = ["emergency stop", "refusal", "resume", "execute again"]
-    assert list(steps) == ["serve", "discover", "execute", "stop", *ending, "leave", "pictures"]
+    safety = ["emergency stop", "refusal", "resume", "execute again"]
+    assert list(steps) == ["serve", "discover", "execute", "stop", *safety, "leave", "pictures"]
     assert all(step["ok"] for step in steps.values())
     assert {"execute", "stop", "getStatus", "getFeatures"} <= set(steps["discover"]["functions"])
     assert steps["execute"]["steps"] > 0
@@ -73,7 +64,7 @@ def test_the_demo_happens_and_leaves_its_pictures(tmp_path: Path) -> None:
     assert "url(http" not in (tmp_path / "demo.svg").read_text(encoding="utf-8")
 
 
-def test_a_refused_motion_fails_the_demo(tmp_path: Path) -> None:
+def test_refused_motion_fails_the_demo(tmp_path: Path) -> None:
     run = start(tmp_path, DEVICE_CONNECT_RPC_ALLOW="somebody-else")
     told, complaints = run.communicate(timeout=WITHIN_S)
     assert run.returncode == 1
@@ -82,7 +73,7 @@ def test_a_refused_motion_fails_the_demo(tmp_path: Path) -> None:
     assert not (tmp_path / "demo-output").exists()
 
 
-def test_a_robot_that_dies_fails_the_demo(tmp_path: Path) -> None:
+def test_dead_robot_process_fails_the_demo(tmp_path: Path) -> None:
     run = start(tmp_path, "--json")
     served = eventually(lambda: served_by(run), within=60.0, what="the demo's robot process")
     served.kill()
@@ -92,7 +83,7 @@ def test_a_robot_that_dies_fails_the_demo(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_demo_takes_its_robot_with_it(tmp_path: Path, number: signal.Signals) -> None:
+def test_interrupted_demo_ends_its_robot_process(tmp_path: Path, number: signal.Signals) -> None:
     run = start(tmp_path)
     served = eventually(lambda: served_by(run), within=60.0, what="the demo's robot process")
     run.send_signal(number)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -12,9 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from fixtures.waiting import accepts, eventually, free_port
-
-from strands_robots import settings
+from fixtures.command_line import COMMAND, Machine
+from fixtures.waiting import accepts, eventually
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 WITHIN_S = 60.0
@@ -23,14 +21,7 @@ pytestmark = pytest.mark.timeout(300)
 
 @pytest.fixture
 def environment(tmp_path: Path) -> dict[str, str]:
-    ours = {setting.name for setting in settings.declared()}
-    kept = {name: value for name, value in os.environ.items() if name not in ours}
-    return {
-        **kept,
-        "STRANDS_DC_PORT": str(free_port()),
-        "STRANDS_STATE_DIR": str(tmp_path),
-        "STRANDS_HALT_DEADLINE_S": "20",
-    }
+    return Machine(tmp_path).environment
 
 
 @contextmanager
@@ -47,7 +38,7 @@ def example(name: str, environment: dict[str, str]) -> Iterator[subprocess.Popen
 
 
 def command(environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "strands_robots.cli", *words]
+    line = [*COMMAND, *words]
     return subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
 
 

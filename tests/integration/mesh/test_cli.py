@@ -6,19 +6,17 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.command_line import COMMAND
 from fixtures.waiting import eventually
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
-
-COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
 
 @contextmanager

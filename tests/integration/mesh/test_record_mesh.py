@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.command_line import COMMAND
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
 
@@ -18,7 +18,6 @@ from strands_robots.recording import RecordedEvent, RecordedJoints, RecordedPict
 
 pytest.importorskip("mcap")
 
-COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 CAMERAS = {"overview", "front", "side", "top", "so100.wrist"}
 
 

@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.command_line import COMMAND
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
 
 from strands_robots.teleoperators.recorded import write_csv
 
 Join = Callable[..., MeshPeer]
-
-COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
 
 @pytest.fixture

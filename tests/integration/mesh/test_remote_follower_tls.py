@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
+from fixtures.command_line import COMMAND
 from fixtures.waiting import free_port
 
 from strands_robots.mesh import keys
 from strands_robots.teleoperators.recorded import write_csv
 
 pytest.importorskip("cryptography")
-
-COMMAND = [sys.executable, "-m", "strands_robots.cli"]
 
 
 @pytest.fixture
