@@ -1,0 +1,58 @@
+"""The way of an emergency stop to the device of a real arm, hop by hop, is the one in docs/architecture.md."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+from fixtures.call_path import Call, CallPath, documented, hops
+from fixtures.devices import RecordingDevice
+from fixtures.nats_server import NatsServer
+from fixtures.planes import own_plane
+from fixtures.waiting import eventually
+
+from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.stop_link import stop_link
+from strands_robots.hardware import HardwareRobot
+from strands_robots.safety.estop_listener import ESTOP, EstopListener, notification
+from strands_robots.safety.orders import new_epoch
+
+ARCHITECTURE = Path(__file__).parents[3] / "docs" / "architecture.md"
+
+
+def way_of_a_stop() -> list[Call]:
+    """Stop an arm over NATS; the calls from the link's callback to the write of the freeze."""
+    device = RecordingDevice()
+    with NatsServer() as server, CallPath() as path, own_plane(20.0) as plane:
+        config = LinkConfig(transport="nats", connect=(server.url,))
+        robot = HardwareRobot(device, "arm")
+        robot.connect()
+        entry = plane.register("arm", robot)
+        listener = EstopListener(plane)
+        registration = listener.register("arm", config, lambda: stop_link(config))
+        controller = stop_link(config)
+        controller.open((), lambda event, source, payload: None, lambda up: None)
+        try:
+            eventually(lambda: registration.link.up and controller.up)
+            robot.start_task("wave")
+            eventually(lambda: device.writes)
+            epoch = new_epoch()
+            controller.publish("safety-1", ESTOP, notification(ESTOP, {"estop_id": epoch}))
+            report = eventually(lambda: entry.reports.get(epoch))
+            assert report.stopped is True
+            assert device.writes[-1].action == device.positions, "the freeze"
+            way = path.way_to("DeviceBody._hold")
+        finally:
+            controller.close()
+            registration.close()
+            robot.cleanup()
+    callback = next(index for index, call in enumerate(way) if call.name.endswith("on_message"))
+    return way[callback:]
+
+
+def test_stop_of_a_real_arm_takes_the_documented_way_with_two_hand_offs() -> None:
+    way = way_of_a_stop()
+    threads = [name for name, _ in itertools.groupby(call.thread for call in way)]
+    assert threads == ["stop-link", "estop-listener", "halt-arm"]
+    assert hops(way) == documented(ARCHITECTURE, "stop-path")
+    assert len(hops(way)) <= 14
