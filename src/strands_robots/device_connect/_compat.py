@@ -1,6 +1,6 @@
-"""The framework's private members that we lean on, all in this file, for ``device-connect-edge`` 0.2.5.
+"""All uses of the framework's private members, for ``device-connect-edge`` 0.2.5.
 
-``tests/device_connect/test_compat.py`` fails when one of them changes.
+``tests/device_connect/test_compat.py`` lists these members and fails when one of them changes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import contextlib
 import functools
 import inspect
 import logging
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
 from typing import Any, TypeVar, cast
 
@@ -23,31 +23,6 @@ from device_connect_edge.messaging.exceptions import AuthenticationError, Messag
 from .. import settings
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
-
-FRAMEWORK_VERSION = "0.2.5"
-
-LEANED_ON = {
-    "DeviceRuntime": (
-        "__init__",
-        "run",
-        "stop",
-        "_connect_messaging",
-        "_cmd_subscription",
-        "_event_dispatch_loop",
-        "_heartbeat_loop",
-        "_validate_startup_config",
-        "_resubscribe_after_reconnect",
-        "_notify_conn_state",
-        "_build_registration_params",
-        "_register",
-        "_track_task",
-        "_warn_if_predicate_extra_missing",
-        "enqueue_event",
-    ),
-    "DeviceDriver": ("_get_functions", "_invoke_decorated", "invoke"),
-    "decorators": ("rpc",),
-}
-"""Members that are called, replaced or whose way of working is relied upon."""
 
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""
@@ -352,9 +327,3 @@ def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[A
         return answer
 
     return called
-
-
-def sources() -> dict[str, Callable[..., Any] | Coroutine[Any, Any, Any]]:
-    """Return the framework's functions named in ``LEANED_ON``, for the test that watches them."""
-    owners = {"DeviceRuntime": DeviceRuntime, "DeviceDriver": DeviceDriver, "decorators": decorators}
-    return {f"{owner}.{name}": getattr(owners[owner], name) for owner, names in LEANED_ON.items() for name in names}

@@ -1,4 +1,4 @@
-"""Putting a robot on Device Connect and taking it off again."""
+"""Bring-up of a robot on Device Connect, and its end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import secrets
 import sys
 import threading
 from concurrent.futures import Future
-from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,12 +57,12 @@ class DuplicateDeviceError(StrandsRobotsError, RuntimeError):
 
 @dataclass(slots=True)
 class Host:
-    """Where a runtime lives."""
+    """Loop, task and thread of a running device."""
 
     loop: asyncio.AbstractEventLoop
     task: asyncio.Task[None]
     thread: threading.Thread | None = None
-    wanted_off: asyncio.Event = field(default_factory=asyncio.Event)
+    end: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 _hosts: dict[Runtime, Host] = {}
@@ -88,7 +87,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         robot: a simulation, a robot, any object that ``contract.adapt`` accepts, or a ready ``DeviceDriver``.
         peer_id: its id on the network, without dots; ``<tool_name>-<8 hex>`` by default.
         peer_type: ``robot`` or ``sim``; settles what an object is that could be either.
-        messaging_url: ``nats://host:port`` or ``tcp/host:port``; the environment's by default. Zenoh without any
+        messaging_url: ``nats://host:port`` or ``tcp/host:port``; the environment's by default. Zenoh without one
             finds other devices by multicast on the local network.
         messaging_backend: ``zenoh`` or ``nats``; by default what the URL or ``MESSAGING_BACKEND`` says.
         tenant: devices and agents of other tenants neither see nor reach this one.
@@ -144,9 +143,9 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
             raise TimeoutError(f"{name} was not up on {where} within {bringup_timeout:g} s: {why}") from exc
         raise
     _hosts[runtime] = Host(asyncio.get_running_loop(), task)
-    # Again with each device, because what is registered last runs first: the link must still be open then.
-    atexit.unregister(_leave_no_ghost)
-    atexit.register(_leave_no_ghost)
+    # Registered again with each device: the last registration runs first, and the link must still be open then.
+    atexit.unregister(_depart_at_exit)
+    atexit.register(_depart_at_exit)
     task.add_done_callback(lambda _: _ended(runtime, task))
     return runtime
 
@@ -172,7 +171,7 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
         TimeoutError: not callable in time; the bring-up is cancelled and never comes online later.
         RuntimeError: the bring-up ended without a runtime.
     """
-    came_up: Future[Runtime | None] = Future()
+    started: Future[Runtime | None] = Future()
 
     async def serve() -> None:
         runtime = await init_device_connect(
@@ -188,16 +187,16 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
         )
         host = _hosts.get(runtime)
         if host is None:
-            came_up.set_result(None)
+            started.set_result(None)
             return
         host.thread = threading.current_thread()
-        # A caller who has given up must not get a device that nobody stops.
-        if not came_up.set_running_or_notify_cancel():
+        # A caller who has given up would never stop the device.
+        if not started.set_running_or_notify_cancel():
             await runtime.shutdown()
             return
-        came_up.set_result(runtime)
-        asked = asyncio.create_task(host.wanted_off.wait())
-        await asyncio.wait({host.task, asked}, return_when=asyncio.FIRST_COMPLETED)
+        started.set_result(runtime)
+        ending = asyncio.create_task(host.end.wait())
+        await asyncio.wait({host.task, ending}, return_when=asyncio.FIRST_COMPLETED)
         await runtime.shutdown()
 
     def live() -> None:
@@ -206,8 +205,8 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
                 loops.append(runner.get_loop())
                 runner.run(serve())
         except BaseException as exc:
-            if not came_up.done():
-                came_up.set_exception(exc)
+            if not started.done():
+                started.set_exception(exc)
             elif not isinstance(exc, asyncio.CancelledError):
                 logger.exception("The device's thread ended.")
 
@@ -215,9 +214,9 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
     thread = threading.Thread(target=live, name="device-connect", daemon=True)
     thread.start()
     try:
-        runtime = came_up.result(bringup_timeout + LOOP_JOIN_TIMEOUT_S)
-    except FutureTimeoutError as exc:
-        if not came_up.cancel():
+        runtime = started.result(bringup_timeout + LOOP_JOIN_TIMEOUT_S)
+    except TimeoutError as exc:
+        if not started.cancel():
             thread.join(LOOP_JOIN_TIMEOUT_S)
             raise
         if loops:
@@ -249,14 +248,14 @@ def stop_device_connect(runtime: Any, within: float = 10.0) -> None:
         asyncio.run_coroutine_threadsafe(runtime.shutdown(), host.loop).result(within)
         return
     with contextlib.suppress(RuntimeError):  # the loop closed by itself a moment ago
-        host.loop.call_soon_threadsafe(host.wanted_off.set)
+        host.loop.call_soon_threadsafe(host.end.set)
     host.thread.join(within)
     if host.thread.is_alive():
         raise TimeoutError(f"The device did not leave the network within {within:g} s.")
 
 
 def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
-    """The driver of ``robot``: its own where it is one, else what the object is, else what ``peer_type`` says."""
+    """Return the driver of ``robot``: itself, else by what the object is, else by ``peer_type``."""
     if isinstance(robot, DeviceDriver):
         return robot
     if getattr(robot, "device_type", "") == "reachy_mini":
@@ -282,20 +281,20 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
 
 
 def default_id(robot: Any) -> str:
-    """``<tool_name>-<8 hex>``, with whatever an id cannot hold replaced by a dash."""
+    """Return ``<tool_name>-<8 hex>`` with a dash for each character that an id cannot have."""
     name = getattr(robot, "tool_name_str", "") or getattr(robot, "device_type", "")
     clean = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name))[:100].strip("-_") or "robot"
     return f"{clean}-{secrets.token_hex(4)}"
 
 
 def announceable(driver: DeviceDriver) -> None:
-    """Refuse a driver whose description JSON cannot carry: nobody would ever discover it.
+    """Refuse a driver whose description JSON cannot carry, because it could not be discovered.
 
     Raises:
         ValidationError: naming the functions and events to mend.
     """
     capabilities = driver.capabilities
-    with contextlib.suppress(TypeError, ValueError):  # what is at fault is looked for below, part by part
+    with contextlib.suppress(TypeError, ValueError):  # the fault is searched below, part by part
         json.dumps(capabilities.model_dump(), allow_nan=False)
         return
     faults = []
@@ -399,8 +398,8 @@ def _cancel_everything(loop: asyncio.AbstractEventLoop) -> None:
         loop.call_soon_threadsafe(cancel)
 
 
-class _LastWord(logging.Handler):
-    """Keeps the framework's last warning; what is shown is the application's to decide."""
+class _LastWarning(logging.Handler):
+    """Keeps the framework's last warning; the application decides what is shown."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -410,18 +409,18 @@ class _LastWord(logging.Handler):
         self.last = record.getMessage().strip()
 
 
-def _listen_to_the_framework(name: str) -> _LastWord:
-    """A handler on the runtime's logger; without any the framework writes to stderr by itself."""
+def _listen_to_the_framework(name: str) -> _LastWarning:
+    """Return a handler on the runtime's logger; without any the framework writes to stderr itself."""
     framework = logging.getLogger(f"device_connect_edge.device.{name}")
     for handler in framework.handlers:
-        if isinstance(handler, _LastWord):
+        if isinstance(handler, _LastWarning):
             return handler
-    word = _LastWord()
-    framework.addHandler(word)
-    return word
+    last = _LastWarning()
+    framework.addHandler(last)
+    return last
 
 
-def _leave_no_ghost() -> None:
+def _depart_at_exit() -> None:
     for runtime, host in list(_hosts.items()):
         if host.thread is None or not host.thread.is_alive():
             continue
