@@ -8,16 +8,14 @@
     ...
     stop_device_connect(runtime)
 
-Everything here is imported when it is asked for: importing this package needs no extra and costs next to nothing.
-What stands on the framework needs the [device-connect] extra, and says so.
+Each name is imported on first use: importing this package needs no extra and costs next to nothing. A name that needs
+the framework names the [device-connect] extra when that is missing.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
 
 if TYPE_CHECKING:
     from device_connect_edge import DeviceRuntime
@@ -32,6 +30,7 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.client import FleetClient
     from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
     from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+    from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
     from strands_robots.device_connect.shutdown import StopSignal
     from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 
@@ -54,6 +53,7 @@ __all__ = [
 
 _HERE = "strands_robots.device_connect"
 _HOMES = {
+    "_LOOP_JOIN_TIMEOUT_S": f"{_HERE}.shutdown",
     "DeviceRuntime": "device_connect_edge",
     "DuplicateDeviceError": f"{_HERE}.bringup",
     "FleetClient": f"{_HERE}.client",
@@ -76,7 +76,7 @@ def __getattr__(name: str) -> Any:
     if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        value = getattr(import_module(home), name)
+        value = getattr(import_module(home), name.lstrip("_"))
     except ModuleNotFoundError as exc:
         if exc.name is None or exc.name.partition(".")[0] not in _FRAMEWORK:
             raise
