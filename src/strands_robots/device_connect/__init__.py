@@ -1,4 +1,4 @@
-"""Device Connect: a robot or a simulation as a device that agents find, drive and stop.
+"""Device Connect: robots and simulations as devices that agents drive and stop.
 
 ::
 

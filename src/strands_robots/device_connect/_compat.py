@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 def rpc(labels: Labels | None = None) -> Callable[[F], F]:
-    """Declare a function that agents may call; its name, hints and docstring become the schema they read."""
+    """Declare a function for agents; its name, hints and docstring are its schema."""
     return cast(Callable[[F], F], drivers.rpc(labels=labels))
 
 
@@ -61,7 +61,7 @@ def on(event_name: str) -> Callable[[F], F]:
 
 
 class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type information
-    """The framework's runtime on our backend: it reports when it is ready and leaves nothing open at its end.
+    """The framework's runtime on our backend; reports its readiness and closes all.
 
     Args:
         driver: what to serve.
@@ -146,7 +146,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
             await self._running
 
     async def shutdown(self) -> None:
-        """End ``run`` wherever it stands, announce the departure, and wait until nothing is open."""
+        """End ``run`` at any stage, announce the departure, wait until all is closed."""
         running = self._running
         if running is None:
             return
@@ -167,7 +167,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         return asyncio.run_coroutine_threadsafe(self.enqueue_event(event, payload), self._loop)
 
     async def _connect_messaging(self) -> None:
-        """Connect, however late the other side comes. The stock loop lets up to 30 s pass between two attempts."""
+        """Connect, with short pauses; the stock loop waits up to 30 s between attempts."""
         framework.DeviceConnectTelemetry = _telemetry
         self.messaging = backend_for(self.link)
         refusals = 0
@@ -219,7 +219,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         await self.messaging.serve(f"device-connect.{self.tenant}.{self.device_id}.cmd", self._serve)
 
     async def _serve(self, command: jsonrpc.RpcRequest, answer: Answer | None) -> None:
-        """Give the framework's answer to a command, without its spans: no exporter would receive them."""
+        """Answer a command as the framework does, without its spans."""
         method, params = command.method, command.params
         source = params.pop("_dc_meta", {}).get("source_device")
         if source:
@@ -242,7 +242,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         await super()._heartbeat_loop()
 
     async def _event_dispatch_loop(self) -> None:
-        """Send events in order. The stock loop tries a refused one for ever, with all others behind it."""
+        """Send events in order; the stock loop repeats a refused event for ever."""
         while True:
             subject, data = await self._event_queue.get()
             await self._send_event(subject, data)
@@ -275,7 +275,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
 
 
 class _NoTelemetry:
-    """Stand-in for the framework's tracer without an exporter: recording spans costs as much as the call itself."""
+    """Stand-in for the framework's tracer, whose spans cost as much as a call."""
 
     def __init__(self, **_names: Any) -> None:
         pass
@@ -288,7 +288,7 @@ _telemetry = framework.DeviceConnectTelemetry
 
 
 def _traced() -> bool:
-    """Return True when spans or metrics are recorded in this process, by our runtime or by the application."""
+    """Return True when spans or metrics are recorded in this process."""
     try:
         from opentelemetry import metrics, trace  # noqa: PLC0415 - an optional part of the framework
     except ImportError:
@@ -301,7 +301,7 @@ def _traced() -> bool:
 
 
 def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
-    """Return an ``@rpc`` method without the framework's log lines, spans and metrics while none of them is recorded.
+    """Return an ``@rpc`` method that logs, traces and counts only when recorded.
 
     The caller is where ``get_rpc_source_device`` looks for it, and failures are logged, as always.
     """

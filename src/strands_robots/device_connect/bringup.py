@@ -81,7 +81,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     link: LinkConfig | None = None,
     bringup_timeout: float = BRINGUP_TIMEOUT_S,
 ) -> Runtime:
-    """Serve a robot or a simulation on Device Connect; returns when it can be found and called.
+    """Serve a robot or a simulation; returns when it can be discovered and called.
 
     Args:
         robot: a simulation, a robot, any object that ``contract.adapt`` accepts, or a ready ``DeviceDriver``.
@@ -162,7 +162,7 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
     link: LinkConfig | None = None,
     bringup_timeout: float = BRINGUP_TIMEOUT_S,
 ) -> Runtime:
-    """:func:`init_device_connect` for programs without an event loop: the device lives on a thread of its own.
+    """Serve a robot as :func:`init_device_connect` does, on a thread of its own.
 
     The arguments are the same. End it with :func:`stop_device_connect`; at the latest the interpreter's end does.
 
@@ -233,7 +233,7 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
 
 
 def stop_device_connect(runtime: Any, within: float = 10.0) -> None:
-    """Take a device off the network: its departure is announced, its link and its thread are closed.
+    """Announce a device's departure, close its link and end its thread.
 
     Callable from any thread but the device's own loop; there, ``await runtime.shutdown()``. A device that is off
     already is no error. The robot is not halted: ask ``robot.halt`` first where it may move.
@@ -255,7 +255,7 @@ def stop_device_connect(runtime: Any, within: float = 10.0) -> None:
 
 
 def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
-    """Return the driver of ``robot``: itself, else by what the object is, else by ``peer_type``."""
+    """Return the driver of ``robot``, by its class, else by ``peer_type``."""
     if isinstance(robot, DeviceDriver):
         return robot
     if getattr(robot, "device_type", "") == "reachy_mini":
@@ -281,14 +281,14 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
 
 
 def default_id(robot: Any) -> str:
-    """Return ``<tool_name>-<8 hex>`` with a dash for each character that an id cannot have."""
+    """Return ``<tool_name>-<8 hex>``, with dashes for characters no id can have."""
     name = getattr(robot, "tool_name_str", "") or getattr(robot, "device_type", "")
     clean = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name))[:100].strip("-_") or "robot"
     return f"{clean}-{secrets.token_hex(4)}"
 
 
 def announceable(driver: DeviceDriver) -> None:
-    """Refuse a driver whose description JSON cannot carry, because it could not be discovered.
+    """Refuse a driver whose description JSON cannot carry: discovery would miss it.
 
     Raises:
         ValidationError: naming the functions and events to mend.
@@ -346,7 +346,7 @@ async def _announced(name: str, link: LinkConfig, messaging: Any) -> bool:
 
 
 async def _answers(name: str, link: LinkConfig, messaging: Any) -> bool:
-    """Return True when a device of this id answers a call; an unserved id is known at once."""
+    """Return True when a device of this id answers a call."""
     request = {"jsonrpc": "2.0", "id": "probe", "method": "requestRegistration", "params": {}}
     if link.is_peer:
         # At a meeting point peers learn of one another one by one; any other open link knows all its peers.
@@ -410,7 +410,7 @@ class _LastWarning(logging.Handler):
 
 
 def _listen_to_the_framework(name: str) -> _LastWarning:
-    """Return a handler on the runtime's logger; without any the framework writes to stderr itself."""
+    """Attach a handler to the runtime's logger, which would else write to stderr."""
     framework = logging.getLogger(f"device_connect_edge.device.{name}")
     for handler in framework.handlers:
         if isinstance(handler, _LastWarning):

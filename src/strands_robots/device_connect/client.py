@@ -1,4 +1,4 @@
-"""Client of a fleet for programs without an event loop: find devices, call, follow events, stop.
+"""Client of a fleet: find devices, call and stop them, follow their events.
 
 The command line and the agent tools use it. Its name (``source``) is self-declared, like that of every caller on
 Device Connect.
@@ -143,15 +143,15 @@ class FleetClient:
             self._loop.close()
 
     def peers(self, timeout: float = 2.0) -> list[Peer]:
-        """Return the devices that answer a probe, sorted by id; ends half a second after the last new one.
+        """Return the devices that answer a probe, sorted by id.
 
         Args:
-            timeout: seconds to wait for the first answer, and for all of them.
+            timeout: seconds at most; the collection ends half a second after the last new device.
         """
         return self.run(self._collect(timeout), timeout + 1.0)
 
     def known(self) -> tuple[str, ...]:
-        """Return the ids announced since the last call of :meth:`peers`, without those of departed devices."""
+        """Return the ids of live devices announced since the last :meth:`peers`."""
         return tuple(sorted(self._seen))
 
     def call(
@@ -166,12 +166,6 @@ class FleetClient:
             MessagingError: the network cannot carry the call.
         """
         return self.run(self._call(device, function, dict(params or {}), timeout), timeout + 3.0)
-
-    def request(self, device: str, data: bytes, timeout: float = 10.0) -> bytes:
-        """Send raw bytes on a device's command topic; return its raw reply. Raises :class:`MessagingError`."""
-        subject = self._subject(f"{device_id('device', device)}.cmd")
-        reply: bytes = self.run(self._messaging.request(subject, data, timeout=timeout), timeout + 1.0)
-        return reply
 
     def events(
         self, device: str = "*", timeout: float | None = None, ready: threading.Event | None = None
@@ -208,7 +202,7 @@ class FleetClient:
         return EventSubscription(self, self.run(self._subscribe(f"{name}.event.*", arrived), 5.0))
 
     def stop(self, device: str, timeout: float = 5.0) -> Envelope:
-        """Stop a device by ``stop``, or ``stopMotion`` where it has that; return its envelope, or an error.
+        """Stop a device by ``stop``, else ``stopMotion``; return its envelope.
 
         ``stopped`` is true only for an affirmative answer.
         """
@@ -283,7 +277,7 @@ class FleetClient:
         return _answer(name, verb, data)
 
     async def _unanswered(self, device: str, within: float, exc: Exception) -> Exception:
-        """Return the error for an unanswered call: no such device, a silent device, or a network that fails."""
+        """Return the error for an unanswered call."""
         if not self._messaging.is_connected:
             return exc
         if any(peer.id == device for peer in await self._collect(1.0)):

@@ -1,4 +1,4 @@
-"""Choice of a device's link from arguments and environment, and the opt-in to an unauthenticated one."""
+"""Choice of a device's link, and the opt-in to an unauthenticated one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NAMES_A_NETWORK = (
 
 
 def usual_link(tenant: str | None = None, port: int | None = None) -> LinkConfig:
-    """Return the link of a command or a tool without one: the network that the environment names, else this machine.
+    """Return the link that the environment names, else one on this machine alone.
 
     Args:
         tenant: ``TENANT`` by default.
@@ -64,7 +64,7 @@ def link_for(
 
 
 def transport_of(url: str) -> str:
-    """Return the transport of a URL: ``nats://`` and ``tls://`` are NATS, ``tcp/``, ``tls/`` and ``zenoh://`` Zenoh.
+    """Return the transport of a URL; ``tls://`` is NATS, ``tls/`` is Zenoh.
 
     Raises:
         ValidationError: none of these.
@@ -80,7 +80,7 @@ def transport_of(url: str) -> str:
 
 
 def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bool) -> bool:
-    """Return True when the device may run on a link without authentication, and log a warning then.
+    """Return True, and warn, when a device may run on an unauthenticated link.
 
     Args:
         allow_insecure: the caller's choice; None leaves it to ``DEVICE_CONNECT_ALLOW_INSECURE``.

@@ -1,4 +1,4 @@
-"""A safety controller on Device Connect: alone, or as a device that agents and operators find by name."""
+"""A safety controller on Device Connect, alone or as a device of its own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from strands_robots.utils import ValidationError, device_id, number, text
 
 
 def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
-    """Return a :class:`SafetyController` on ``link``, or on the network that the environment names.
+    """Return a :class:`SafetyController` on ``link``, else on the environment's.
 
     Further arguments are those of :class:`SafetyController`.
     """
@@ -27,7 +27,7 @@ def safety_controller(controller_id: str, link: LinkConfig | None = None, **opti
 
 
 def envelope(report: StopReport) -> Envelope:
-    """Return the report as an answer: an error unless every robot is known to have stopped."""
+    """Return the report as an answer, an error unless every robot stopped."""
     fields: dict[str, Any] = {
         "estop_id": report.estop_id,
         "stopped": {name: round(each.latency_ms, 3) for name, each in report.stopped.items()},
@@ -48,7 +48,7 @@ def envelope(report: StopReport) -> Envelope:
 
 
 class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
-    """The controller as a device. Its stops leave on the controller's own link, never on the runtime's."""
+    """The controller as a device; its stops leave on the controller's own link."""
 
     device_type = "safety_controller"
 

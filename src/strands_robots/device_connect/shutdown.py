@@ -1,4 +1,4 @@
-"""The orderly end of a program: a signal to wait for, and how long the end of a device may take.
+"""The orderly end of a program: StopSignal, and the deadline of a thread.
 
 Importing this module needs no extra.
 """
@@ -15,9 +15,10 @@ LOOP_JOIN_TIMEOUT_S = 5.0
 
 
 class StopSignal:
-    """Within this context the first SIGINT or SIGTERM ends :meth:`wait`; a second one acts as it did before.
+    """Context in which the first SIGINT or SIGTERM ends :meth:`wait`.
 
-    Signal handlers exist in the main thread only; elsewhere entering raises ``ValueError``.
+    A second signal acts as before. Signal handlers exist in the main thread only; elsewhere entering raises
+    ``ValueError``.
 
     ::
 
@@ -43,7 +44,7 @@ class StopSignal:
         self._restore()
 
     def wait(self, within: float | None = None) -> int | None:
-        """Return the number of the signal, or None when ``within`` seconds passed without one."""
+        """Return the number of the signal, or None after ``within`` seconds."""
         # On some platforms a signal handler does not interrupt an untimed wait on a lock.
         left = within
         while not self._received.wait(0.2 if left is None else min(0.2, max(left, 0))):

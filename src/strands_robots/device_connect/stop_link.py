@@ -1,4 +1,4 @@
-"""The e-stop listener's own connections to Device Connect: one Zenoh session or one NATS connection for each link.
+"""The e-stop listener's own connections to Device Connect, over Zenoh or NATS.
 
 They take the configuration of a device's link and nothing else of it: no session, loop, queue or lock is shared.
 """
@@ -45,7 +45,7 @@ def stop_link(link: LinkConfig) -> StopLink:
 
 
 def _apart(link: LinkConfig) -> LinkConfig:
-    """Return ``link`` without what one session alone can have: the meeting port, and ports that are listened on.
+    """Return ``link`` without the ports that only one session can listen on.
 
     The e-stop listener joins the others there and listens on ports of its own, of which they learn by gossip.
     """
@@ -59,7 +59,7 @@ def _apart(link: LinkConfig) -> LinkConfig:
 
 
 def _from_here(endpoint: str) -> str:
-    """Return the endpoint at which this machine dials what it listens on; the certificate's name is not checked."""
+    """Return the endpoint at which this machine dials its own listener."""
     host, _, port = endpoint.rpartition(":")
     scheme, _, name = host.partition("/")
     local = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}.get(name, name)
@@ -80,7 +80,7 @@ class _State:
 
 
 class ZenohStopLink:
-    """A Zenoh session of its own; callbacks run on Zenoh's receiving threads and only hand over."""
+    """Stop link over a Zenoh session; its callbacks run on Zenoh's threads."""
 
     def __init__(self, link: LinkConfig) -> None:
         self._link = _apart(link)
@@ -110,7 +110,7 @@ class ZenohStopLink:
         _OPEN.add(self)
 
     def renew(self) -> None:
-        """Open another session, and close the one before it once both have carried what was sent for a while.
+        """Open another session, and close the present one after an overlap.
 
         The work is done on a thread; a call while that thread still works does nothing.
         """
@@ -210,7 +210,7 @@ class ZenohStopLink:
 
 
 class NatsStopLink:
-    """A NATS connection of its own, on an event loop and a thread of its own."""
+    """Stop link over a NATS connection, on a thread and an event loop of its own."""
 
     def __init__(self, link: LinkConfig) -> None:
         self._link = link
@@ -286,7 +286,7 @@ class NatsStopLink:
                 await client.close()
 
     async def _connected(self, client: Any, end: asyncio.Event) -> bool:
-        """Try once, as long as the link is wanted; False after a pause when it did not come up."""
+        """Try once to connect; False, after a pause, when it failed."""
 
         async def back() -> None:
             self._state.set(True)

@@ -1,4 +1,4 @@
-"""Telemetry of a device: the events of a rollout from the control thread to the loop, and periodic updates."""
+"""Telemetry of a device: the events of a rollout, and periodic updates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CATCH_UP_AT_START = 2.0
 
 
 def numbers(values: object) -> dict[str, float]:
-    """The finite numbers of a mapping, by name; a joint given as ``{"position": x, ...}`` counts by its position."""
+    """Return the finite numbers of a mapping; ``{"position": x}`` counts as ``x``."""
     if not isinstance(values, Mapping):
         return {}
     return base.numbers(
@@ -35,7 +35,7 @@ def numbers(values: object) -> dict[str, float]:
 
 
 class Throttle:
-    """At most ``hz`` passes a second for each key, and :data:`CATCH_UP` at once after a pause."""
+    """At most ``hz`` passes a second for each key, :data:`CATCH_UP` after a pause."""
 
     def __init__(self, hz: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._hz = hz
@@ -57,7 +57,7 @@ class Throttle:
 
 
 class RolloutPump:
-    """Carries rollout events from control threads to one coroutine on the loop, in order.
+    """Carries rollout events from control threads to one coroutine, in order.
 
     Args:
         deliver: awaited once for each event.
@@ -74,7 +74,7 @@ class RolloutPump:
         self._dropped = 0
 
     def observe(self, event: RolloutEvent) -> None:
-        """Queue an event; the observer that a robot calls from its control thread. Returns at once and never raises."""
+        """Queue an event. Control thread; returns at once and never raises."""
         with self._lock:
             if event.kind == "step":
                 if not self._throttle.passes(event.robot):
@@ -103,9 +103,9 @@ class RolloutPump:
 
 
 async def paced(hz: Callable[[], float], act: Callable[[], Awaitable[None]], wake: asyncio.Event | None = None) -> None:
-    """Await ``act`` at ``hz()`` times a second until cancelled, and at once when ``wake`` is set.
+    """Await ``act`` ``hz()`` times a second, and at once when ``wake`` is set.
 
-    The beat is kept: what comes late is followed on time, and missed beats are left out, never made up for.
+    Ends when cancelled. A late turn is followed on time, and missed turns are left out.
     """
     loop = asyncio.get_running_loop()
     due = loop.time()

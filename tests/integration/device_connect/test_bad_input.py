@@ -13,6 +13,7 @@ from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import free_port
 
 from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.device_connect.backends import open_client
 from strands_robots.device_connect.client import CallRefusedError
 
 BAD_TEXT: list[Any] = ["", " ", "x" * 2001, "a\u0000b", "\n", None, 5, True, [], {}, ["x"]]
@@ -55,10 +56,12 @@ class Site:
             init_device_connect_sync(self.robot, peer_id="metal-1", link=link),
         ]
         self.fleet = FleetClient(link, "tester").__enter__()
+        self.client = self.fleet.run(open_client(link), 20.0)
 
     def raw(self, device: str, data: bytes, within: float = 20.0) -> dict[str, Any]:
         """Send ``data`` as it is on a device's command topic; the decoded reply."""
-        return json.loads(self.fleet.request(device, data, within))  # type: ignore[no-any-return]
+        request = self.client.request(f"device-connect.default.{device}.cmd", data, timeout=within)
+        return json.loads(self.fleet.run(request, within + 1.0))  # type: ignore[no-any-return]
 
     def refusal(self, device: str, function: str, params: dict[str, Any]) -> str:
         """Why the device refused, in its envelope or in JSON-RPC's own error."""
@@ -74,6 +77,7 @@ class Site:
         return bool(self.world.rollouts or self.robot.rollouts)
 
     def close(self) -> None:
+        self.fleet.run(self.client.close(), 20.0)
         self.fleet.close()
         for runtime in self.runtimes:
             stop_device_connect(runtime)

@@ -1,38 +1,23 @@
-"""A Zenoh and a NATS messaging backend for ``device_connect_edge``, wire-compatible with every bare peer and agent.
+"""Messaging backends for ``device_connect_edge`` over Zenoh and over NATS.
 
-Unlike the framework's own backends they serve commands concurrently and bounded, ``stop`` and reads never wait for
-motion, malformed commands are answered at once, puts and replies use no thread pool, peers may use mutual TLS or meet
-without multicast, and all runtimes of a process share one Zenoh session.
+They are wire-compatible with every bare peer and agent. Unlike the framework's own they serve commands concurrently and
+bounded, ``stop`` and reads never wait for motion, malformed commands are answered at once, peers may use mutual TLS or
+meet without multicast, and all runtimes of a process share one Zenoh session.
 
-A device::
-
-    from strands_robots.device_connect._compat import Runtime
-    from strands_robots.device_connect.backends import loopback_config
-
-    runtime = Runtime(driver=driver, device_id="arm-1", link=loopback_config(), allow_insecure=True)
-    task = asyncio.create_task(runtime.run())
-    await runtime.wait_ready(10.0)       # raises what run() raised, or TimeoutError
-    ...
-    await runtime.shutdown()             # ends a start that is still under way, too; leaves nothing open
-
-``Runtime`` is the framework's ``DeviceRuntime`` with our backend under it; see its docstring. ``runtime.messaging``
-is the connected client, ``runtime.emit_from_thread(name, payload)`` emits from any thread.
-
-A client without a device (command line, tools)::
+A device is served by :class:`strands_robots.device_connect._compat.Runtime`, the framework's runtime on our backend. A
+client without a device::
 
     client = await open_client(loopback_config())
-    answer = await client.request("device-connect.default.arm-1.cmd", payload, timeout=5.0)
+    reply = await client.request("device-connect.default.arm-1.cmd", payload, timeout=5.0)
     await client.close()
 
-A client serves commands by ``await client.serve(subject, serve)``, where ``serve(command, answer)`` carries a command
-out and gives the encoded reply (``jsonrpc.result`` or ``jsonrpc.error``) to ``dispatch.send(answer, reply)``; the
-framework's ``subscribe`` on a ``.cmd`` subject works, too.
+A client serves commands by ``await client.serve(subject, serve)``, where ``serve(command, answer)`` gives the encoded
+reply (``jsonrpc.result`` or ``jsonrpc.error``) to ``dispatch.send(answer, reply)``.
 
-Links: ``loopback_config()`` needs nothing and stays on this machine; ``link_from_environment()`` reads the
-framework's own variables (``ZENOH_CONNECT``, ``NATS_URL``, ``MESSAGING_TLS_*`` ...) as the framework does;
-``LinkConfig(...)`` says everything. ``link.authenticated`` is true where both sides prove their identity.
+Links: ``loopback_config()`` needs nothing and stays on this machine; ``link_from_environment()`` reads the framework's
+own variables (``ZENOH_CONNECT``, ``NATS_URL``, ``MESSAGING_TLS_*`` ...); ``LinkConfig(...)`` states everything.
 
-A stock ``DeviceRuntime`` may use them as well: after ``register()``, ``messaging_backend="strands-zenoh"`` or
+A stock ``DeviceRuntime`` may use the backends as well: after ``register()``, ``messaging_backend="strands-zenoh"`` or
 ``"strands-nats"``; ``register(link)`` returns the name for one particular link.
 """
 
@@ -73,7 +58,7 @@ def backend_for(link: LinkConfig, *, open_ended: bool = False) -> Backend:
 
 
 def register(link: LinkConfig | None = None) -> str:
-    """Make the backends known to the framework; return the name to give as ``messaging_backend``.
+    """Register the backends; return the name to give as ``messaging_backend``.
 
     Args:
         link: with it, the returned name stands for exactly this link. Without it, ``strands-zenoh`` and

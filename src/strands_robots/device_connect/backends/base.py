@@ -1,4 +1,4 @@
-"""The parts of a messaging client that Zenoh and NATS share: subscriptions, served commands, owed replies."""
+"""Base of the messaging clients: subscriptions, served commands, owed replies."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         queue: str | None = None,
         subscribe_only: bool = False,
     ) -> Subscription:
-        """Have ``callback(data, reply_subject)`` called; one subject ending in ``.cmd`` is served concurrently.
+        """Have ``callback(data, reply_subject)`` called; ``.cmd`` is served concurrently.
 
         Raises:
             NotConnectedError: not connected.
@@ -81,7 +81,7 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         return await self._consumed(subject, queue, feed, answers=not subscribe_only)
 
     async def serve(self, subject: str, serve: Serve) -> Subscription:
-        """Have every command on ``subject`` carried out and answered by ``serve``, concurrently.
+        """Have every command on ``subject`` answered by ``serve``, concurrently.
 
         Raises:
             NotConnectedError: not connected.
@@ -96,7 +96,7 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         queue: str | None = None,
         subscribe_only: bool = False,
     ) -> Subscription:
-        """``subscribe`` whose callback also gets the subject that matched: ``callback(data, subject, reply)``."""
+        """Have ``callback(data, subject, reply)`` called with the subject that matched."""
         feed = OrderedFeed(subject, callback, self._call_soon)
         return await self._consumed(subject, queue, feed, answers=not subscribe_only, with_subject=True)
 
@@ -142,7 +142,7 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         answers: bool = True,
         with_subject: bool = False,
     ) -> Undo:
-        """Have the consumer get what comes on ``subject``; with ``answers`` it is asked by queries, too."""
+        """Feed the consumer from ``subject``, with ``answers`` also from queries."""
         raise NotImplementedError
 
     @staticmethod
@@ -155,5 +155,5 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         raise NotImplementedError
 
     def _call_soon(self, function: Callable[[], None]) -> None:
-        """Have ``function`` called on the client's loop; from any thread on which messages arrive."""
+        """Have ``function`` called on the loop; from threads on which messages arrive."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Configuration of a link to Device Connect: endpoints, scouting, certificates, credentials, deadlines."""
+"""Configuration of a link: endpoints, certificates, credentials, deadlines."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class LinkConfig:
         if bool(self.cert) != bool(self.key):
             raise ValidationError("a certificate needs its key and a key its certificate; one of them is missing")
         if self.cert and not self.ca:
-            raise ValidationError("a certificate needs ca, the authority that the far side is checked against")
+            raise ValidationError("a certificate needs ca, the authority that the other side is checked against")
         if bool(self.jwt) != bool(self.nkey_seed):
             raise ValidationError("jwt needs nkey_seed and nkey_seed needs jwt; one of them is missing")
 
@@ -99,7 +99,7 @@ class LinkConfig:
 
     @property
     def authenticated(self) -> bool:
-        """True when both sides prove who they are: mutual TLS, or credentials that a NATS server checks."""
+        """True with mutual TLS, or with credentials that a NATS server checks."""
         if self.transport == "nats":
             return bool(self.jwt or self.cert or any("@" in url for url in self.connect))
         return bool(self.ca and self.cert)
@@ -148,7 +148,7 @@ class LinkConfig:
         credentials: Mapping[str, Any] | None,
         tls: Mapping[str, Any] | None,
     ) -> LinkConfig:
-        """Return this link, with what it leaves open taken from the framework's ``connect`` arguments."""
+        """Return this link, its open fields filled from the arguments of ``connect``."""
         link = self
         if servers and not (link.connect or link.listen or link.meet_port):
             link = replace(link, connect=endpoints(servers))
@@ -215,14 +215,14 @@ class LinkConfig:
         return config
 
     def _session_id(self) -> str:
-        """Return a fresh Zenoh id; a link without a stated endpoint to listen on gets a greater one.
+        """Return a fresh Zenoh id, a greater one where no listen endpoint is stated.
 
         Such a peer may be behind a firewall, and the greater id dials. The last byte counts most.
         """
         return f"51{secrets.token_hex(14)}{'01' if self.listen else 'ff'}"
 
     def _dials_peers(self) -> str:
-        """Return Zenoh's strategy for two peers that learn of each other by gossip: only the greater id dials.
+        """Return Zenoh's dialling strategy: of two peers only the greater id dials.
 
         If both dialled, one transport would hold two links. When one of them expires on one side first, the peers
         meet again without their subscriptions, for good (eclipse-zenoh/zenoh issue 2806, open in 1.10). With
@@ -246,18 +246,19 @@ class LinkConfig:
 
 
 def loopback_config(meet_port: int | None = None, tenant: str = "default") -> LinkConfig:
-    """Return a link for any number of processes on this machine, which find each other without configuration.
+    """Return a link for any number of processes on this machine.
 
-    The first process listens on ``meet_port`` (default: ``STRANDS_DC_PORT``); the others connect to it and learn of
-    each other there. When the process that has the port goes, another takes it over within seconds. A bare agent
-    joins with ``ZENOH_CONNECT=tcp/127.0.0.1:PORT DEVICE_CONNECT_DISCOVERY_MODE=d2d``. Nothing leaves the machine.
+    They need no configuration: the first process listens on ``meet_port`` (default: ``STRANDS_DC_PORT``), the others
+    connect to it and learn of each other there. When the process that has the port goes, another takes it over within
+    seconds. A bare agent joins with ``ZENOH_CONNECT=tcp/127.0.0.1:PORT DEVICE_CONNECT_DISCOVERY_MODE=d2d``. Nothing
+    leaves the machine.
     """
     meet = settings.integer("STRANDS_DC_PORT") if meet_port is None else meet_port
     return LinkConfig(mode="peer", meet_port=meet, multicast=False, tenant=tenant)
 
 
 def link_from_environment(tenant: str = "default", transport: str | None = None) -> LinkConfig:
-    """Return the link that the framework's own variables describe; a multicast peer when none is set.
+    """Return the link of the framework's own variables, else a multicast peer.
 
     Raises:
         ValidationError: an unknown backend, or a credentials file that cannot be read.
@@ -292,7 +293,7 @@ def link_from_environment(tenant: str = "default", transport: str | None = None)
 
 
 def endpoints(servers: Sequence[str]) -> tuple[str, ...]:
-    """Return Zenoh endpoints for URLs in any of the framework's spellings; ``zenoh://`` alone means none."""
+    """Return Zenoh endpoints for the framework's URLs; ``zenoh://`` means none."""
     found = []
     for server in (each.strip() for each in servers):
         scheme, _, rest = server.partition("://")
@@ -313,7 +314,7 @@ def host_of(endpoint: str) -> str:
 
 
 def _check_zenoh(name: str, endpoint: str) -> None:
-    """Refuse an endpoint that no attempt could reach: ``tcp/host:port`` is the form; serial and sockets pass.
+    """Refuse an endpoint unlike ``tcp/host:port``; serial ports and sockets pass.
 
     Raises:
         ValidationError: naming ``name``, the value and the domain.
@@ -328,7 +329,7 @@ def _check_zenoh(name: str, endpoint: str) -> None:
 
 
 def _check_nats(name: str, url: str) -> None:
-    """Refuse a URL that no attempt could reach: ``nats://host:port`` is the form; the port may be left out.
+    """Refuse a URL unlike ``nats://host:port``, of which the port may be left out.
 
     Raises:
         ValidationError: naming ``name``, the value and the domain.
@@ -393,7 +394,7 @@ def _credentials_file() -> dict[str, Any]:
 
 
 def _armoured(text: str) -> dict[str, str]:
-    """Return token and seed of a NATS ``.creds`` file: each is the block between its BEGIN and END line."""
+    """Return token and seed of a NATS ``.creds`` file, each between BEGIN and END."""
     blocks: dict[str, str] = {}
     title = ""
     for line in (each.strip() for each in text.splitlines()):

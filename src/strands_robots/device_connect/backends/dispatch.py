@@ -1,4 +1,4 @@
-"""From a transport's thread to handlers on an event loop: commands side by side, events in order.
+"""Hand-over from a transport's thread to handlers on an event loop.
 
 This module knows no transport. All queues are bounded, and a flood costs one log line a second.
 """
@@ -80,7 +80,7 @@ class Throttled:
 
 
 class Backlog:
-    """A bounded queue from any thread to one loop; one wake-up serves all that arrives meanwhile.
+    """A bounded queue from any thread to one loop, with one wake-up for a batch.
 
     Args:
         wake: called by the thread that puts the first message of a batch.
@@ -96,7 +96,7 @@ class Backlog:
         self._lock = threading.Lock()
 
     def offer(self, message: Any, size: int = 0) -> bool:
-        """Add a message of ``size`` bytes; False where it has no room."""
+        """Add a message of ``size`` bytes; False at capacity."""
         with self._lock:
             if len(self._waiting) >= self._messages or self._bytes + size > self._size:
                 return False
@@ -106,7 +106,7 @@ class Backlog:
         return True
 
     def push(self, message: Any, size: int = 0) -> int:
-        """Add a message in place of the oldest ones where it has no room; the number of those."""
+        """Add a message; return the number of oldest ones dropped for it."""
         dropped = 0
         with self._lock:
             asleep = self._add(message, size)
@@ -118,7 +118,7 @@ class Backlog:
         return dropped
 
     def take(self) -> Any:
-        """Remove and return the oldest message; None, and a wake-up for the next one, when there is none."""
+        """Remove and return the oldest message; without one, None, and wake up again."""
         with self._lock:
             if not self._waiting:
                 self._awake = False
@@ -135,7 +135,7 @@ class Backlog:
 
 
 class CommandServer:
-    """Serves one device's commands, each in a task of its own, so that none waits for another.
+    """Serves one device's commands, each in a task of its own.
 
     Args:
         subject: for the log.
@@ -167,7 +167,7 @@ class CommandServer:
         self._closed = False
 
     def receive(self, message: Any) -> None:
-        """Take a message for the loop, or answer 'busy' while the loop is held up. On the receiving thread."""
+        """Queue a message, or answer 'busy' at capacity. On the receiving thread."""
         data, reply = self._read(message)
         size = 0 if isinstance(data, int) else len(data)
         if not self._backlog.offer((data, reply), size) and reply is not None:
@@ -240,7 +240,7 @@ class PendingReplies:
         return len(self._answers) >= MAX_ARRIVED
 
     def expect(self, answer: Answer, within_s: float = math.inf) -> str:
-        """Remember how to answer a caller, for ``within_s`` seconds; the subject that stands for it. Any thread."""
+        """Keep an answer for ``within_s`` seconds; return its subject. Any thread."""
         subject, now = f"{REPLY_SUBJECT}{next(self._numbers)}", time.monotonic()
         with self._lock:
             if within_s < math.inf:
@@ -250,7 +250,7 @@ class PendingReplies:
         return subject
 
     def take(self, subject: str) -> Answer | None:
-        """Remove and return what :meth:`expect` remembered; None when it was answered or given up."""
+        """Remove and return an answer; None when it was used or has expired."""
         with self._lock:
             return self._answers.pop(subject, (None, 0.0))[0]
 
@@ -261,7 +261,7 @@ class PendingReplies:
 
 
 def relaying(handler: Handler, replies: PendingReplies) -> Serve:
-    """Serve commands by a handler that publishes its reply; the caller is answered even when it does not."""
+    """Serve commands by a handler that publishes its reply, else by an error."""
 
     async def relay(command: jsonrpc.RpcRequest, answer: Answer | None) -> None:
         if answer is None:
@@ -289,7 +289,7 @@ async def send(answer: Answer | None, data: bytes) -> None:
 
 
 def reserved(method: str) -> bool:
-    """Return True for stops and reads, which still have capacity when motion has filled the rest."""
+    """Return True for stops and reads, which have reserved capacity."""
     return method.startswith(("stop", "get", "list", "describe")) or method in ("emergencyStop", "requestRegistration")
 
 
@@ -299,7 +299,7 @@ def _failure(command: jsonrpc.RpcRequest, problem: BaseException | None) -> byte
 
 
 class OrderedFeed:
-    """Serves one subscription's messages one after another, in the order of their arrival.
+    """Serves one subscription's messages one by one, in order of arrival.
 
     Args:
         subject: for the log.
@@ -342,7 +342,7 @@ class OrderedFeed:
 
 
 async def on_a_thread(function: Callable[[], Any], undo: Callable[[Any], None] | None = None) -> Any:
-    """Await ``function()`` on a thread of its own, for the rare calls that wait; a loop's pool would keep its threads.
+    """Await ``function()`` on a thread that ends with it, unlike a pool's.
 
     When the caller is cancelled meanwhile, a result is handed to ``undo``.
     """
@@ -398,7 +398,7 @@ def start_now(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
 
 
 class _Started(Coroutine[Any, Any, None]):
-    """A coroutine that has taken its first step; a task that steps it first gets that step's outcome."""
+    """A coroutine that took its first step, and replays its outcome to the task."""
 
     __slots__ = ("_work", "first")
 
@@ -416,7 +416,7 @@ class _Started(Coroutine[Any, Any, None]):
         return waits_for
 
     def throw(self, *error: Any) -> Any:
-        """Raise inside the coroutine; a task that is cancelled before its first step cancels what it waits for."""
+        """Raise inside the coroutine, and cancel the future that it waits for."""
         (waits_for, end), self.first = self.first or (None, None), None
         if end is not None:
             raise end

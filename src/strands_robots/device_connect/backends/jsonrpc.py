@@ -59,12 +59,12 @@ class Refusal:
 
 
 def error(rpc_id: RpcId, code: int, reason: str) -> bytes:
-    """An encoded JSON-RPC error reply."""
+    """Encode a JSON-RPC error reply."""
     return json.dumps({"jsonrpc": "2.0", "id": rpc_id, "error": {"code": code, "message": reason}}).encode()
 
 
 def result(rpc_id: RpcId, value: object) -> bytes:
-    """An encoded JSON-RPC result, or the error that a value with NaN or Infinity in it is owed.
+    """Encode a JSON-RPC result; NaN and Infinity become an error.
 
     Raises:
         TypeError, ValueError: the value has no JSON at all.
@@ -73,7 +73,7 @@ def result(rpc_id: RpcId, value: object) -> bytes:
 
 
 def sendable(reply: bytes, size_max: int | None = None) -> bytes:
-    """Return ``reply``, or the error that stands for one too large or with NaN or Infinity in it."""
+    """Return ``reply``, or an error where it is too large or holds NaN or Infinity."""
     if size_max is not None and len(reply) > size_max:
         reason = f"the result has {len(reply)} bytes and the NATS server takes at most {size_max}"
         return error(_id_of(reply), INTERNAL_ERROR, reason)
@@ -103,7 +103,7 @@ def too_large(size: int) -> Refusal:
 
 
 def valid_json(data: bytes) -> bool:
-    """False when ``data`` holds NaN or Infinity, which Python writes and JSON forbids."""
+    """Return False when ``data`` holds NaN or Infinity, which JSON forbids."""
     if b"NaN" not in data and b"Infinity" not in data:
         return True
     try:
@@ -159,7 +159,7 @@ def _params_problem(params: object) -> str:
 
 
 def _deeper_than(value: object, limit: int) -> bool:
-    """True when ``value`` nests deeper; walks level by level, so depth costs no stack."""
+    """Return True when ``value`` nests deeper; uses no stack."""
     level: list[object] = [value]
     for _ in range(limit):
         level = [

@@ -1,4 +1,4 @@
-"""Device Connect over NATS: the framework's wire, with commands side by side and a connect that ends.
+"""Device Connect over NATS, on the framework's wire.
 
 A ``nats-py`` client belongs to one event loop and a device's credentials to one device, so each client has a connection
 of its own: one descriptor, no thread, some 0.3 MB.

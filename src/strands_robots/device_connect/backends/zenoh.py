@@ -1,4 +1,4 @@
-"""Device Connect over Zenoh: the framework's wire, without its thread pool and its queue of commands.
+"""Device Connect over Zenoh, on the framework's wire.
 
 The wire is that of the framework's own adapter: subjects become key expressions, a command is a Zenoh query on the
 device's ``cmd`` key whose payload is the JSON-RPC request, its reply carries the JSON-RPC response, events are puts.
@@ -53,14 +53,14 @@ _QUERY_OF_A_PEER = {**_QUERY, "target": zenoh.QueryTarget.ALL}
 
 @lru_cache(maxsize=1024)
 def key_of(subject: str) -> str:
-    """Return the key expression for a dotted subject; one with a slash in it is a key expression already."""
+    """Return the key expression for a dotted subject, or the key that it is."""
     if "/" in subject:
         return subject
     return "/".join("**" if token == ">" else token for token in subject.split("."))
 
 
 class ZenohBackend(Backend):
-    """A messaging client on a shared session. Everything but Zenoh's callbacks runs on the loop that connected."""
+    """A messaging client on a shared session; runs on the loop that connected."""
 
     def __init__(self, link: LinkConfig, *, open_ended: bool = False) -> None:
         super().__init__(link, open_ended=open_ended)
@@ -145,7 +145,7 @@ class ZenohBackend(Backend):
         raise NoResponderError(f"no device answers on {subject}")
 
     async def close(self) -> None:
-        """Undeclare everything and give the session back; the last of the process closes it."""
+        """Undeclare everything and release the session."""
         self._closed = True
         shared, self._shared = self._shared, None
         await self._unsubscribe_all()
@@ -158,7 +158,7 @@ class ZenohBackend(Backend):
 
     @property
     def is_connected(self) -> bool:
-        """True while messages can leave: a peer's session is open, a client has its router."""
+        """True for an open peer, and for a client that has its router."""
         return self._shared is not None and self._shared.linked
 
     @property
@@ -171,7 +171,7 @@ class ZenohBackend(Backend):
         return key_of(subject)
 
     def configure_d2d_retry(self, retries: int = 3, delay: float = 0.3) -> None:
-        """Set how often a peer asks again without an answer, and after how many seconds; the framework calls this."""
+        """Set a peer's retries of an unanswered request, and the seconds between."""
         self._tries, self._retry_delay = retries, delay
 
     def _connected(self) -> zenoh_session.SharedSession:
@@ -297,7 +297,7 @@ class ZenohBackend(Backend):
 
 
 class _Request:
-    """A query on its way: collects replies on Zenoh's thread and settles its future on the loop, once."""
+    """A pending query: replies come on Zenoh's thread, its future is settled once."""
 
     __slots__ = ("_outcomes", "answered", "failure", "future")
 
@@ -334,7 +334,7 @@ class _Request:
 
 
 def _reply_to(query: Any, data: bytes) -> None:
-    """Reply with the caller's own priority and let go of the query, which tells the caller that no more comes."""
+    """Reply with the caller's priority and end the query."""
     with contextlib.suppress(zenoh.ZError):  # the link to the caller is gone
         query.reply(query.key_expr, data)
     query.drop()

@@ -1,4 +1,4 @@
-"""One Zenoh session for each distinct link in the process, shared by every client and closed by the last.
+"""Zenoh sessions, one for each distinct link, shared by the process.
 
 Zenoh calls back on its own threads; a sink given here runs there and must only hand over. Callbacks are direct: the
 binding would otherwise start one Python thread for each subscriber, queryable and query.
@@ -44,7 +44,7 @@ _lock = threading.Lock()
 
 
 def acquire(link: LinkConfig) -> SharedSession:
-    """Return the process's session for ``link``, opened on first use. Blocks; call it off the event loop.
+    """Return the session for ``link``, opened on first use. Blocks.
 
     Raises:
         zenoh.ZError: the session cannot be opened.
@@ -63,7 +63,7 @@ def acquire(link: LinkConfig) -> SharedSession:
 
 
 def release(shared: SharedSession) -> None:
-    """Give a session back; the last one closes it. Blocks; call it off the event loop."""
+    """Release a session; the last user closes it. Blocks."""
     with _lock:
         shared.users -= 1
         if shared.users > 0:
@@ -81,18 +81,18 @@ def open_links() -> tuple[LinkConfig, ...]:
 
 
 def direct(sink: Sink, drop: Callable[[], None] | None = None) -> Any:
-    """Return a Zenoh handler that calls ``sink`` on the thread on which Zenoh received."""
+    """Return a handler that calls ``sink`` on Zenoh's receiving thread."""
     return zenoh.handlers.Callback(sink, drop, indirect=False)
 
 
 def undeclare(entity: Any) -> None:
-    """Undeclare a subscriber, queryable or listener; a session that was closed meanwhile has done it already."""
+    """Undeclare an entity, unless its session was closed meanwhile."""
     with contextlib.suppress(zenoh.ZError):
         entity.undeclare()
 
 
 class LinkedSession:
-    """An open Zenoh session, what is declared on it, and the ids of the sessions it is linked to.
+    """An open Zenoh session that knows the ids of the sessions it is linked to.
 
     Args:
         config: what ``zenoh.open`` takes.
@@ -114,7 +114,7 @@ class LinkedSession:
         self._declared.append(events)
 
     def subscribe(self, key: str, sink: Sink) -> None:
-        """Have ``sink(sample)`` called for every sample on ``key`` until the session closes."""
+        """Have ``sink(sample)`` called for every sample on ``key`` until the close."""
         self._declared.append(self.zenoh.declare_subscriber(key, direct(sink)))
 
     def close(self) -> None:
@@ -172,12 +172,12 @@ class SharedSession:
 
     @property
     def linked(self) -> bool:
-        """True when the session can send: a client while it has its router, a peer always."""
+        """True for an open peer, and for a client that has its router."""
         opened = self._linked_session
         return opened is not None and (self.link.is_peer or bool(opened.remotes))
 
     def watch(self, watcher: Callable[[bool], None]) -> None:
-        """Have ``watcher(linked)`` called, on Zenoh's thread, when the link is lost or back."""
+        """Have ``watcher(linked)`` called on Zenoh's thread at each change."""
         with self._lock:
             self._watchers.append(watcher)
 
