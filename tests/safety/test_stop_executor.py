@@ -39,6 +39,9 @@ class Wedged:
 class DirectWedged(Wedged):
     """The same, whose public halt goes through the executor."""
 
+    def halt_ordered(self) -> None:
+        return None
+
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
         return super().halt(reason)
 

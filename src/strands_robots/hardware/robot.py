@@ -286,9 +286,11 @@ class HardwareRobot(TeleopMixin):
         is started anew, and the robot was frozen. A bus that does not answer is ``not_stopped``, and the robot is
         frozen as soon as it does.
         """
-        # Before the permits are void: a loop that finds its permit void ends by itself, and was halted all the same.
-        self._moved.update(dict.fromkeys(self._moving()))
         return stop_executor().halt(self, self.tool_name_str, reason)
+
+    def halt_ordered(self) -> None:
+        """Note what moves: a loop that finds its permit void ends by itself, and was halted all the same."""
+        self._moved.update(dict.fromkeys(self._moving()))
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
         """Halt on the calling thread, the stop executor's; returns by ``deadline`` unless the bus blocks."""
@@ -449,6 +451,9 @@ class _TaskStop:
 
     body: DeviceBody
     task: Rollout
+
+    def halt_ordered(self) -> None:
+        """The caller has noted the task."""
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
         try:

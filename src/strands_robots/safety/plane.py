@@ -24,7 +24,7 @@ from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
 from strands_robots.safety.persistence import Kept, LockoutStore
 from strands_robots.safety.reporting import OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
-from strands_robots.safety.stop_executor import StopExecutor, stop_executor
+from strands_robots.safety.stop_executor import DirectTarget, StopExecutor, stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, identifier, shown
 
@@ -256,6 +256,8 @@ class SafetyPlane:
         fresh: list[Registered] = []
         for entry in robots:
             if entry.latch.engage(order.epoch, order.source, order.reason) is not None:
+                if isinstance(entry.robot, DirectTarget):
+                    entry.robot.halt_ordered()
                 for gate in entry.gates:
                     gate.revoke()
                 fresh.append(entry)

@@ -51,6 +51,9 @@ class DirectTarget(Protocol):
     blocks the first, such as its bus, would block the second.
     """
 
+    def halt_ordered(self) -> None:
+        """Note what moves, before permits are void. Must not block."""
+
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
         """Halt on the calling thread and return by ``deadline`` (monotonic seconds), unless the device blocks."""
 
@@ -255,9 +258,11 @@ class StopExecutor:
         stop.future.set_running_or_notify_cancel()
         if answered is not None:
             stop.future.add_done_callback(lambda future: answered(future.result()))
+        if isinstance(target, DirectTarget):
+            target.halt_ordered()
         gate = getattr(target, "gate", None)
-        if slot.running is not None and isinstance(gate, MotionGate):
-            # Its own halt, which voids permits after it has seen what moves, cannot begin yet.
+        if isinstance(gate, MotionGate) and (stop.direct or slot.running is not None):
+            # The halt of any other target voids permits itself, after it has seen what moves, unless it has to wait.
             gate.revoke()
         if slot in getattr(self._here, "serving", ()):
             # A halt that asks for itself again: this thread is the one that carries it out.
