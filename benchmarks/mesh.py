@@ -1,4 +1,4 @@
-"""The native mesh beside bare Zenoh: round trips, publishing, teleoperation, fleet stops, idle cost, import."""
+"""The mesh beside bare Zenoh: latency, rate, stops, idle cost and import."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class Child:
         )
         assert self._read() == {"ready": True}
 
-    def ask(self, word: str = "") -> Any:
+    def ask(self, command: str = "") -> Any:
         assert self._process.stdin is not None
-        self._process.stdin.write(word + "\n")
+        self._process.stdin.write(command + "\n")
         self._process.stdin.flush()
         return self._read()
 
@@ -100,7 +100,7 @@ def run(quick: bool = False) -> list[Row]:
 
 def pings(console: Mesh, session: Any, shared: dict[str, str], count: int) -> list[Row]:
     answered = threading.Event()
-    heard = session.declare_subscriber(
+    subscriber = session.declare_subscriber(
         "strands/bench/answer", lambda sample: (json.loads(sample.payload.to_bytes()), answered.set())
     )
     ours: list[float] = []
@@ -120,7 +120,7 @@ def pings(console: Mesh, session: Any, shared: dict[str, str], count: int) -> li
                 assert answered.wait(2)
                 bare.append((time.perf_counter() - started) * 1000)
         assert peer.ask("alive")
-    heard.undeclare()
+    subscriber.undeclare()
     mine, raw = statistics.median(ours), statistics.median(bare)
     ratio = mine / raw
     return [Row("ping round trip, p50", f"{mine:.3f} ms", f"{raw:.3f} ms", ratio, "at most 2.0", ratio <= 2.0)]
@@ -159,7 +159,7 @@ def teleoperation(console: Mesh, session: Any, echo: Child, shared: dict[str, st
     follower, leader = Child("follow", "console", **shared), Counter()
     publisher = InputPublisher(console, leader, hz=50)
     bare_sent: dict[int, float] = {}
-    time.sleep(0.5)  # a frame that is sent before the hub has heard of the follower is not a lost one
+    time.sleep(0.5)  # a frame that is sent before the hub knows the follower is not a lost one
     publisher.start()
     for number in range(seconds * 50):
         bare_sent[number] = time.time()
@@ -178,8 +178,8 @@ def teleoperation(console: Mesh, session: Any, echo: Child, shared: dict[str, st
     guards = {why: stats[why] for why in ("out_of_order", "rate_dropped", "slew_rejected", "rejected") if stats[why]}
     where = f": {guards or 'never arrived'}" if lost else ""
     what = f"leader to applied action at 50 Hz for {seconds} s, p99 ({lost} of {sent} lost{where})"
-    kept = mine <= 2 * raw + 1 and lost == 0
-    return Row(what, f"{mine:.2f} ms", f"{raw:.2f} ms", mine / raw, "at most 2 x + 1 ms, none lost", kept)
+    passed = mine <= 2 * raw + 1 and lost == 0
+    return Row(what, f"{mine:.2f} ms", f"{raw:.2f} ms", mine / raw, "at most 2 x + 1 ms, none lost", passed)
 
 
 def stops(console: Mesh, shared: dict[str, str], state: str, count: int) -> list[Row]:
@@ -227,7 +227,7 @@ def _after_hub_loss(state: str) -> float:
 
 
 def losses(state: str) -> list[Row]:
-    """From the death of a process to what the others make of it: a child by its hub, and a hub by its children."""
+    """Seconds from the death of a process until the others notice it."""
     shared = {"STRANDS_MESH_PORT": str(free_port())}
     with ExitStack() as stack:
 
@@ -263,7 +263,7 @@ def _stop_row(what: str, took: float, most: float) -> Row:
 
 
 def presence(seconds: int) -> Row:
-    """A hundred peers at 2 Hz over real Zenoh from another process; the CPU time of all of one listener's threads."""
+    """CPU time of a listener to a hundred peers of another process at 2 Hz."""
     shared = {"STRANDS_MESH_PORT": str(free_port())}
     with ExitStack() as stack:
         listener = Child("listen", **shared)

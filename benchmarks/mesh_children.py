@@ -1,4 +1,4 @@
-"""The other end of the mesh's measurements: a raw Zenoh echo, and processes of many peers.
+"""The remote side of the mesh's measurements: an echo, and many peers.
 
 ``python -m benchmarks.mesh_children echo PORT`` answers what it hears on ``strands/bench/ask`` and tells when
 each input frame arrived; ``fleet PREFIX COUNT`` joins that many peers, ``follow LEADER`` follows one, ``crowd COUNT``
@@ -99,7 +99,7 @@ def follow(source: str) -> None:
 
 
 def crowd(count: str) -> None:
-    """Presence of that many peers, each at 2 Hz, evenly spread, from one bare session."""
+    """Publish the presence of many peers, each at 2 Hz, from one session."""
     import zenoh  # noqa: PLC0415 - only this role needs it
 
     endpoint = f"tcp/127.0.0.1:{os.environ['STRANDS_MESH_PORT']}"
@@ -124,7 +124,7 @@ def crowd(count: str) -> None:
 
 
 def listen() -> None:
-    """A peer without a robot that tells the CPU seconds of all its threads, and how many peers it sees."""
+    """Run a peer that reports its CPU seconds and the number of peers it sees."""
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - only this role needs it
 
     mesh = init_mesh(None, "listener")

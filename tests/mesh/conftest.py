@@ -16,7 +16,7 @@ from strands_robots.mesh import safety
 def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patient_halts: None) -> Iterator[Fleet]:
     monkeypatch.setenv("STRANDS_MESH_AUDIT_DIR", str(tmp_path / "audit"))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path / "state"))
-    # Who is there answers when a busy machine lets it; a test with somebody who never does has less patience.
+    # A peer answers when a busy machine lets it; a test with a peer that never does shortens this.
     monkeypatch.setattr(safety, "COLLECT_S", 20.0)
     monkeypatch.setattr(input_module, "_INPUT_JOIN_TIMEOUT_S", 20.0)
     with fleet(tmp_path) as joined:

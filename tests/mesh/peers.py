@@ -21,7 +21,7 @@ Message = dict[str, Any]
 
 
 class Clock:
-    """Seconds that pass only when told to, from the real time on."""
+    """Seconds that pass only when a test says so, from the real time on."""
 
     def __init__(self) -> None:
         self.at = time.time()
@@ -41,7 +41,7 @@ class RealClock(Clock):
 
 
 class Fleet:
-    """Peers in one process, each as if alone in a process of its own: own session, registry and safety plane."""
+    """Peers of one process, each with a session, registry and plane of its own."""
 
     def __init__(self, folder: Path, clock: Clock | None = None) -> None:
         self.bus = MemoryBus()
@@ -116,7 +116,7 @@ def received(peers: Fleet, key: str) -> list[Message]:
 
 
 class ScriptedPeer:
-    """A peer in the field: it serves one command of a turn, and answers after ``seconds``."""
+    """A peer that serves one command of a turn and answers after ``seconds``."""
 
     def __init__(
         self,
@@ -132,9 +132,9 @@ class ScriptedPeer:
         self.wire = peers.stranger()
         self.wire.put(f"strands/{name}/presence", {"robot_id": name, "timestamp": peers.clock()})
         for key in ("strands/broadcast", f"strands/{name}/cmd"):
-            self.wire.declare_subscriber(key, self.asked)
+            self.wire.declare_subscriber(key, self.on_command)
 
-    def asked(self, sample: Any) -> None:
+    def on_command(self, sample: Any) -> None:
         body = json.loads(sample.payload)
         again = body["turn_id"] in self.turns
         first = self.first if not self.turns else None

@@ -46,62 +46,62 @@ def repairing() -> list[threading.Thread]:
 
 
 def test_presence_goes_both_ways_and_state_stays_local(buses: tuple[MemoryBus, MemoryBus]) -> None:
-    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
-    heard: list[tuple[str, str]] = []
-    near.declare_subscriber("strands/**", lambda sample: heard.append(("near", sample.key)))
-    far.declare_subscriber("strands/**", lambda sample: heard.append(("far", sample.key)))
+    both, local, cloud = bridge(buses), on(buses[0]), on(buses[1])
+    received: list[tuple[str, str]] = []
+    local.declare_subscriber("strands/**", lambda sample: received.append(("local", sample.key)))
+    cloud.declare_subscriber("strands/**", lambda sample: received.append(("cloud", sample.key)))
     both.put("strands/a/presence", {"x": 1})
     both.put("strands/a/state", {"x": 1})
-    assert heard == [("near", "strands/a/presence"), ("far", "strands/a/presence"), ("near", "strands/a/state")]
+    assert received == [("local", "strands/a/presence"), ("cloud", "strands/a/presence"), ("local", "strands/a/state")]
 
 
 def test_a_command_that_comes_by_both_legs_is_served_once(buses: tuple[MemoryBus, MemoryBus]) -> None:
-    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
+    both, local, cloud = bridge(buses), on(buses[0]), on(buses[1])
     served: list[str] = []
     both.declare_subscriber("strands/a/cmd", lambda sample: served.append(sample.key))
     body = {"sender_id": "x", "turn_id": "t", "command": {"action": "stop"}, "timestamp": 1.0}
-    near.put("strands/a/cmd", body)
-    far.put("strands/a/cmd", {**body, "timestamp": 2.0})
+    local.put("strands/a/cmd", body)
+    cloud.put("strands/a/cmd", {**body, "timestamp": 2.0})
     assert len(served) == 1
-    far.put("strands/a/cmd", {**body, "turn_id": "u"})
+    cloud.put("strands/a/cmd", {**body, "turn_id": "u"})
     assert len(served) == 2
 
 
 def test_stop_goes_to_the_broker_without_its_session(
     buses: tuple[MemoryBus, MemoryBus],
 ) -> None:
-    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
-    heard: dict[str, dict[str, Any]] = {}
-    near.declare_subscriber("strands/safety/estop", lambda sample: heard.update(near=json.loads(sample.payload)))
-    far.declare_subscriber("strands/safety/estop", lambda sample: heard.update(far=json.loads(sample.payload)))
+    both, local, cloud = bridge(buses), on(buses[0]), on(buses[1])
+    received: dict[str, dict[str, Any]] = {}
+    local.declare_subscriber("strands/safety/estop", lambda sample: received.update(local=json.loads(sample.payload)))
+    cloud.declare_subscriber("strands/safety/estop", lambda sample: received.update(cloud=json.loads(sample.payload)))
     both.put("strands/safety/estop", {"peer_id": "a", "t": 1.0, "source_zid": both.session_id})
-    assert heard == {
-        "near": {"peer_id": "a", "t": 1.0, "source_zid": both.session_id},
-        "far": {"peer_id": "a", "t": 1.0},
+    assert received == {
+        "local": {"peer_id": "a", "t": 1.0, "source_zid": both.session_id},
+        "cloud": {"peer_id": "a", "t": 1.0},
     }
 
 
 def test_message_of_a_local_peer_is_dropped_from_the_cloud_leg(buses: tuple[MemoryBus, MemoryBus]) -> None:
-    both, near, far = bridge(buses), on(buses[0]), on(buses[1])
-    heard: list[tuple[str, str | None]] = []
-    both.declare_subscriber("strands/*/presence", lambda sample: heard.append((sample.key, sample.session)))
+    both, local, cloud = bridge(buses), on(buses[0]), on(buses[1])
+    received: list[tuple[str, str | None]] = []
+    both.declare_subscriber("strands/*/presence", lambda sample: received.append((sample.key, sample.session)))
     for number, peer in enumerate(["a", "b"]):
         if number == 0:
-            near.put(f"strands/{peer}/presence", {"x": 1})
-        far.put(f"strands/{peer}/presence", {"x": 1})
-    assert heard == [("strands/a/presence", near.session_id), ("strands/b/presence", far.session_id)]
+            local.put(f"strands/{peer}/presence", {"x": 1})
+        cloud.put(f"strands/{peer}/presence", {"x": 1})
+    assert received == [("strands/a/presence", local.session_id), ("strands/b/presence", cloud.session_id)]
 
 
 def test_peer_silent_on_the_local_leg_is_no_longer_local() -> None:
     clock = Clock()
-    near = LocalPeers(clock)
-    near.note("a")
-    assert "a" in near
+    local = LocalPeers(clock)
+    local.note("a")
+    assert "a" in local
     clock.pass_(4)
-    assert "a" not in near
+    assert "a" not in local
     for number in range(2000):
-        near.note(f"p{number}")
-    assert "p0" not in near
+        local.note(f"p{number}")
+    assert "p0" not in local
 
 
 def test_bridge_is_connected_while_either_leg_is(buses: tuple[MemoryBus, MemoryBus]) -> None:
@@ -135,13 +135,13 @@ def test_leg_down_at_start_later_gets_subscribers_and_stops(
     late = Late(buses[1], sessionless=True)
     both = BridgeTransport(MemoryTransport(buses[0]), late)
     both.connect()
-    far = on(buses[1])
-    heard: list[str] = []
+    cloud = on(buses[1])
+    received: list[str] = []
     stops: list[dict[str, Any]] = []
-    kept = both.declare_subscriber("strands/a/cmd", lambda sample: heard.append(sample.key))
-    dropped = both.declare_subscriber("strands/b/cmd", lambda sample: heard.append(sample.key))
+    first = both.declare_subscriber("strands/a/cmd", lambda sample: received.append(sample.key))
+    dropped = both.declare_subscriber("strands/b/cmd", lambda sample: received.append(sample.key))
     dropped.undeclare()
-    far.declare_subscriber("strands/safety/estop", lambda sample: stops.append(json.loads(sample.payload)))
+    cloud.declare_subscriber("strands/safety/estop", lambda sample: stops.append(json.loads(sample.payload)))
     for count in (0, 2):
         stop = {"peer_id": "a", "t": 1.0, "estop_id": "e" * 32, "source_zid": both.session_id, "peers_silent": count}
         both.put("strands/safety/estop", stop)
@@ -150,10 +150,10 @@ def test_leg_down_at_start_later_gets_subscribers_and_stops(
     for name in ("b", "a"):
         body = {"sender_id": "x", "turn_id": name, "command": {"action": "stop"}}
         eventually(late.is_alive)
-        far.put(f"strands/{name}/cmd", body)
-    assert heard == ["strands/a/cmd"]
+        cloud.put(f"strands/{name}/cmd", body)
+    assert received == ["strands/a/cmd"]
     eventually(lambda: not repairing())
-    kept.undeclare()
+    first.undeclare()
     both.close()
 
 

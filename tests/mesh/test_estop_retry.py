@@ -20,46 +20,46 @@ def brief(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def cut_off(peers: Fleet) -> tuple[Mesh, Mesh, Arm]:
-    """A console that issued a stop while one arm was parted from everybody."""
+    """A console that issued a stop while one arm was cut off from all others."""
     arm = Arm()
-    console, far = peers.join(None, "console"), peers.join(arm, "arm-1")
+    console, remote = peers.join(None, "console"), peers.join(arm, "arm-1")
     peers.bus.partition(peers.transports["arm-1"])
     peers.clock.pass_(1)
     console.emergency_stop()
     peers.clock.pass_(1)
-    assert far.lockout_epoch is None
-    return console, far, arm
+    assert remote.lockout_epoch is None
+    return console, remote, arm
 
 
 def test_a_robot_that_was_cut_off_is_stopped_and_locked_when_it_is_back(peers: Fleet) -> None:
-    console, far, arm = cut_off(peers)
+    console, remote, arm = cut_off(peers)
     assert peers.events("emergency_stop")[0]["silent"] == ["arm-1"]
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
-    eventually(lambda: far.lockout_epoch == console.lockout_epoch)
+    eventually(lambda: remote.lockout_epoch == console.lockout_epoch)
     eventually(lambda: arm.halts)
 
 
 def test_robot_dropped_from_the_registry_is_stopped_when_it_is_back(peers: Fleet) -> None:
     arm = Arm()
-    console, far = peers.join(None, "console"), peers.join(arm, "arm-1")
+    console, remote = peers.join(None, "console"), peers.join(arm, "arm-1")
     peers.bus.partition(peers.transports["arm-1"])
     peers.clock.pass_(60)
     eventually(lambda: console.peers == [], what="the silent arm is dropped")
     console.emergency_stop()
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
-    eventually(lambda: far.lockout_epoch == console.lockout_epoch)
+    eventually(lambda: remote.lockout_epoch == console.lockout_epoch)
 
 
 def test_cleared_stop_is_not_repeated(peers: Fleet) -> None:
-    _, far, arm = cut_off(peers)
+    _, remote, arm = cut_off(peers)
     peers.planes["console"].clear_local("operator")
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
     # Longer than two rounds of repeats.
     time.sleep(1.3)
-    assert far.lockout_epoch is None
+    assert remote.lockout_epoch is None
     assert arm.halts == []
 
 
@@ -80,15 +80,15 @@ def test_peer_in_reach_that_never_answers_is_given_up(
     console, ghost = peers.join(None, "console"), peers.stranger()
     heartbeat = {"robot_id": "ghost", "timestamp": peers.clock()}
     ghost.put("strands/ghost/presence", heartbeat)
-    asked: list[str] = []
-    ghost.declare_subscriber("strands/ghost/cmd", lambda sample: asked.append(sample.key))
+    requests: list[str] = []
+    ghost.declare_subscriber("strands/ghost/cmd", lambda sample: requests.append(sample.key))
     console.emergency_stop()
-    # Requests so far belong to the stop itself; it is repeated after the next heartbeat.
-    asked.clear()
+    # Requests so remote belong to the stop itself; it is repeated after the next heartbeat.
+    requests.clear()
     peers.clock.pass_(1)
     ghost.put("strands/ghost/presence", {**heartbeat, "timestamp": peers.clock()})
     eventually(lambda: "is in reach and does not answer" in caplog.text)
-    assert len(asked) == safety.UNANSWERED_MAX
+    assert len(requests) == safety.UNANSWERED_MAX
 
 
 def test_returning_peer_that_does_not_stop_is_logged_once_and_asked_until_it_stops(
@@ -99,7 +99,7 @@ def test_returning_peer_that_does_not_stop_is_logged_once_and_asked_until_it_sto
     arm.stops = False
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
-    eventually(lambda: len(arm.halts) > safety.UNANSWERED_MAX, what="it is asked on and on")
+    eventually(lambda: len(arm.halts) > safety.UNANSWERED_MAX, what="the stop is repeated")
     named = [line for line in caplog.records if line.levelname == "CRITICAL" and "did NOT stop" in line.getMessage()]
     assert len(named) == 1
     assert "the brake is stuck" in named[0].getMessage()

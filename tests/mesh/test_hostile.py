@@ -1,4 +1,4 @@
-"""Arbitrary bytes on every topic: nothing raises, nothing is stored, the peer still answers."""
+"""Arbitrary bytes on every topic: nothing raises, the peer still answers."""
 
 from __future__ import annotations
 
@@ -152,10 +152,10 @@ def test_any_key_falls_under_a_topic(key: str) -> None:
 
 
 def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
-    """A lawful message of each topic, to mutate; those that carry a signature are signed."""
+    """A valid message of each topic, to mutate; signed where that is due."""
     now = peers.clock()
     assertion = {"v": 1, "epoch": "0" * 32, "targets": ["arm-1"], "t": now, "nonce": "1" * 32, "sig": "x"}
-    told = {"peer_id": "lead", "t": now, "x": 1.0}
+    common = {"peer_id": "lead", "t": now, "x": 1.0}
     sensors = ("state", "stream", "pose", "imu", "odom", "health", "lidar/summary", "lidar/state", "map/info")
     return {
         "strands/arm-9/presence": signer.sign({"robot_id": "arm-9", "robot_type": "robot", "timestamp": now}),
@@ -165,11 +165,11 @@ def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
         "strands/arm-1/response/x/t": {"type": "response", "responder_id": "x", "turn_id": "t", "result": {}},
         "strands/safety/estop": {"peer_id": 5, "t": now, "estop_id": "a" * 32, "source_zid": "ff"},
         "strands/safety/resume": {"peer_id": "x", "t": now, "assertion": assertion, "source_zid": "ff"},
-        "strands/lead/safety/event": {**told, "event": "emergency_stop"},
-        "strands/lead/input/leader": {**told, "seq": 1, "action": {"j": 1.0}},
-        "strands/lead/camera/front": {**told, "encoding": "jpeg", "data": "AAAA"},
-        "strands/lead/hand/left/state": told,
-        **{f"strands/lead/{name}": told for name in sensors},
+        "strands/lead/safety/event": {**common, "event": "emergency_stop"},
+        "strands/lead/input/leader": {**common, "seq": 1, "action": {"j": 1.0}},
+        "strands/lead/camera/front": {**common, "encoding": "jpeg", "data": "AAAA"},
+        "strands/lead/hand/left/state": common,
+        **{f"strands/lead/{name}": common for name in sensors},
     }
 
 
@@ -240,9 +240,9 @@ def test_flood_of_refusals_is_audited_as_a_count(peers: Fleet) -> None:
     seconds = int(time.monotonic() - began) + 1
     assert len(peers.events("command_rejected")) <= 5 * seconds
     peers.meshes[0].stop()
-    told = peers.events("command_rejected")
-    counted = sum(event.get("left_out", 0) + event.get("left_out_before", 0) for event in told)
-    assert counted + sum("left_out" not in event for event in told) == 1000
+    common = peers.events("command_rejected")
+    counted = sum(event.get("left_out", 0) + event.get("left_out_before", 0) for event in common)
+    assert counted + sum("left_out" not in event for event in common) == 1000
 
 
 def test_invented_peers_do_not_fill_the_registry_beyond_its_bound(

@@ -69,7 +69,7 @@ def stream(peers: Fleet) -> Iterator[Stream]:
     made.receiver.stop()
 
 
-def heard(peers: Fleet, teleoperator: Any) -> dict[str, Any]:
+def first_frame(peers: Fleet, teleoperator: Any) -> dict[str, Any]:
     """The first frame that a leader's publisher puts on the mesh."""
     frames: list[Any] = []
     listener, lead = peers.join(None, "listener"), peers.join(None, "lead")
@@ -115,7 +115,7 @@ def test_restarted_leader_is_still_followed(peers: Fleet) -> None:
 
 def test_a_stream_needs_a_leader_that_was_seen(peers: Fleet) -> None:
     arm = Arm()
-    receiver = InputReceiver(peers.join(arm, "follower"), arm, "nobody")
+    receiver = InputReceiver(peers.join(arm, "follower"), arm, "absent")
     receiver.start()
     assert receiver.start_refusal is not None
     assert peers.events("input_stream_refused")
@@ -236,12 +236,12 @@ def test_first_frame_is_bounded_by_the_followers_position(stream: Stream) -> Non
 
 
 def test_no_frame_is_applied_while_the_followers_joints_cannot_be_read(stream: Stream) -> None:
-    told = {"joints": {"shoulder.pos": 90.0}, "joints_error": "The bus was busy for 1 s."}
-    stream.arm.get_state = lambda: success("state", **told)  # type: ignore[method-assign]
+    report = {"joints": {"shoulder.pos": 90.0}, "joints_error": "The bus was busy for 1 s."}
+    stream.arm.get_state = lambda: success("state", **report)  # type: ignore[method-assign]
     for _ in range(2):
         stream.send(action={"shoulder.pos": 90.0})
     eventually(lambda: stream.stat("slew_rejected")() == 2)
-    told.update(joints={"shoulder.pos": 10.0}, joints_error="")
+    report.update(joints={"shoulder.pos": 10.0}, joints_error="")
     stream.send(action={"shoulder.pos": 90.0})
     eventually(lambda: stream.stat("slew_rejected")() == 3)
     stream.send(action={"shoulder.pos": 11.0})
@@ -283,8 +283,8 @@ def test_streams_are_opened_listed_and_closed_by_command(peers: Fleet, monkeypat
     publisher = InputPublisher(lead, Leader(), hz=50)
     publisher.start()
     eventually(lambda: arm.actions)
-    told = lead.send("follower", {"action": "teleop_status"}, timeout=20)["result"]
-    assert told["streams"][0]["running"] is True
+    report = lead.send("follower", {"action": "teleop_status"}, timeout=20)["result"]
+    assert report["streams"][0]["running"] is True
     closed = lead.send("follower", {"action": "teleop_stop"}, timeout=20)["result"]
     assert closed["streams"][0]["running"] is False
     publisher.stop()
@@ -323,8 +323,8 @@ def test_events_named_by_an_enumeration_are_published_under_their_own_names(peer
         def get_teleop_events(self) -> dict[Any, Any]:
             return {TeleopEvents.TERMINATE_EPISODE: 1, "success": False}
 
-    told = heard(peers, Pad())
-    assert told["events"] == {"terminate_episode": True, "success": False}
+    report = first_frame(peers, Pad())
+    assert report["events"] == {"terminate_episode": True, "success": False}
 
 
 def test_published_action_holds_only_floats(peers: Fleet, caplog: pytest.LogCaptureFixture) -> None:
@@ -341,9 +341,9 @@ def test_published_action_holds_only_floats(peers: Fleet, caplog: pytest.LogCapt
                 "word": "x",
             }
 
-    told = heard(peers, Odd())
-    assert told["action"] == {"whole": 3.0, "scalar": 0.5, "lone": 2.0}
-    assert all(type(value) is float for value in told["action"].values())
+    report = first_frame(peers, Odd())
+    assert report["action"] == {"whole": 3.0, "scalar": 0.5, "lone": 2.0}
+    assert all(type(value) is float for value in report["action"].values())
     assert sum("flag, hot, list, several, word" in line.getMessage() for line in caplog.records) == 1
 
 
@@ -360,17 +360,17 @@ def test_an_action_without_a_number_is_an_error_and_no_frame(peers: Fleet, actio
 def test_a_publisher_whose_loop_outlived_its_stop_starts_no_second_one(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free, asked = threading.Event(), threading.Event()
+    free, reading = threading.Event(), threading.Event()
 
     class Wedged(Leader):
         def get_action(self) -> dict[str, float]:
-            asked.set()
+            reading.set()
             free.wait(60)
             return super().get_action()
 
     publisher = InputPublisher(peers.join(None, "lead"), Wedged(), hz=200)
     publisher.start()
-    assert asked.wait(20)
+    assert reading.wait(20)
     with monkeypatch.context() as brief:
         brief.setattr(input_module, "_INPUT_JOIN_TIMEOUT_S", 0.05)
         assert publisher.stop()["thread_alive"] is True
@@ -417,9 +417,9 @@ def test_frames_of_a_local_leader_move_a_remote_follower(peers: Fleet) -> None:
     assert here.teleoperate(publish=True)["status"] == "success"
     eventually(lambda: follower.stats["frames_received"] > 20)
     assert here.stop_teleoperate()["status"] == "success"
-    told = follower.stop()
-    assert told["errors"] == 0
-    assert told["out_of_order"] == 0
+    report = follower.stop()
+    assert report["errors"] == 0
+    assert report["out_of_order"] == 0
     written = [write.action["pan.pos"] for write in there.device.writes]
     assert len(set(written)) > 10
     assert all(5.0 <= value <= 15.0 for value in written)

@@ -1,4 +1,4 @@
-"""The largest value a frame may hold for each joint, by the units that the follower states."""
+"""The largest value of a frame for each joint, by the follower's units."""
 
 from __future__ import annotations
 

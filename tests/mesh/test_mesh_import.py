@@ -1,4 +1,4 @@
-"""Importing the mesh loads next to nothing, so that a program that does not use it pays nothing."""
+"""Importing the mesh loads next to nothing."""
 
 from __future__ import annotations
 

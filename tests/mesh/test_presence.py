@@ -46,10 +46,10 @@ def test_peers_see_each_other_with_their_descriptions(peers: Fleet) -> None:
 def test_a_live_peers_name_cannot_be_taken_by_another_session(peers: Fleet) -> None:
     console = peers.join(None, "console")
     peers.join(Arm(), "arm-1")
-    held = console.peer_wire_zid("arm-1")
+    bound = console.peer_wire_zid("arm-1")
     thief = peers.stranger()
     thief.put("strands/arm-1/presence", heartbeat(peers, "arm-1"))
-    assert console.peer_wire_zid("arm-1") == held
+    assert console.peer_wire_zid("arm-1") == bound
     assert peers.events("presence_identity_conflict")
     peers.clock.pass_(10.5)
     thief.put("strands/arm-1/presence", heartbeat(peers, "arm-1"))
@@ -87,16 +87,16 @@ def test_local_facts_are_written_over_what_a_heartbeat_claims(peers: Fleet) -> N
 
 
 def test_silent_peer_is_pruned_or_listed_as_out_of_reach() -> None:
-    clock, kept = Clock(), [0.0]
-    registry = PeerRegistry(clock=clock, most=lambda: 2, retention=lambda: kept[0])
+    clock, retention = Clock(), [0.0]
+    registry = PeerRegistry(clock=clock, most=lambda: 2, retention=lambda: retention[0])
     assert registry.update("a", "robot", "h", {}) is True
     assert registry.update("a", "robot", "h", {}) is False
     clock.pass_(11)
-    kept[0] = 60
+    retention[0] = 60
     assert registry.prune() == []
     assert registry.all()[0]["reachable"] is False
     assert registry.get("a", max_age_s=5) is None
-    kept[0] = 0
+    retention[0] = 0
     assert registry.prune() == ["a"]
     for name in "bcd":
         registry.update(name, "robot", "h", {})
@@ -143,13 +143,13 @@ def test_a_peer_that_cannot_join_is_not_alive(monkeypatch: pytest.MonkeyPatch) -
 
 def test_subscriptions_deliver_objects_and_end_when_the_mesh_stops(peers: Fleet) -> None:
     one, two = peers.join(None, "one"), peers.join(None, "two")
-    heard: list[tuple[str, dict[str, Any], str | None]] = []
-    name = one.subscribe("strands/**", on_sample=lambda key, data, zid: heard.append((key, data, zid)), name="all")
+    received: list[tuple[str, dict[str, Any], str | None]] = []
+    name = one.subscribe("strands/**", on_sample=lambda key, data, zid: received.append((key, data, zid)), name="all")
     assert name == "all"
     assert one.subscribe("strands/two/note") == "strands/two/note"
     two.publish("strands/two/note", {"x": 1})
     eventually(lambda: one.inbox["strands/two/note"])
-    assert ("strands/two/note", {"x": 1}, peers.transports["two"].session_id) in heard
+    assert ("strands/two/note", {"x": 1}, peers.transports["two"].session_id) in received
     assert one.inbox["strands/two/note"][0]["x"] == 1
     one.unsubscribe("all")
     with pytest.raises(ValueError, match="not both"):

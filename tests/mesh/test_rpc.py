@@ -55,7 +55,7 @@ def test_reply_reports_the_delivery_of_the_command(
     monkeypatch.setattr(MemoryTransport, "put_confirmed", put_confirmed, raising=False)
     for answer in (console.send("there", {"action": "ping"}, timeout=20), console.ping("there", timeout=20)):
         assert (answer["via"], answer["confirmed"]) == ("direct", taken is True)
-    absent = console.send("nobody", {"action": "ping"}, timeout=0.05)
+    absent = console.send("absent", {"action": "ping"}, timeout=0.05)
     assert (absent["status"], absent["via"]) == ("timeout", "direct")
 
 

@@ -73,11 +73,11 @@ def test_hardware_lockout_is_stored_under_its_own_key(peers: Fleet, tmp_path: Pa
     arm.safety_key = "hardware:so101:left"  # type: ignore[attr-defined]  # as real robots have it
     peers.join(arm, "arm-1").emergency_stop()
 
-    def kept() -> list[list[str]]:
+    def stored() -> list[list[str]]:
         return [list(LockoutStore(path.parent).load_all()) for path in tmp_path.rglob("lockouts.json")]
 
     # A stop waits for no disk.
-    eventually(lambda: kept() == [["hardware:so101:left"]])
+    eventually(lambda: stored() == [["hardware:so101:left"]])
 
 
 def test_peers_that_did_not_stop_or_answer_are_named(
@@ -118,7 +118,7 @@ def test_estop_counts_whatever_its_time(peers: Fleet, shift: float) -> None:
     arm = Arm()
     mesh = peers.join(arm, "arm-1")
     stranger = peers.stranger()
-    body = {"peer_id": "far", "t": peers.clock() + shift, "estop_id": "a" * 32, "source_zid": stranger.session_id}
+    body = {"peer_id": "remote", "t": peers.clock() + shift, "estop_id": "a" * 32, "source_zid": stranger.session_id}
     stranger.put("strands/safety/estop", body)
     eventually(lambda: mesh.lockout_epoch == "a" * 32)
     eventually(lambda: arm.halts)
@@ -131,8 +131,8 @@ def test_estop_counts_whatever_its_time(peers: Fleet, shift: float) -> None:
 def test_epoch_of_an_estop_without_id_derives_from_issuer_and_time(peers: Fleet) -> None:
     mesh = peers.join(Arm(), "arm-1")
     stranger = peers.stranger()
-    stranger.put("strands/safety/estop", {"peer_id": "far", "t": 1700000000.25, "source_zid": stranger.session_id})
-    expected = hashlib.sha256(b"far\x001700000000.25").hexdigest()[:32]
+    stranger.put("strands/safety/estop", {"peer_id": "remote", "t": 1700000000.25, "source_zid": stranger.session_id})
+    expected = hashlib.sha256(b"remote\x001700000000.25").hexdigest()[:32]
     eventually(lambda: mesh.lockout_epoch == expected)
 
 
@@ -152,7 +152,7 @@ def test_inconsistent_estop_is_rejected(peers: Fleet, change: dict[str, Any]) ->
     arm = Arm()
     mesh = peers.join(arm, "arm-1")
     stranger = peers.stranger()
-    body = {"peer_id": "far", "t": peers.clock(), "estop_id": "a" * 32, "source_zid": stranger.session_id, **change}
+    body = {"peer_id": "remote", "t": peers.clock(), "estop_id": "a" * 32, "source_zid": stranger.session_id, **change}
     stranger.put("strands/safety/estop", body)
     eventually(lambda: peers.events("estop_rejected"))
     assert mesh.lockout_epoch is None
@@ -238,7 +238,7 @@ def test_resume_for_other_peers_does_not_count_as_a_refusal(peers: Fleet, key: A
 
 def test_retained_estop_locks_a_late_joiner(peers: Fleet) -> None:
     mesh = peers.join(Arm(), "arm-1", sessionless=True)
-    body = {"peer_id": "far", "t": peers.clock() - 86_400, "estop_id": "b" * 32}
+    body = {"peer_id": "remote", "t": peers.clock() - 86_400, "estop_id": "b" * 32}
     sample = Sample("strands/safety/estop", json.dumps(body).encode(), None, sessionless=True, retained=True)
     peers.bus.deliver(peers.transports["arm-1"], sample)
     eventually(lambda: mesh.lockout_epoch == "b" * 32)
@@ -247,8 +247,8 @@ def test_retained_estop_locks_a_late_joiner(peers: Fleet) -> None:
 def test_retained_estop_followed_by_a_signed_resume_does_not_lock(peers: Fleet, key: Any) -> None:
     mesh = peers.join(Arm(), "arm-1", sessionless=True)
     [assertion] = sign(key, "b" * 32, ["arm-1"], clock=lambda: peers.clock() - 3600)
-    relay = {"peer_id": "far", "t": peers.clock() - 3600, "assertion": assertion}
-    estop = {"peer_id": "far", "t": peers.clock() - 7200, "estop_id": "b" * 32}
+    relay = {"peer_id": "remote", "t": peers.clock() - 3600, "assertion": assertion}
+    estop = {"peer_id": "remote", "t": peers.clock() - 7200, "estop_id": "b" * 32}
     for key_, body in (("resume", relay), ("estop", estop)):
         sample = Sample(f"strands/safety/{key_}", json.dumps(body).encode(), None, sessionless=True, retained=True)
         peers.bus.deliver(peers.transports["arm-1"], sample)

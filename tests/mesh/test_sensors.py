@@ -1,4 +1,4 @@
-"""Sensor messages and camera frames: only readings are published, and a failing sensor delays no other."""
+"""Sensor messages and camera frames: a failing sensor delays no other."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ ODOMETRY = {
 
 def test_refused_reading_is_not_published_and_logged_once(peers: Fleet, caplog: pytest.LogCaptureFixture) -> None:
     class Deaf(Arm):
-        asked = 0
+        reads = 0
 
         def get_imu(self) -> Envelope:
-            self.asked += 1
-            return error(f"IMU data is stale: {self.asked}.0 s old.")
+            self.reads += 1
+            return error(f"IMU data is stale: {self.reads}.0 s old.")
 
     robot, imus = Deaf(), received(peers, "strands/arm-1/imu")
     with caplog.at_level(logging.INFO):
         mesh = peers.join(robot, "arm-1")
         console = peers.join(None, "console")
-        eventually(lambda: robot.asked > 5)
+        eventually(lambda: robot.reads > 5)
     assert imus == []
     assert len([record for record in caplog.records if "IMU data is stale" in record.getMessage()]) == 1
     mesh.announce()
@@ -130,11 +130,11 @@ def test_an_added_pose_is_normalised_and_one_that_is_no_rotation_is_left_out(pee
     eventually(lambda: poses)
     assert poses[0]["quat"] == [1.0, 0.0, 0.0, 0.0]
     mesh.add_sensor("pose", lambda: {"x": 1.0, "quat": [0.0, 0.0, 0.0, 0.0]}, hz=50)
-    told = len(poses)
+    logged = len(poses)
     mesh.add_sensor("odom", lambda: {"x": 1.0}, hz=50)
     odometry = received(peers, "strands/arm-1/odom")
     eventually(lambda: len(odometry) > 5)
-    assert len(poses) <= told + 1
+    assert len(poses) <= logged + 1
 
 
 def test_host_health_is_published_when_the_robots_cannot_be_read(peers: Fleet) -> None:
@@ -188,10 +188,10 @@ def test_a_robots_own_sensors_are_published_and_named_in_presence(peers: Fleet) 
 
 
 def test_a_quaternion_is_normalised_or_not_published() -> None:
-    found = pose({"quat": [-0.1, 0.0, 0.0, 0.1]})
-    assert found is not None
-    assert found["quat"][0] > 0
-    assert sum(value * value for value in found["quat"]) == pytest.approx(1)
+    normalised = pose({"quat": [-0.1, 0.0, 0.0, 0.1]})
+    assert normalised is not None
+    assert normalised["quat"][0] > 0
+    assert sum(value * value for value in normalised["quat"]) == pytest.approx(1)
     assert pose({"quat": [0, 0, 0, 0]}) is None
     assert pose({"quat": [float("nan"), 0, 0, 0]}) is None
     assert health(lambda: {"battery_pct": 55.0})["battery_pct"] == 55.0
@@ -242,9 +242,9 @@ def test_frames_that_cannot_be_published_leave_the_other_cameras(
         peers.join(Seeing(), "arm-1")
         eventually(lambda: len(frames) >= 3)
     assert {body["cam"] for body in frames} == {"wrist"}
-    told = [record.getMessage() for record in caplog.records if "publishes nothing of" in record.getMessage()]
-    assert len(told) == 3
-    assert any("'huge': TooLargeError" in line for line in told)
+    logged = [record.getMessage() for record in caplog.records if "publishes nothing of" in record.getMessage()]
+    assert len(logged) == 3
+    assert any("'huge': TooLargeError" in line for line in logged)
 
 
 def test_failing_camera_leaves_the_others_of_its_robot(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,15 +270,15 @@ def test_robot_whose_cameras_cannot_be_read_is_logged_once(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Blind(Arm):
-        asked = 0
+        reads = 0
 
         def camera_frames(self) -> dict[str, Any]:
-            self.asked += 1
+            self.reads += 1
             raise OSError("no cameras")
 
     monkeypatch.setenv("STRANDS_MESH_CAMERA_HZ", "50")
     robot = Blind()
     with caplog.at_level(logging.WARNING):
         peers.join(robot, "arm-1")
-        eventually(lambda: robot.asked > 3)
+        eventually(lambda: robot.reads > 3)
     assert len([record for record in caplog.records if "no cameras" in record.getMessage()]) == 1

@@ -1,4 +1,4 @@
-"""A real simulated arm on the mesh: state, camera, a policy started, stopped and locked over the wire."""
+"""A real simulated arm on the mesh: watched, started, stopped and locked."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def test_rollout_steps_are_published_without_a_request(peers: Fleet, arm: Simula
     assert set(first["action"]) <= set(arm.get_features()["robots"]["so100"]["action_features"])
     assert [body["step"] for body in steps] == sorted({body["step"] for body in steps})
     mesh.stop()
-    told = len(steps)
+    published = len(steps)
     assert arm.list_policies_running(), "leaving the mesh ends no rollout"
     eventually(lambda: arm.list_policies_running()[0]["step"] > first["step"] + 20)
-    assert len(steps) == told
+    assert len(steps) == published
 
 
 def test_simulated_robot_publishes_its_pose(peers: Fleet, arm: Simulation) -> None:

@@ -1,4 +1,4 @@
-"""State messages and presence fields: a section or field that cannot be read leaves the others."""
+"""State messages and presence: what cannot be read leaves the rest."""
 
 from __future__ import annotations
 
@@ -162,10 +162,10 @@ def test_unreadable_robot_is_degraded_and_still_published() -> None:
     reader.read()
     body = reader.read()
     assert body is not None
-    told = body["degraded"]["joints"]
-    assert set(told) == {"reason", "detail", "failures", "seconds"}
-    assert (told["reason"], told["failures"]) == ("OSError", 2)
-    assert told["detail"].startswith("bus timeout")
-    assert len(told["detail"]) < 200
+    degraded = body["degraded"]["joints"]
+    assert set(degraded) == {"reason", "detail", "failures", "seconds"}
+    assert (degraded["reason"], degraded["failures"]) == ("OSError", 2)
+    assert degraded["detail"].startswith("bus timeout")
+    assert len(degraded["detail"]) < 200
     assert body["task"]["status"] == "idle"
     assert StateReader("console", None).read() is None

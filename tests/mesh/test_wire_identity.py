@@ -44,8 +44,8 @@ def test_a_signed_message_is_verified_once(folder: Path) -> None:
     clock = Clock()
     signed, check = signer(folder, "arm-1", clock).sign(BODY), verifier(folder, clock)
     arrived = json.loads(json.dumps(signed))
-    found = check.verify(arrived)
-    assert found.common_name == "arm-1"
+    verified = check.verify(arrived)
+    assert verified.common_name == "arm-1"
     with pytest.raises(IdentityError, match="nonce"):
         check.verify(arrived)
 
@@ -132,18 +132,18 @@ def test_issuer_is_checked_before_the_validity_dates(folder: Path, tmp_path: Pat
         verifier(folder, clock).verify(message)
 
 
-@pytest.mark.parametrize(("word", "required"), [("1", True), ("yes", True), ("TRUE", True), ("0", False)])
+@pytest.mark.parametrize(("policy", "required"), [("1", True), ("yes", True), ("TRUE", True), ("0", False)])
 def test_unknown_policy_demands_signatures_on_every_transport_with_one_warning(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
-    word: str,
+    policy: str,
     required: bool,
 ) -> None:
-    monkeypatch.setenv("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY", word)
+    monkeypatch.setenv("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY", policy)
     wire_identity._unknown_policy.cache_clear()
     broker = MemoryTransport(MemoryBus(), sessionless=True)
     assert [identity_of(broker).required for _ in range(3)] == [required] * 3
-    assert len([each for each in caplog.records if "taken as 1" in each.getMessage()]) == (word not in "01")
+    assert len([each for each in caplog.records if "taken as 1" in each.getMessage()]) == (policy not in "01")
 
 
 @pytest.mark.parametrize("kind", ["rsa", "ed25519", "ecdsa"])

@@ -13,10 +13,10 @@ from strands_robots.mesh.transport.zenoh_config import Posture
 
 
 def test_without_any_setting_the_mesh_stays_on_loopback_without_certificates() -> None:
-    found = Posture.from_settings()
-    assert found.hub == "tcp/127.0.0.1:7447"
-    assert found.credentials is None
-    config = zenoh_config.hub(found)
+    posture = Posture.from_settings()
+    assert posture.hub == "tcp/127.0.0.1:7447"
+    assert posture.credentials is None
+    config = zenoh_config.hub(posture)
     assert config["scouting"]["multicast"]["enabled"] is False
     assert config["namespace"] == "strands"
     assert config["adminspace"]["enabled"] is False
@@ -79,9 +79,9 @@ def use(monkeypatch: pytest.MonkeyPatch, issued: zenoh_config.TlsCredentials) ->
 def test_certificates_bring_mutual_tls_and_access_control(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     keys.init(tmp_path)
     use(monkeypatch, keys.issue(tmp_path, "arm-1", ["192.168.1.2", "arm.example"]))
-    found = Posture.from_settings()
-    assert found.hub == "tls/127.0.0.1:7447"
-    config = zenoh_config.hub(found)
+    posture = Posture.from_settings()
+    assert posture.hub == "tls/127.0.0.1:7447"
+    config = zenoh_config.hub(posture)
     assert config["transport"]["link"]["protocols"] == ["tls"]
     tls = config["transport"]["link"]["tls"]
     assert tls["enable_mtls"] and tls["verify_name_on_connect"] and tls["close_link_on_expiration"]

@@ -1,4 +1,4 @@
-"""Teleoperation over the mesh: a leader publishes its actions, and a follower applies them.
+"""Teleoperation over the mesh: leaders publish actions, followers apply them.
 
 A frame on ``strands/PEER/input/DEVICE`` is ``peer_id``, ``device``, ``method``, ``t``, ``seq``, ``action`` (floats by
 joint) and ``events`` (or null).
@@ -35,13 +35,13 @@ LOGGED_ERRORS = 5
 
 
 class MeshInputSink:
-    """Publishes input frames; the sink of ``teleoperate(publish=True)``, for a leader that drives a local robot too."""
+    """Publishes the input frames of ``teleoperate(publish=True)``."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
 
     def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
-        """Publish one frame. Raises TransportError or WireError; the local follower goes on."""
+        """Publish one frame. Raises TransportError or WireError."""
         frame = {
             "peer_id": self._mesh.peer_id,
             "device": device,
@@ -55,7 +55,7 @@ class MeshInputSink:
 
 
 class InputPublisher:
-    """Polls a teleoperator and publishes its actions at a fixed rate, on a thread of its own.
+    """Publishes the actions of a teleoperator at a fixed rate, on its own thread.
 
     Raises:
         ValidationError: ``device_name`` is no identifier.
@@ -97,7 +97,7 @@ class InputPublisher:
 
     @property
     def stats(self) -> dict[str, Any]:
-        """Counters; ``running`` is the requested state, ``thread_alive`` that of the loop."""
+        """Counters; ``running`` is the request, ``thread_alive`` the state of the loop."""
         thread = self._thread
         alive = thread is not None and thread.is_alive()
         end = time.monotonic() if self._running else self._ended
@@ -135,7 +135,7 @@ class InputPublisher:
         self._mesh.announce_input(self._device, self._method, self._hz)
 
     def stop(self) -> dict[str, Any]:
-        """Stop, wait at most 2 s for the loop, and return the counters; ``thread_alive`` tells a loop that stayed."""
+        """Stop, wait at most 2 s for the loop, and return the counters."""
         if self._running:
             self._running, self._ended = False, time.monotonic()
             self._mesh.announce_input(self._device, None, 0)
@@ -170,7 +170,7 @@ class InputPublisher:
             self._frames += 1
 
     def _normalised(self, action: object) -> dict[str, float]:
-        """The action as floats by joint. Raises :class:`ValidationError` when it holds none."""
+        """Return the action as floats by joint. Raises ValidationError without any."""
         if not isinstance(action, Mapping):
             raise ValidationError(f"action must be an object of numbers by joint, not {shown(action)}.")
         joints = {str(key): number for key, value in action.items() if (number := _float(value)) is not None}
@@ -198,7 +198,7 @@ class InputPublisher:
 
 
 def _float(value: Any) -> float | None:
-    """Return ``value``, or the one element of an array, as a finite float; None for all else, booleans included."""
+    """Return a number, or an array's one element, as a finite float, else None."""
     if hasattr(value, "tolist"):
         value = value.tolist()
         while isinstance(value, list) and len(value) == 1:

@@ -1,4 +1,4 @@
-"""Certificates and access rules for a mesh that leaves its machine: ``strands-robots mesh keys init|issue|acl``.
+"""Certificates and access rules: ``strands-robots mesh keys init|issue|acl``.
 
 One authority for a fleet, one certificate a peer with the peer's id as its common name, and Zenoh access rules
 that let each peer publish under its own name alone.
@@ -27,7 +27,7 @@ LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
 def init(folder: Path, name: str = "strands-robots mesh", days: int = AUTHORITY_DAYS) -> Path:
-    """Make the fleet's authority, ``ca.pem`` and ``ca.key`` (mode 0600), and return the certificate's path.
+    """Make the authority: ``ca.pem``, whose path is returned, and ``ca.key`` (0600).
 
     Raises:
         ValidationError: a blank name, or ``days`` not from 1 to 36500.
@@ -51,7 +51,7 @@ def init(folder: Path, name: str = "strands-robots mesh", days: int = AUTHORITY_
 
 
 def issue(folder: Path, peer_id: str, hosts: Sequence[str] = (), days: int = PEER_DAYS) -> TlsCredentials:
-    """Make a certificate for ``peer_id``, good on loopback and on ``hosts`` (names or addresses).
+    """Make a certificate for ``peer_id``, valid on loopback and on ``hosts``.
 
     Raises:
         ValueError: ``peer_id`` is no peer id, a host is blank, or ``days`` is not from 1 to 3650.
@@ -88,7 +88,7 @@ def acl(
     relays: Sequence[str] | None = None,
     namespace: str = "strands",
 ) -> str:
-    """Return Zenoh access rules (JSON5): default deny; a robot publishes as itself, an operator also commands.
+    """Return Zenoh access rules (JSON5) that deny by default.
 
     Every certified peer receives everything, may stop the fleet and may relay a resume, which only the operator's
     key can have signed. A relay is a peer through which others are connected (the hub); what it forwards arrives

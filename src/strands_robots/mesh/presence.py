@@ -1,4 +1,4 @@
-"""Presence: heartbeats, liveliness tokens, and the binding of a peer to the session that it announces itself from."""
+"""Presence: heartbeats, liveliness tokens, and sessions bound to peers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class PresencePublisher:
         self._host = socket.gethostname()
 
     def start(self) -> None:
-        """Subscribe to presence; declare and watch liveliness tokens as soon as the transport has them."""
+        """Subscribe to presence, and declare our token as soon as there is a session."""
         transport = self._context.transport
         if transport is None:
             raise TransportError("the mesh is not running.")
@@ -58,7 +58,7 @@ class PresencePublisher:
         self._declare_token()
 
     def _declare_token(self) -> None:
-        """Declare our token and watch those of others, once there is a session: that of a bridge may come later."""
+        """Declare our token and watch the others, once there is a session."""
         transport, session = self._context.transport, self._context.session_id()
         if self._token_declared or session is None or transport is None or not isinstance(transport, LiveTransport):
             return
@@ -75,7 +75,7 @@ class PresencePublisher:
                 each.undeclare()
 
     def refresh(self) -> None:
-        """Read the description anew; a robot that cannot be read is announced by its name alone."""
+        """Read the description anew; a robot that fails is announced by name alone."""
         try:
             self._facts, trouble = dict(self._describe()), ""
         except Exception as exc:  # noqa: BLE001 - a robot that cannot be read is announced all the same
@@ -139,7 +139,7 @@ class PresencePublisher:
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
 
     def on_token(self, key: str, there: bool) -> None:
-        """Note a token that came or went; :meth:`judge_tokens` decides later about one that went."""
+        """Note a token that came or went, for :meth:`judge_tokens`."""
         parts = key.split("/")
         if len(parts) != 4 or parts[1] == self._context.peer_id:
             return
@@ -152,7 +152,7 @@ class PresencePublisher:
                 self.judge_tokens(0.0)
 
     def judge_tokens(self, patience: float = TOKEN_PATIENCE_S) -> None:
-        """Mark a peer whose token went as gone, unless the token went because our own link was lost.
+        """Mark peers whose token went as gone, unless our own link was lost.
 
         When a hub dies every token goes at once, although the sessions may live on. A living session declares its
         token again on the next hub; a token that is not back :data:`RETURN_S` after our own link belongs to a peer
@@ -181,6 +181,6 @@ class PresencePublisher:
 
 
 def _owns_topic(key: str, peer: str) -> bool:
-    """Whether a topic is the peer's own or its parent's: without sessions the broker vouches for nothing else."""
+    """True for a topic of the peer itself or of its parent."""
     parts = key.split("/")
     return len(parts) > 1 and (peer == parts[1] or peer.startswith(f"{parts[1]}__"))

@@ -1,4 +1,4 @@
-"""Registry of peers, each bound to the session and the certificate that it announced itself with.
+"""Registry of peers, each bound to its session and its certificate.
 
 Ages are measured here, on a monotonic clock, never taken from the wire. :func:`attribute` compares the session of a
 message with the one that its stated sender is bound to.
@@ -37,12 +37,12 @@ class Attribution(Enum):
 
     @property
     def proven(self) -> bool:
-        """True where it is good enough to move metal: a topic that anyone may write to proves nothing."""
+        """True where a motion counts; a topic that anyone may write to is no proof."""
         return self is Attribution.BOUND
 
 
 def attribute(bound: str | None, sample: Sample) -> Attribution:
-    """Compare ``bound``, the session that the stated sender announced itself from, with the one on a sample."""
+    """Compare the session bound to a sender with the one on its sample."""
     if bound is not None:
         if sample.session == bound:
             return Attribution.BOUND
@@ -52,7 +52,7 @@ def attribute(bound: str | None, sample: Sample) -> Attribution:
 
 @dataclass(frozen=True, slots=True)
 class PeerInfo:
-    """One row. ``seen`` is on the monotonic clock; ``gone`` says that its session is known to have ended."""
+    """One row; ``seen`` is monotonic, ``gone`` means that its session ended."""
 
     peer_id: str
     peer_type: str
@@ -64,7 +64,7 @@ class PeerInfo:
     gone: bool = False
 
     def to_dict(self, now: float) -> dict[str, Any]:
-        """Presence fields, then what is decided here: id, type, host, age in seconds, whether it is in reach."""
+        """Return the presence fields, and over them those that are decided here."""
         age = max(0.0, now - self.seen)
         return {
             **self.caps,
@@ -127,10 +127,10 @@ class PeerRegistry:
         return known is None
 
     def conflicts(self, peer_id: str, session: str | None, *, certified: bool = False) -> str | None:
-        """The binding of the living ``peer_id`` that rules out a heartbeat from ``session``, else None.
+        """Return the binding that rules out a heartbeat from ``session``, else None.
 
-        That is its session when it is another one, or the certificate (SHA-256) that it announced itself with when
-        the heartbeat is not ``certified`` for the peer.
+        That is the session of a living peer when it is another one, or the certificate (SHA-256) that it announced
+        itself with when the heartbeat is not ``certified`` for the peer.
         """
         row = self._row(peer_id)
         if row is None or row.gone or self._clock() - row.seen > PEER_TIMEOUT:
@@ -148,7 +148,7 @@ class PeerRegistry:
         return row.certificate if row else None
 
     def lost(self, peer_id: str, session: str) -> bool:
-        """Note that the session of a peer ended; True when it was the one the peer is bound to."""
+        """Note that a session ended; True when the peer was bound to it."""
         with self._lock:
             row = self._rows.get(peer_id)
             if row is None or row.session != session or row.gone:
@@ -173,7 +173,7 @@ class PeerRegistry:
             self._past.clear()
 
     def prune(self, timeout: float = PEER_TIMEOUT) -> list[str]:
-        """Drop the rows that were silent for longer than ``timeout`` and the retention; their ids."""
+        """Drop rows silent for longer than ``timeout`` and the retention; return ids."""
         limit, now = max(timeout, self._retention()), self._clock()
         with self._lock:
             gone = [peer for peer, row in self._rows.items() if now - row.seen > limit]
@@ -184,7 +184,7 @@ class PeerRegistry:
         return gone
 
     def seen_within(self, seconds: float) -> set[str]:
-        """Ids of all peers seen in the last ``seconds``, also of those that were dropped since."""
+        """Ids of peers seen in the last ``seconds``, dropped ones included."""
         now = self._clock()
         with self._lock:
             seen = {**self._past, **{peer: row.seen for peer, row in self._rows.items()}}

@@ -20,7 +20,7 @@ USAGE = "usage: python -m strands_robots.mesh.resume_authority keygen FILE"
 
 
 def main(arguments: Sequence[str], ask: Callable[[str], str] = getpass.getpass) -> int:
-    """Run the command; 0 when the key was written, 1 when it was refused, 2 for another command line."""
+    """Run the command; 0: key written, 1: refused, 2: another command line."""
     if len(arguments) != 2 or arguments[0] != "keygen":
         print(USAGE, file=sys.stderr)
         return 2

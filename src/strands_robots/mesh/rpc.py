@@ -1,4 +1,4 @@
-"""Requests to other peers: turns, the peers that may answer them, and the checks of their replies."""
+"""Requests to other peers: turns, and the checks of their replies."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Requester:
         self._lock = threading.Lock()
 
     def send(self, target: object, command: object, timeout: object) -> dict[str, Any]:
-        """Return the raw reply of ``target``, or status ``timeout``, or status ``error`` with the reason.
+        """Return the raw reply, or status ``timeout``, or status ``error``.
 
         ``via`` and ``confirmed`` report the delivery, and replace fields of these names in the reply.
         """
@@ -91,7 +91,7 @@ class Requester:
             self._close(turn)
 
     def ping(self, target: object, timeout: object) -> dict[str, Any]:
-        """Ping a peer: status ok, timeout, offline or error, the round trip in milliseconds, and the delivery."""
+        """Ping a peer and return status, round trip in milliseconds and delivery."""
         started = time.perf_counter()
         reply = self.send(target, {"action": "ping"}, timeout)
         latency = round((time.perf_counter() - started) * 1000, 3)
@@ -109,7 +109,7 @@ class Requester:
     def broadcast(
         self, command: object, timeout: object, missing: Callable[[list[dict[str, Any]]], set[str]] | None = None
     ) -> list[dict[str, Any]]:
-        """Return the reply of each peer that answered within ``timeout``; ``[]`` for a refused precondition.
+        """Return the replies within ``timeout``; ``[]`` for a refused precondition.
 
         Args:
             missing: returns the peers still to answer, given the results so far. The collection ends when there is
@@ -195,7 +195,7 @@ class Requester:
         if parts[3] != reply.responder_id or parts[4] != reply.turn_id:
             return "the topic and the body disagree"
         if turn.expected not in (BROADCAST_RESPONDER, reply.responder_id):
-            return "it is not the peer that was asked"
+            return "it is not the peer that the request was for"
         context = self._context
         attribution = attribute(context.registry.session_of(reply.responder_id), sample)
         if not attribution.accepted:
@@ -261,7 +261,7 @@ class Requester:
 
 
 def stop_outcome(reply: Mapping[str, Any]) -> Outcome:
-    """Grade a raw reply to a ``stop``: only a result can say stopped, and what is no reply counts as no answer."""
+    """Grade a raw reply to a ``stop``; what is no reply counts as no answer."""
     if reply.get("type") == "response":
         return grade(reply.get("result"))
     return Outcome.RAISED if reply.get("type") == "error" else Outcome.TIMED_OUT

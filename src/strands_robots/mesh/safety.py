@@ -1,4 +1,4 @@
-"""Fleet e-stop and signed resume on the mesh, carried to and from the safety plane of this process.
+"""Fleet e-stop and resume, between the wire and the safety plane.
 
 Nothing is decided here. Locking, halting and checking a resume are the plane's, reached through a
 :class:`SafetyAdapter`; this module translates between it and the wire, and :class:`EstopRetry` repeats a stop to the
@@ -55,7 +55,7 @@ Verdict = Callable[[], StopVerdict | None]
 
 
 class NoRobot:
-    """The robot of a peer that has none, such as an operator's console: it never moves."""
+    """Stand-in for a peer without a robot, such as a console: it never moves."""
 
     tool_name_str = "none"
 
@@ -104,7 +104,7 @@ class SafetyAdapter:
         return self._decision.source_refusal(source)
 
     def begin(self, order: StopOrder) -> Verdict | None:
-        """Lock under the order's epoch, start the halt and return at once; None when the epoch was seen before.
+        """Lock under the order's epoch and start the halt; None for a known epoch.
 
         The callable that is returned waits for the robot's verdict, at most the halt deadline and the time that the
         plane takes to report; it returns None when there is none by then.
@@ -121,7 +121,7 @@ class SafetyAdapter:
         return verdict
 
     def resume(self, assertion: object) -> str | None:
-        """Clear one epoch, when the assertion is an operator's and for this robot; else return the rejection."""
+        """Clear the epoch of an operator's assertion, or return the rejection."""
         entry = self._entry
         return REJECTED if entry is None or is_error(entry.resume(assertion, "mesh")) else None
 
@@ -133,7 +133,7 @@ class SafetyAdapter:
 
 
 class EstopRetry:
-    """Repeats one emergency stop to the peers that did not answer it, when they are back, until they stopped.
+    """Repeats an emergency stop to the peers that missed it, until they stopped.
 
     A link that parted, or a hub that hangs, loses what is published meanwhile, and Zenoh stores nothing for a peer
     that comes back. So the issuer repeats the stop itself, for as long as it is locked by it.
@@ -147,7 +147,7 @@ class EstopRetry:
     def begin(
         self, epoch: str, missing: Iterable[str], locked: Callable[[], bool], publish: Callable[[], None]
     ) -> None:
-        """Repeat the stop to ``missing`` until all have stopped, ``locked`` is false, or this peer leaves.
+        """Repeat the stop until ``missing`` have stopped or the lockout is over.
 
         Args:
             publish: publishes the stop's envelope once more.
@@ -221,10 +221,10 @@ class FleetSafety:
     # Issuing.
 
     def emergency_stop(self) -> list[dict[str, Any]]:
-        """Stop this robot and every peer; return the reply of the local robot, if any, then each attributed reply."""
+        """Stop this robot and every peer; return their replies, the local one first."""
         context = self._context
         order = StopOrder(new_epoch(), context.peer_id, "emergency stop", "mesh", issued=context.clock())
-        # The fleet is told while the local robot halts.
+        # The fleet receives the stop while the local robot halts.
         local = self._adapter.begin(order)
         none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
         self._publish_estop(order, none)
@@ -275,7 +275,7 @@ class FleetSafety:
         return responses
 
     def _local_reply(self, order: StopOrder, verdict: StopVerdict | None) -> list[dict[str, Any]]:
-        """The reply of the local robot as a peer would send it; none for a peer without a robot."""
+        """The reply of the local robot in a peer's form; none without a robot."""
         if not self._robot:
             return []
         context = self._context
@@ -292,7 +292,7 @@ class FleetSafety:
     # Receiving.
 
     def on_estop(self, sample: Sample) -> None:
-        """Receive a fleet e-stop: on return every robot of this process is locked and its halt has started."""
+        """Receive a fleet e-stop; on return all robots are locked and halting."""
         received = time.monotonic()
         context = self._context
         try:
@@ -347,7 +347,7 @@ class FleetSafety:
     # Resume.
 
     def resume(self, signing_key: Any, targets: Sequence[str] | None) -> dict[str, Any]:
-        """Sign for every epoch that locks this peer, admit each assertion here and relay it to the targets."""
+        """Sign for every epoch here, admit each assertion and relay it."""
         context = self._context
         wanted = [row["peer_id"] for row in context.registry.all() if row["reachable"]] if targets is None else targets
         epochs = self._adapter.epochs()
@@ -376,7 +376,7 @@ class FleetSafety:
         return {"status": "ok"}
 
     def on_resume(self, sample: Sample) -> None:
-        """Receive a relayed resume; one for other peers or other epochs does not count against its sender."""
+        """Receive a relayed resume; one meant for others is not counted as refused."""
         context = self._context
         try:
             body = wire.decode(sample.payload, topics.BY_NAME["resume"].max_bytes)
@@ -404,7 +404,7 @@ class FleetSafety:
             logger.warning("%s: a relayed resume was left out: %s", context.peer_id, exc)
 
     def _note_retained(self, assertion: Any) -> None:
-        """Note the epoch of a retained resume: it is too old to clear a lockout, but ends the retained e-stop."""
+        """Note the epoch of a retained resume, which ends its retained e-stop."""
         if not isinstance(assertion, dict) or self._context.peer_id not in (assertion.get("targets") or ()):
             return
         signature = ed25519.decode(assertion.get("sig"), 64)
@@ -435,7 +435,7 @@ class FleetSafety:
 
 
 def _require_same_session(body: dict[str, Any], sample: Sample) -> None:
-    """Raise WireError unless the session in the body and on the sample are equal, or both absent."""
+    """Raise WireError unless body and sample state the same session, or none."""
     stated = body.get("source_zid")
     if stated is None and sample.session is None:
         return

@@ -21,7 +21,7 @@ MIN_PERIOD_S = 0.001
 
 @dataclass(slots=True)
 class Job:
-    """A callable due every ``period`` seconds; ``busy`` while it waits for the sampler or runs there."""
+    """A callable due every ``period`` seconds; ``busy`` while queued or running."""
 
     name: str
     period: float
@@ -50,7 +50,7 @@ class Scheduler:
         self._running = False
 
     def every(self, name: str, hz: float, run: Callable[[], None], *, quick: bool = False) -> None:
-        """Run ``run`` ``hz`` times a second under ``name``, replacing a job of that name; 0 or less is off."""
+        """Run ``run`` ``hz`` times a second under ``name``; 0 or less is off."""
         with self._wake:
             if hz <= 0:
                 self._jobs.pop(name, None)
@@ -76,7 +76,7 @@ class Scheduler:
             thread.start()
 
     def stop(self, timeout: float) -> list[str]:
-        """End both threads within ``timeout`` seconds in all; the names of those still running."""
+        """End both threads within ``timeout`` s; return names of those still running."""
         with self._wake:
             self._running = False
             self._wake.notify_all()
@@ -92,7 +92,7 @@ class Scheduler:
         return alive
 
     def run_due(self, now: float) -> None:
-        """Run every job that is due at ``now`` in the calling thread; for tests with a clock of their own."""
+        """Run the jobs due at ``now`` in the calling thread; for tests with a clock."""
         for job in self._take_due(now):
             self._run(job)
 

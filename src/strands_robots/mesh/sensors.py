@@ -1,4 +1,4 @@
-"""Sensor topics: pose, IMU, odometry, health, lidar, hands, map, and camera frames.
+"""Sensor topics (pose, IMU, odometry, health, lidar, hands, map) and cameras.
 
 A provider is a callable that returns the fields of one message, or None when it has none. A robot's own
 ``get_pose``, ``get_imu``, ``get_odom``, ``get_lidar_summary``, ``get_lidar_state``, ``get_hand_state`` and
@@ -53,7 +53,7 @@ class NoReadingError(StrandsRobotsError):
 
 @dataclass(frozen=True, slots=True)
 class SensorKind:
-    """One sensor: its topic suffix, the setting that holds its rate, and the robot's method that reads it."""
+    """One sensor: topic suffix, setting of its rate, and the robot's method."""
 
     suffix: str
     setting: str
@@ -96,7 +96,7 @@ class SensorPublisher:
         self._troubles = TroubleLog(logger)
 
     def add(self, suffix: str, provider: Provider, hz: float) -> None:
-        """Read ``provider`` from now on ``hz`` times a second, replacing the one of this suffix; 0 or less is off."""
+        """Read ``provider`` ``hz`` times a second from now on; 0 or less is off."""
         name, sensor = f"sensor:{suffix}", _Sensor(suffix, provider)
         if hz > 0:
             self._sensors[suffix] = sensor
@@ -142,7 +142,7 @@ class SensorPublisher:
 
 
 class SensorLoopsMixin:
-    """The sensor methods of a mesh peer, over the context, publisher and robot of the class it is mixed into."""
+    """The sensor methods of a mesh peer, mixed into its class."""
 
     _context: Context
     _sensors: SensorPublisher
@@ -179,7 +179,7 @@ class SensorLoopsMixin:
 
 
 class _RobotHealth:
-    """A robot's own health; a failure to read it is logged once, and the host's health is published all the same."""
+    """A robot's own health; a failure to read it is logged once."""
 
     def __init__(self, read: Provider, peer_id: str) -> None:
         self._read = read
@@ -198,7 +198,7 @@ class _RobotHealth:
 
 
 class CameraPublisher:
-    """Publishes one frame of each camera of a robot; one that fails costs no other its frame, and is logged once.
+    """Publishes camera frames; a camera that fails costs no other its frame.
 
     Off by default, and behind a privacy switch that is read before a frame is built.
     """
@@ -242,7 +242,7 @@ class CameraPublisher:
 
 
 def camera_enabled() -> bool:
-    """False while the privacy switch is on; text that is no boolean keeps the cameras off."""
+    """False while the privacy switch is on, or holds text that is no boolean."""
     return not settings.boolean("STRANDS_MESH_CAMERA_DISABLED", safe=True)
 
 
@@ -266,7 +266,7 @@ def frame_message(peer_id: str, name: str, now: float, pixels: Any) -> dict[str,
 
 
 def plain(answer: object) -> dict[str, Any] | None:
-    """Return the fields of a provider's answer without those of an envelope; None where there are none.
+    """Return a provider's fields without those of an envelope, or None.
 
     Raises:
         NoReadingError: the answer is an error, or no mapping.
@@ -286,7 +286,7 @@ def plain(answer: object) -> dict[str, Any] | None:
 
 
 def pose(fields: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return a pose with its quaternion (w, x, y, z) normalised and w not negative; None where it is no rotation."""
+    """Return a pose with a unit quaternion, w >= 0; None where it is no rotation."""
     if fields is None:
         return None
     normalised = dict(fields)
@@ -300,14 +300,14 @@ def pose(fields: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def pose_of(fields: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Like :func:`pose`; where the fields are a ROS message and its ``topic``, of the pose in that message."""
+    """Like :func:`pose`; of a ROS message, the pose in it."""
     if fields is not None and isinstance(fields.get("message"), Mapping):
         return pose(from_ros(fields["message"], str(fields.get("topic", "")) or None))
     return pose(fields)
 
 
 def from_ros(message: Mapping[str, Any], source: str | None = None) -> dict[str, Any]:
-    """Return the pose in a ``nav_msgs/Odometry``, ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``turtlesim/Pose``.
+    """Return the pose in an odometry, pose or turtlesim message of ROS.
 
     ROS writes a quaternion as x, y, z, w (``geometry_msgs/Quaternion``); ``theta`` is its yaw in radians. A turtle
     lives in a plane, z = 0, and states its yaw alone. ``frame`` is None where the message names none.

@@ -1,4 +1,4 @@
-"""The shared session of the mesh and the registry of peers: one of each in a process.
+"""The one mesh session of a process, and its one registry of peers.
 
 The session is opened for its first user and closed with its last. Without stated endpoints (``ZENOH_CONNECT``,
 ``ZENOH_LISTEN``) the first process of a machine is the hub on ``tcp/127.0.0.1:STRANDS_MESH_PORT`` and the others
@@ -84,7 +84,7 @@ class _Shared:
             logger.info("The mesh's session is closed.")
 
     def close(self) -> None:
-        """Close it whatever the references: an interpreter that ends with a Zenoh subscriber declared hangs."""
+        """Close it whatever the references: Zenoh would hang the interpreter's end."""
         with self.lock:
             self.references = min(self.references, 1)
         self.release()
@@ -95,12 +95,12 @@ atexit.register(_shared.close)
 
 
 def acquire() -> Transport | None:
-    """Take a reference to the shared transport; None when the mesh is off or cannot be opened, which is logged."""
+    """Take a reference to the shared transport; None, logged, where there is none."""
     return _shared.acquire()
 
 
 def get_session() -> Any | None:
-    """Take a reference to the shared session: a ``zenoh.Session``, the transport of another backend, or None."""
+    """Take a reference to the shared session, a ``zenoh.Session`` by default."""
     return _session_of(acquire())
 
 
@@ -121,7 +121,7 @@ def session_alive() -> bool:
 
 
 def put(key: str, data: dict[str, Any]) -> None:
-    """Publish a JSON object and return at once; nothing happens while no session is open.
+    """Publish a JSON object at once; nothing happens while no session is open.
 
     A message that cannot be sent is logged at WARNING.
     """
@@ -135,7 +135,7 @@ def put(key: str, data: dict[str, Any]) -> None:
 
 
 def zenoh_error_types() -> tuple[type[BaseException], ...]:
-    """Exception types of a transport's faults: Zenoh's, where it is installed, and the operating system's."""
+    """Exception types of a transport's faults; ``ZError`` only with Zenoh."""
     try:
         import zenoh  # noqa: PLC0415 - optional, loaded when used
     except ImportError:
@@ -154,7 +154,7 @@ def get_peers() -> list[dict[str, Any]]:
 
 
 def get_peer(peer_id: str, max_age_s: float | None = None) -> dict[str, Any] | None:
-    """Return one peer, or None when it is unknown or silent for longer than ``max_age_s`` seconds.
+    """Return one peer, or None when it is unknown or silent for over ``max_age_s`` s.
 
     Raises:
         ValidationError: ``max_age_s`` is not positive and finite.
@@ -173,7 +173,7 @@ def clear_peers() -> None:
 
 
 def prune_peers(timeout: float = PEER_TIMEOUT) -> list[str]:
-    """Remove peers silent for more than ``timeout`` s and ``STRANDS_MESH_PEER_RETENTION_S``; return their ids."""
+    """Remove the peers silent for longer than ``timeout`` s and return their ids."""
     return _registry.prune(number("timeout", timeout, above=0))
 
 

@@ -1,4 +1,4 @@
-"""A robot read into messages: its state ten times a second, and the description in its presence.
+"""A robot read into messages: its state, and the description in presence.
 
 Each section and each field is read by itself: one that cannot be read takes no other with it.
 """
@@ -54,7 +54,7 @@ class _Degradation:
 
 
 class StateReader:
-    """Reads a robot into state messages; a section that cannot be read is reported as degraded, the others stay."""
+    """Reads a robot into state messages; a failed section is reported degraded."""
 
     def __init__(
         self, peer_id: str, robot: TaskRobot | WorldRobot | None, clock: Callable[[], float] = time.time
@@ -136,7 +136,7 @@ class StateReader:
         return _without(joints, bad)
 
     def _velocity(self, joint: str, position: float, at: object) -> float | None:
-        """Velocity by simulated time between two messages; 0 while the world stands still, None for the first."""
+        """Velocity by simulated time since the last message; None for the first."""
         if not isinstance(at, int | float):
             return None
         known = self._positions.get(joint)
@@ -148,7 +148,7 @@ class StateReader:
 
 
 class Description:
-    """Reads a robot for the presence of its peer; a field that cannot be read is logged once for each reason."""
+    """Reads a robot for presence, field by field; failures are logged once."""
 
     def __init__(self, peer_id: str, robot: TaskRobot | WorldRobot | None) -> None:
         self._peer_id = peer_id

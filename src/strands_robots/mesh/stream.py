@@ -22,7 +22,7 @@ WAITING = 8
 
 
 class StepPublisher:
-    """Publishes the policy steps of one peer: those of its robot's rollouts, and those that a program hands in.
+    """Publishes policy steps: of rollouts, and those that a program hands in.
 
     A rollout reports its steps on its control thread, so they leave on a thread of this publisher's own; where the
     transport is slower than the rollout the oldest are dropped.
@@ -43,7 +43,7 @@ class StepPublisher:
         self._unpublished = 0
 
     def start(self) -> None:
-        """Subscribe to the robot's rollouts; a robot without ``subscribe`` publishes no steps of its own."""
+        """Subscribe to the robot's rollouts, where it has ``subscribe``."""
         if self._robot is None or self._hz <= 0:
             return
         try:
@@ -117,7 +117,7 @@ class StepPublisher:
 
 
 def numbers(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries that the wire carries: numbers, booleans and 1-D arrays under 100 entries."""
+    """Return the numbers, booleans and 1-D arrays under 100 entries."""
     plain = {str(key): _plain(value) for key, value in values.items()}
     return {key: value for key, value in plain.items() if value is not None}
 

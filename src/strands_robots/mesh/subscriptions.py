@@ -22,7 +22,7 @@ INBOX_MAX = 256
 
 
 class Subscriptions:
-    """Named subscriptions of one peer. Callbacks run one after another on the delivery thread.
+    """Named subscriptions; callbacks run one after another on one thread.
 
     A slow callback loses the oldest messages; it never delays a command or a stop.
     """
@@ -43,7 +43,7 @@ class Subscriptions:
         on_sample: SampleCallback | None = None,
         direct: Callable[[Sample], None] | None = None,
     ) -> bool:
-        """Subscribe under ``name``, replacing what had that name; False when the transport refused.
+        """Subscribe under ``name``, replacing it; False when the transport refused.
 
         Args:
             direct: called with the raw sample on the transport's thread instead, for parts of the mesh.

@@ -1,4 +1,4 @@
-"""Bounds on what repeats itself: audit events of a flood, log lines about one trouble, messages above a rate."""
+"""Bounds on floods: audit events, log lines, and messages above a rate."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class AuditThrottle:
         self._sink(event, self._peer, payload)
 
     def close(self) -> None:
-        """Record the counts of events that were left out since the last record of their kind."""
+        """Record the counts of events left out since the last of their kind."""
         with self._lock:
             counts = {kind: window.left_out for kind, window in self._windows.items() if window.left_out}
             self._windows.clear()
@@ -87,14 +87,14 @@ class AuditThrottle:
 
 
 class TroubleLog:
-    """Logs the trouble of each subject once, and again only when it changed or had ended."""
+    """Logs the trouble of each subject once, until it changes or ends."""
 
     def __init__(self, logger: logging.Logger) -> None:
         self._logger = logger
         self._kinds: dict[str, str] = {}
 
     def note(self, subject: str, kind: str, message: str, *args: object, level: int = logging.WARNING) -> None:
-        """Log ``message`` unless ``subject`` has trouble of this ``kind`` already; an empty kind is no trouble."""
+        """Log ``message`` where ``kind`` is new for ``subject``; empty is no trouble."""
         if kind and kind != self._kinds.get(subject):
             self._logger.log(level, message, *args)
         self._kinds[subject] = kind

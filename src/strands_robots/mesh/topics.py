@@ -115,7 +115,7 @@ def safety_event(peer: str) -> str:
 
 
 def token(peer: str, session: str) -> str:
-    """Liveliness token of one peer in one session; no message is ever published there."""
+    """Liveliness token of a peer in a session; nothing is published there."""
     return f"{ROOT}/{peer}/alive/{session}"
 
 

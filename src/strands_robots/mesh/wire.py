@@ -29,7 +29,7 @@ class TooLargeError(WireError):
 
 
 def encode(payload: Mapping[str, Any], limit: int) -> bytes:
-    """Return UTF-8 JSON. A number that is not finite becomes null, because JSON has none.
+    """Return UTF-8 JSON; a number that is not finite becomes null.
 
     Raises:
         TooLargeError: more than ``limit`` bytes.
@@ -107,7 +107,7 @@ _DECODER = json.JSONDecoder(parse_constant=_refuse_constant)
 
 @dataclass(frozen=True, slots=True)
 class Presence:
-    """A heartbeat: a peer and its capabilities. ``body`` is the message as received, signature included."""
+    """A heartbeat; ``body`` is the message as received, signature included."""
 
     robot_id: str
     robot_type: str
@@ -117,7 +117,7 @@ class Presence:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Presence:
-        """Parse ``body``. Raises WireError for a missing id or time; type and host are cut to 256 characters."""
+        """Parse ``body``; type and host are cut to 256 characters. Raises WireError."""
         return cls(
             _identifier(body, "robot_id"),
             _label(body.get("robot_type"), "robot"),
@@ -134,7 +134,7 @@ class Presence:
 
 @dataclass(slots=True)  # not frozen: that would cost each message a microsecond
 class Request:
-    """A command to one peer or to all of them. ``command`` is anything until it is validated."""
+    """A command to one peer or to all; ``command`` is not validated yet."""
 
     sender_id: str
     turn_id: str
@@ -152,14 +152,14 @@ class Request:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Request:
-        """Parse ``body``. Raises WireError for a sender or a turn that is no identifier; a time may be missing."""
+        """Parse ``body``; the time may be missing. Raises WireError."""
         sender, turn = _identifier(body, "sender_id"), _identifier(body, "turn_id")
         return cls(sender, turn, body.get("command"), finite(body.get("timestamp")), body)
 
 
 @dataclass(slots=True)  # not frozen: that would cost each message a microsecond
 class Reply:
-    """The answer of a peer in a turn: ``result`` of a response, ``error`` text of an error."""
+    """An answer in a turn: ``result`` of a response, ``error`` of an error."""
 
     type: Literal["response", "error"]
     responder_id: str
@@ -176,7 +176,7 @@ class Reply:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Reply:
-        """Parse ``body``. Raises WireError for another ``type`` or an id that is no identifier."""
+        """Parse ``body``. Raises WireError for another ``type`` or a bad id."""
         kind = body.get("type")
         if kind not in ("response", "error"):
             raise WireError(f"type must be response or error, not {shown(kind)}")
@@ -202,7 +202,7 @@ class EstopNotice:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> EstopNotice:
-        """Parse ``body``. Raises WireError for an empty issuer or a time that is no finite number."""
+        """Parse ``body``. Raises WireError for an empty issuer or a bad time."""
         issuer = body.get("peer_id")
         if not isinstance(issuer, str) or not issuer.strip() or len(issuer) > 256:
             raise WireError(f"peer_id must name the issuer, not {shown(issuer)}")
@@ -230,7 +230,7 @@ class ResumeRelay:
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> ResumeRelay:
-        """Parse ``body``. Raises WireError for a peer that is no identifier or a time that is no finite number."""
+        """Parse ``body``. Raises WireError for a bad peer id or a bad time."""
         zid = body.get("source_zid")
         return cls(
             _identifier(body, "peer_id"),

@@ -91,7 +91,7 @@ class Signer:
 
 
 class Verifier:
-    """Checks signed messages against the roots of a PEM file; every (certificate, nonce) counts once.
+    """Checks signed messages; every (certificate, nonce) counts once.
 
     Args:
         roots: PEM certificates that may issue a peer's certificate, directly.
@@ -173,7 +173,7 @@ class Verifier:
 
 
 class Identity:
-    """Signer and verifier of this peer; ``required`` says that unsigned messages do not count."""
+    """Signer and verifier of a peer; ``required``: only signed messages count."""
 
     def __init__(self, signer: Signer | None = None, verifier: Verifier | None = None, required: bool = False) -> None:
         self._signer = signer
@@ -182,7 +182,7 @@ class Identity:
 
     @classmethod
     def from_settings(cls, credentials: TlsCredentials | None) -> Identity:
-        """The identity that the environment asks for: by default signed where there are certificates."""
+        """The identity that the environment asks for; signed with certificates."""
         policy = signature_policy()
         signer, verifier = None, None
         if credentials is not None:
@@ -195,7 +195,7 @@ class Identity:
         return self._signer.sign(body) if self._signer is not None else body
 
     def verify(self, body: Mapping[str, Any], peer_id: str) -> Verified:
-        """Return the certificate that signed ``body`` and speaks for ``peer_id``, or raise IdentityError."""
+        """Return the certificate that signed for ``peer_id``, or raise IdentityError."""
         if self._verifier is None:
             raise IdentityError("this peer has no roots to check signatures against")
         verified = self._verifier.verify(body)
@@ -218,7 +218,7 @@ class Identity:
 
 
 def visitor_id(prefix: str) -> str:
-    """Make a fresh id for a short stay on the mesh, which our certificate speaks for where there is one.
+    """Make a fresh id for a short stay, under our certificate's name if any.
 
     Raises:
         TransportError: the certificate's settings name files that cannot be used.
@@ -229,7 +229,7 @@ def visitor_id(prefix: str) -> str:
 
 
 def signature_policy() -> str:
-    """``STRANDS_MESH_REQUIRE_SIGNED_IDENTITY`` as ``1``, ``0`` or ``auto``; any other text counts as ``1``."""
+    """``STRANDS_MESH_REQUIRE_SIGNED_IDENTITY``: 1, 0 or auto; other text is 1."""
     stated = settings.raw("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY").strip().lower()
     return stated if stated in ("0", "1", "auto") else _unknown_policy(stated)
 
@@ -243,7 +243,7 @@ def _unknown_policy(stated: str) -> str:
 
 @lru_cache(maxsize=1)
 def cryptography() -> SimpleNamespace:
-    """Load the parts of the ``cryptography`` package that certificates and signatures need.
+    """Load the parts of the ``cryptography`` package that are needed here.
 
     Raises:
         MissingExtraError: the package is not installed.

@@ -20,7 +20,7 @@ def port() -> int:
 
 @pytest.fixture
 def join(port: int, tmp_path: Path) -> Iterator[Join]:
-    """Start a peer by id, kind of robot and further settings; each keeps its state in a folder of its own."""
+    """Start a peer by id, kind of robot and further settings."""
     with ExitStack() as stack:
 
         def start(peer_id: str, robot: str = "world", **settings: str) -> MeshPeer:

@@ -25,10 +25,10 @@ from strands_robots.mesh.transport.zenoh_config import Posture
 CANNOT = {
     ("mqtt", "input"): "input frames are not sent over MQTT",
     ("mqtt", "session"): "MQTT names no sessions",
-    ("memory", "confirm"): "only MQTT tells whether anybody has subscribed",
-    ("zenoh", "confirm"): "only MQTT tells whether anybody has subscribed",
-    ("zenoh-tls", "confirm"): "only MQTT tells whether anybody has subscribed",
-    ("bridge", "confirm"): "its Zenoh leg does not tell whether anybody has subscribed",
+    ("memory", "confirm"): "only MQTT reports whether a topic has subscribers",
+    ("zenoh", "confirm"): "only MQTT reports whether a topic has subscribers",
+    ("zenoh-tls", "confirm"): "only MQTT reports whether a topic has subscribers",
+    ("bridge", "confirm"): "its Zenoh leg does not report whether a topic has subscribers",
 }
 """What a network cannot do by design, and why: a test that needs it is skipped there."""
 
@@ -189,7 +189,7 @@ class OverMqtt(Network):
 
 
 class OverBoth(OverMqtt):
-    """The bridge: Zenoh with mutual TLS and the broker at once. The stranger is on Zenoh."""
+    """The bridge: Zenoh with TLS and the broker; the stranger is on Zenoh."""
 
     kind = "bridge"
 

@@ -1,4 +1,4 @@
-"""What a mesh does, the same on every transport: in memory, Zenoh, Zenoh with mutual TLS, an MQTT 5 broker, both.
+"""The behaviour of a mesh, the same on every transport.
 
 Three peers: an operator's console, a simulated world and a real arm. Over Zenoh and MQTT each is a process.
 """
@@ -63,21 +63,23 @@ def request(sender: str, command: object, **fields: Any) -> dict[str, Any]:
 
 def replies_to(transport: Transport, sender: str) -> list[dict[str, Any]]:
     """Everything that is answered to ``sender`` from now on, whoever that is."""
-    found: list[dict[str, Any]] = []
+    messages: list[dict[str, Any]] = []
     key = f"strands/{sender}/response/**"
-    transport.declare_subscriber(key, lambda sample: found.append(json.loads(sample.payload)))
-    return found
+    transport.declare_subscriber(key, lambda sample: messages.append(json.loads(sample.payload)))
+    return messages
 
 
-def until_answered(transport: Transport, key: str, body: dict[str, Any], found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Publish until an answer comes: a new subscription takes a moment to reach everybody."""
+def until_answered(
+    transport: Transport, key: str, body: dict[str, Any], messages: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Publish until an answer comes: a new subscription takes a moment."""
 
     def ask() -> dict[str, Any] | None:
-        if not found:
+        if not messages:
             # As another turn each time: the same one would be refused as a replay of what was not answered to us.
             transport.put(key, {**body, "turn_id": uuid.uuid4().hex})
             time.sleep(0.1)
-        return found[0] if found else None
+        return messages[0] if messages else None
 
     return eventually(ask, what="an answer") or {}
 
@@ -102,8 +104,8 @@ def test_a_peer_is_bound_to_the_session_it_came_from(net: Network) -> None:
     def bound() -> set[str | None]:
         return {peer.ask("zid", "arm-1") for name, peer in net.peers.items() if name != "arm-1"}
 
-    # A bridge may hear a peer over the broker first, where nobody has a session.
-    seen = eventually(lambda: (found := bound()) and None not in found and found)
+    # A bridge may receive a heartbeat over the broker first, where peers have no session.
+    seen = eventually(lambda: (messages := bound()) and None not in messages and messages)
     assert len(seen) == 1
     assert net.peers["console"].ask("zid", "sim-1") not in seen
 
@@ -134,11 +136,11 @@ def test_a_ping_is_answered_and_timed(net: Network) -> None:
 
 def test_absent_peer_is_offline_at_once(net: Network) -> None:
     net.needs("confirm")
-    assert net.peers["console"].ask("ping", "nobody")["status"] == "offline"
+    assert net.peers["console"].ask("ping", "absent")["status"] == "offline"
 
 
 def test_absent_peer_times_out(net: Network) -> None:
-    answer = net.peers["console"].ask("send", "nobody", {"action": "status"}, 0.2)
+    answer = net.peers["console"].ask("send", "absent", {"action": "status"}, 0.2)
     assert answer.get("status") == "timeout" or answer.get("error") == "offline"
 
 
@@ -154,8 +156,8 @@ def test_a_simulation_starts_and_stops_on_demand(net: Network) -> None:
     console, sim = net.peers["console"], net.peers["sim-1"]
     assert console.ask("send", "sim-1", WAVE, 20)["result"]["status"] == "success"
     assert sim.ask("moving") == ["left"]
-    told = console.ask("send", "sim-1", {"action": "stop"}, 20)["result"]
-    assert told == {"ok": True, "stopped": ["left"], "not_stopped": [], "results": {"left": "stopped"}}
+    result = console.ask("send", "sim-1", {"action": "stop"}, 20)["result"]
+    assert result == {"ok": True, "stopped": ["left"], "not_stopped": [], "results": {"left": "stopped"}}
     assert sim.ask("moving") == []
 
 
@@ -187,20 +189,20 @@ def test_published_message_is_received_until_unsubscribed(net: Network) -> None:
     console, sim = net.peers["console"], net.peers["sim-1"]
     assert console.ask("hear", "strands/*/notes", None, "notes") == "notes"
 
-    def heard() -> list[Any]:
-        sim.ask("publish", "strands/sim-1/notes", {"words": "good morning"})
-        found: list[Any] = console.ask("heard", "notes")
-        return found
+    def received() -> list[Any]:
+        sim.ask("publish", "strands/sim-1/notes", {"text": "good morning"})
+        messages: list[Any] = console.ask("received", "notes")
+        return messages
 
-    assert eventually(heard)[0] == {"key": "strands/sim-1/notes", "words": "good morning"}
+    assert eventually(received)[0] == {"key": "strands/sim-1/notes", "text": "good morning"}
     console.ask("deaf", "notes")
-    sim.ask("publish", "strands/sim-1/notes", {"words": "good night"})
-    assert console.ask("heard", "notes") == []
+    sim.ask("publish", "strands/sim-1/notes", {"text": "good night"})
+    assert console.ask("received", "notes") == []
 
 
 def test_a_message_too_large_is_an_error_to_its_sender(net: Network) -> None:
     with pytest.raises(RuntimeError, match="16384"):
-        net.peers["console"].ask("publish", "strands/sim-1/cmd", {"words": "x" * 16384})
+        net.peers["console"].ask("publish", "strands/sim-1/cmd", {"text": "x" * 16384})
 
 
 def test_the_state_of_a_robot_and_of_a_world_is_published(net: Network) -> None:
@@ -208,26 +210,26 @@ def test_the_state_of_a_robot_and_of_a_world_is_published(net: Network) -> None:
     console.ask("hear", "strands/*/state", None, "states")
 
     def by_peer() -> dict[str, Any] | None:
-        found = {each["peer_id"]: each for each in console.ask("heard", "states")}
-        return found if len(found) >= 2 else None
+        messages = {each["peer_id"]: each for each in console.ask("received", "states")}
+        return messages if len(messages) >= 2 else None
 
-    found = eventually(by_peer) or {}
+    messages = eventually(by_peer) or {}
     console.ask("deaf", "states")
-    assert found["arm-1"]["joints"] == {"shoulder": 1.5}
-    assert found["sim-1"]["sim_time"] == 1.25
-    assert abs(found["sim-1"]["t"] - time.time()) < 10
+    assert messages["arm-1"]["joints"] == {"shoulder": 1.5}
+    assert messages["sim-1"]["sim_time"] == 1.25
+    assert abs(messages["sim-1"]["t"] - time.time()) < 10
 
 
 def test_a_policys_steps_are_streamed(net: Network) -> None:
     console, sim = net.peers["console"], net.peers["sim-1"]
     console.ask("hear", "strands/sim-1/stream", None, "steps")
 
-    def heard() -> list[Any]:
+    def received() -> list[Any]:
         sim.ask("step", 7)
-        found: list[Any] = console.ask("heard", "steps")
-        return found
+        messages: list[Any] = console.ask("received", "steps")
+        return messages
 
-    step = eventually(heard)[0]
+    step = eventually(received)[0]
     console.ask("deaf", "steps")
     assert (step["peer_id"], step["step"], step["instruction"], step["policy"]) == ("sim-1", 7, "wave", "mock")
     assert step["action"] == {"joint": 0.6}
@@ -275,21 +277,21 @@ def test_frames_of_another_session_move_nothing(net: Network) -> None:
     assert len(arm.ask("actions")) == before
 
 
-# Somebody else's words.
+# Messages in another peer's name.
 
 
 def test_a_command_in_anothers_name_does_not_move_an_arm(net: Network) -> None:
     mallory, arm = net.stranger("forger"), net.peers["arm-1"]
-    found = replies_to(mallory, "console")
-    reply = until_answered(mallory, "strands/arm-1/cmd", request("console", WAVE), found)
+    messages = replies_to(mallory, "console")
+    reply = until_answered(mallory, "strands/arm-1/cmd", request("console", WAVE), messages)
     assert "operator approval" in reply["error"]
     assert arm.ask("moving") is False
 
 
 def test_a_command_is_carried_out_once(net: Network) -> None:
     mallory, sim = net.stranger("repeater"), net.peers["sim-1"]
-    found = replies_to(mallory, "repeater")
-    until_answered(mallory, "strands/sim-1/cmd", request("repeater", {"action": "ping"}), found)
+    messages = replies_to(mallory, "repeater")
+    until_answered(mallory, "strands/sim-1/cmd", request("repeater", {"action": "ping"}), messages)
     before, step = sim.ask("steps"), request("repeater", {"action": "step", "steps": 3})
     for _ in range(3):
         mallory.put("strands/sim-1/cmd", step)
@@ -298,7 +300,7 @@ def test_a_command_is_carried_out_once(net: Network) -> None:
 
     def answers() -> list[str]:
         # A ping that was sent more than once may still be answered meanwhile.
-        return sorted(reply.get("error", "") for reply in list(found) if reply["turn_id"] == step["turn_id"])
+        return sorted(reply.get("error", "") for reply in list(messages) if reply["turn_id"] == step["turn_id"])
 
     eventually(lambda: len(answers()) >= 1 + len(again))
     assert answers() == ["", *again]
@@ -309,17 +311,17 @@ def test_a_command_is_carried_out_once(net: Network) -> None:
 def test_motion_with_a_wrong_time_is_refused(net: Network, shift: float) -> None:
     mallory, sim = net.stranger("late" if shift < 0 else "early"), net.peers["sim-1"]
     sender, before = "late" if shift < 0 else "early", sim.ask("steps")
-    found = replies_to(mallory, sender)
+    messages = replies_to(mallory, sender)
     stale = request(sender, {"action": "step"}, timestamp=time.time() + shift)
-    assert until_answered(mallory, "strands/sim-1/cmd", stale, found)["error"] == "replay rejected"
+    assert until_answered(mallory, "strands/sim-1/cmd", stale, messages)["error"] == "replay rejected"
     assert sim.ask("steps") == before
 
 
 def test_a_command_out_of_bounds_is_answered_with_the_reason(net: Network) -> None:
     mallory = net.stranger("careless")
-    found = replies_to(mallory, "careless")
+    messages = replies_to(mallory, "careless")
     body = request("careless", {**WAVE, "duration": True})
-    reply = until_answered(mallory, "strands/sim-1/cmd", body, found)
+    reply = until_answered(mallory, "strands/sim-1/cmd", body, messages)
     assert reply["error"].startswith("validation: duration")
 
 
@@ -362,7 +364,7 @@ def test_any_peer_may_stop_and_only_the_operator_may_resume(net: Network, tmp_pa
 def test_a_reply_in_anothers_name_does_not_count(net: Network) -> None:
     mallory, ghost = net.stranger("liar"), net.stranger("ghost")
     console = net.peers["console"]
-    asked: list[str] = []
+    turns: list[str] = []
 
     def announced() -> bool:
         ghost.put("strands/ghost/presence", {"robot_id": "ghost", "robot_type": "robot", "timestamp": time.time()})
@@ -370,7 +372,7 @@ def test_a_reply_in_anothers_name_does_not_count(net: Network) -> None:
 
     def answer(sample: Any) -> None:
         turn = json.loads(sample.payload)["turn_id"]
-        asked.append(turn)
+        turns.append(turn)
         body = {"type": "response", "responder_id": "ghost", "turn_id": turn, "result": {}, "timestamp": time.time()}
         mallory.put(f"strands/console/response/ghost/{turn}", body)
 
@@ -380,6 +382,6 @@ def test_a_reply_in_anothers_name_does_not_count(net: Network) -> None:
     def unanswered() -> bool:
         assert announced()
         assert console.ask("send", "ghost", {"action": "ping"}, 0.3).get("type") is None
-        return len(asked) >= 2
+        return len(turns) >= 2
 
     eventually(unanswered, what="two commands that the liar answered")

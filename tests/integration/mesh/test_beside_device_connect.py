@@ -1,4 +1,4 @@
-"""Device Connect and the mesh on one machine at the same loopback port, as both have it by default."""
+"""Device Connect and the mesh on one machine at the same loopback port."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from strands_robots.mesh import keys
 async def answered(caller: Caller, value: str) -> None:
     """Wait until ``dev-2`` gives the value back; whoever lost the hub needs a moment to be there again."""
 
-    async def told() -> bool:
+    async def answered() -> bool:
         try:
             answer = await caller.call("dev-2", "getStatus", {"value": value})
         except MessagingError:
             return False
         return bool(answer["result"]["value"] == value)
 
-    await eventually_async(told, what=f"an answer with {value}")
+    await eventually_async(answered, what=f"an answer with {value}")
 
 
 @pytest.mark.parametrize("first", ["device", "mesh"])
@@ -47,7 +47,7 @@ async def test_who_comes_second_shares_the_port_and_a_survivor_takes_it_over(joi
             await caller.sees("dev-1", "dev-2")
             await answered(caller, "a")
             (one if first == "device" else console).kill()
-            await until(lambda: accepts(port), what="somebody at the port again")
+            await until(lambda: accepts(port), what="a listener at the port again")
             await answered(caller, "b")
         other = join("sim-2")
         eventually(lambda: other.ask("ping", "sim-1", 0.5)["status"] == "ok")
@@ -58,7 +58,7 @@ async def test_who_comes_second_shares_the_port_and_a_survivor_takes_it_over(joi
 
 @pytest.fixture
 def served_on_both(port: int, tmp_path: Path) -> Iterator[str]:
-    """A simulated arm in one process, on Device Connect under the id that is given, and on the mesh."""
+    """A simulated arm in one process, on Device Connect and on the mesh."""
     state = tmp_path / "both"
     state.mkdir(mode=0o700)
     both = {"STRANDS_MESH": "true", "STRANDS_MESH_PORT": str(port), "STRANDS_DC_PORT": str(port)}

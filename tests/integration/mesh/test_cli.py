@@ -1,4 +1,4 @@
-"""Two terminals, two commands, no configuration: two robots on the mesh; and certificates without a recipe."""
+"""Two terminals without configuration, and certificates made by command."""
 
 from __future__ import annotations
 
@@ -40,23 +40,23 @@ def served(tmp_path: Path, port: int) -> Iterator[tuple[subprocess.Popen[str], d
         serving.wait()
 
 
-def asked(settings: dict[str, str], *words: str) -> tuple[int, dict[str, Any]]:
+def ask(settings: dict[str, str], *arguments: str) -> tuple[int, dict[str, Any]]:
     """The exit code and the answer of a command in the second terminal."""
     ended = subprocess.run(
-        [*COMMAND, *words, "--json"], capture_output=True, text=True, env=settings, check=False, timeout=60
+        [*COMMAND, *arguments, "--json"], capture_output=True, text=True, env=settings, check=False, timeout=60
     )
     assert ended.stdout, ended.stderr
     return ended.returncode, json.loads(ended.stdout)
 
 
-def held(file: Path) -> dict[str, list[dict[str, Any]]]:
-    """What holds each robot by name, as it is kept in a lockout file."""
+def lockouts(file: Path) -> dict[str, list[dict[str, Any]]]:
+    """The lockouts of each robot by name, as stored in a lockout file."""
     return {each["name"]: each["holds"] for each in json.loads(file.read_text())["robots"].values()}
 
 
 def test_a_served_arm_is_seen_from_another_terminal_and_ctrl_c_stops_it(tmp_path: Path, port: int) -> None:
     with served(tmp_path, port) as (serving, settings):
-        code, seen = asked(settings, "peers", "--mesh", "--timeout", "5")
+        code, seen = ask(settings, "peers", "--mesh", "--timeout", "5")
         [row] = seen["peers"]
         assert (code, row["peer_id"], row["type"], row["sim_robots"]) == (0, "arm-1", "sim", ["so100"])
         serving.send_signal(signal.SIGINT)
@@ -66,21 +66,21 @@ def test_a_served_arm_is_seen_from_another_terminal_and_ctrl_c_stops_it(tmp_path
 
 def test_served_arm_is_stopped_locked_and_cleared_from_another_terminal(tmp_path: Path, port: int) -> None:
     with served(tmp_path, port) as (_, settings):
-        assert asked(settings, "stop", "arm-1", "--mesh")[1]["stopped"] is True
-        code, told = asked(settings, "estop", "--mesh")
-        assert (code, told["stopped"], list(told["robots"])) == (0, True, ["arm-1"])
-        # It is locked at once and kept a moment later, because no disk may delay a halt.
+        assert ask(settings, "stop", "arm-1", "--mesh")[1]["stopped"] is True
+        code, answer = ask(settings, "estop", "--mesh")
+        assert (code, answer["stopped"], list(answer["robots"])) == (0, True, ["arm-1"])
+        # It is locked at once and stored a moment later, because no disk may delay a halt.
         file = tmp_path / "state" / "lockouts.json"
-        eventually(lambda: file.exists() and held(file))
-        assert list(held(file)) == ["arm-1"]
-        assert asked(settings, "resume", "--local", "arm-1")[0] == 0
-        assert held(file) == {"arm-1": []}
+        eventually(lambda: file.exists() and lockouts(file))
+        assert list(lockouts(file)) == ["arm-1"]
+        assert ask(settings, "resume", "--local", "arm-1")[0] == 0
+        assert lockouts(file) == {"arm-1": []}
 
 
 def test_unanswered_stop_is_no_success(tmp_path: Path, port: int) -> None:
     settings = {**os.environ, "STRANDS_MESH_PORT": str(port), "STRANDS_STATE_DIR": str(tmp_path)}
-    code, told = asked(settings, "estop", "--mesh")
-    assert (code, told["stopped"]) == (3, None)
+    code, answer = ask(settings, "estop", "--mesh")
+    assert (code, answer["stopped"]) == (3, None)
 
 
 @pytest.mark.parametrize("command", [["serve", "so100"], ["peers"], ["stop", "--all"], ["estop"]])
@@ -93,8 +93,8 @@ def test_network_flag_that_the_mesh_does_not_take_is_refused(command: list[str])
 def test_keys_are_made_issued_and_named_for_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
-    def run(*words: str) -> tuple[int, str]:
-        ended = CliRunner().invoke(build(), ["mesh", "keys", *words])
+    def run(*arguments: str) -> tuple[int, str]:
+        ended = CliRunner().invoke(build(), ["mesh", "keys", *arguments])
         return ended.exit_code, ended.stdout
 
     assert run("init")[0] == 0

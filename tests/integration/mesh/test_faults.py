@@ -1,4 +1,4 @@
-"""Two and five peers in processes of their own, and what befalls them: killed, restarted, suspended."""
+"""Peers in processes that are killed, restarted and suspended."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def meet(peers: Sequence[MeshPeer], within: float = 20.0) -> None:
         peer.sees(*(other.peer_id for other in peers if other is not peer), within=within)
 
 
-def everybody_answers_everybody(peers: Sequence[MeshPeer]) -> None:
+def all_answer_all(peers: Sequence[MeshPeer]) -> None:
     for peer in peers:
         for other in peers:
             if other is not peer:
@@ -49,18 +49,18 @@ def test_two_peers_outlive_a_restart_of_the_other_and_of_their_own_session(join:
     for each in (child, hub):
         assert each.ask("restart") is True
         meet([hub, child])
-        everybody_answers_everybody([hub, child])
+        all_answer_all([hub, child])
 
 
 def test_five_peers_lose_their_hub_and_get_it_back(join: Join, port: int) -> None:
     hub = join("hub", "none")
     others = [join("console", "none"), join("arm-1", "arm"), join("sim-1"), join("sim-2")]
     meet([hub, *others])
-    everybody_answers_everybody([hub, *others])
+    all_answer_all([hub, *others])
     sessions = {each.peer_id: others[0].ask("zid", each.peer_id) for each in others[1:]}
     hub.kill()
     eventually(lambda: accepts(port), what="a survivor takes the port")
-    everybody_answers_everybody(others)
+    all_answer_all(others)
 
     def broadcast() -> list[str]:
         return sorted(each["responder_id"] for each in others[0].ask("broadcast", {"action": "ping"}, 0.7))
@@ -70,13 +70,13 @@ def test_five_peers_lose_their_hub_and_get_it_back(join: Join, port: int) -> Non
     assert {each.peer_id: others[0].ask("zid", each.peer_id) for each in others[1:]} == sessions
     back = join("hub", "none")
     meet([back, *others])
-    everybody_answers_everybody([back, *others])
+    all_answer_all([back, *others])
     # The relay that took over ends as well, and those that are left find each other once more.
     [relay] = [each for each in others if port in listened_on(each)]
     relay.kill()
     left = [back, *(other for other in others if other is not relay)]
     eventually(lambda: accepts(port), what="the next survivor takes the port")
-    everybody_answers_everybody(left)
+    all_answer_all(left)
 
 
 def test_suspended_robot_is_reported_silent_and_stops_when_it_continues(join: Join) -> None:
@@ -108,7 +108,7 @@ def test_stop_arrives_when_a_suspended_hub_continues(join: Join, port: int) -> N
     eventually(lambda: arm.ask("epoch") == console.ask("epoch"), within=20)
     eventually(lambda: arm.ask("moving") is False, what="it stands still")
     meet([hub, console, arm])
-    everybody_answers_everybody([hub, console, arm])
+    all_answer_all([hub, console, arm])
 
 
 def test_a_suspended_hub_that_is_killed_is_replaced(join: Join, port: int) -> None:
@@ -119,7 +119,7 @@ def test_a_suspended_hub_that_is_killed_is_replaced(join: Join, port: int) -> No
     assert console.ask("ping", "sim-1", 0.3)["status"] == "timeout"
     hub.kill()
     eventually(lambda: accepts(port), what="a survivor takes the port")
-    everybody_answers_everybody([console, sim])
+    all_answer_all([console, sim])
 
 
 def test_stated_endpoints_connect_in_any_order_and_outlive_the_listener(join: Join, port: int) -> None:
@@ -128,11 +128,11 @@ def test_stated_endpoints_connect_in_any_order_and_outlive_the_listener(join: Jo
     console = join("console", "none", ZENOH_LISTEN=endpoint)
     # Those that are connected to a third hear each other through it.
     meet([console, one, two])
-    everybody_answers_everybody([console, one, two])
+    all_answer_all([console, one, two])
     console.kill()
     console = join("console", "none", ZENOH_LISTEN=endpoint)
     meet([console, one, two])
-    everybody_answers_everybody([console, one, two])
+    all_answer_all([console, one, two])
     one.ask("start", "wave")
     assert {each["responder_id"] for each in two.ask("estop")[1]} == {"console", "sim-1", "sim-2"}
     eventually(lambda: one.ask("moving") == [], what="it stands still")
@@ -148,9 +148,9 @@ def test_a_bare_session_of_any_mode_takes_part_through_the_listener(join: Join, 
     if mode != "client":
         config["listen"] = {"endpoints": ["tcp/127.0.0.1:0"]}
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as bare:
-        heard: list[str] = []
-        bare.declare_subscriber("strands/*/presence", lambda sample: heard.append(str(sample.key_expr)))
-        eventually(lambda: {"strands/console/presence", "strands/sim-1/presence"} <= set(heard))
+        received: list[str] = []
+        bare.declare_subscriber("strands/*/presence", lambda sample: received.append(str(sample.key_expr)))
+        eventually(lambda: {"strands/console/presence", "strands/sim-1/presence"} <= set(received))
 
         def seen() -> bool:
             heartbeat = {"robot_id": "bare", "robot_type": "robot", "timestamp": time.time()}

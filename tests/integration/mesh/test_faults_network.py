@@ -1,4 +1,4 @@
-"""A mesh under mutual TLS over a network that parts and loses: namespaces and TAP devices."""
+"""A mesh under mutual TLS over a network that parts and loses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lab() -> Iterator[NetworkLab]:
 
 
 class Site:
-    """An arm and a simulation here, a console there; each is connected to the arm, which listens."""
+    """An arm, a simulation and a remote console, all connected to the arm."""
 
     def __init__(self, lab: NetworkLab, folder: Path, stack: ExitStack) -> None:
         self._folder, self._stack = folder, stack
@@ -78,10 +78,10 @@ def test_a_short_partition_costs_an_answer_and_no_binding(site: Site, lab: Netwo
 def test_long_partition_removes_peers_and_heals_by_itself(site: Site, lab: NetworkLab) -> None:
     site.arm.ask("start", "wave")
     lab.weather.parted = True
-    eventually(lambda: site.console.ask("reachable") == [], what="the far side is out of reach")
+    eventually(lambda: site.console.ask("reachable") == [], what="the remote side is out of reach")
     eventually(lambda: site.arm.ask("reachable") == ["sim-1"])
     assert site.sim.ask("ping", "arm-1")["status"] == "ok"
-    # A stop of the far side reaches nobody now, says so, and follows when the link is back.
+    # A stop of the remote side reaches no peer now, reports that, and is repeated when the link is back.
     assert site.console.ask("estop")[1] == []
     assert site.arm.ask("moving") is True
     lab.weather.parted = False

@@ -29,7 +29,7 @@ FLOOD = 600
 
 
 class Attacker:
-    """A bare session; it may put any source on its messages that it has heard."""
+    """A bare session; it may put any source on its messages that it has seen."""
 
     def __init__(self, net: OverZenoh) -> None:
         config: dict[str, Any] = {"mode": "client", "namespace": "strands"}
@@ -53,9 +53,9 @@ class Attacker:
 
     def hear(self, key: str) -> list[Any]:
         """Every sample on ``key`` from now on."""
-        found: list[Any] = []
-        self.session.declare_subscriber(key, found.append)
-        return found
+        messages: list[Any] = []
+        self.session.declare_subscriber(key, messages.append)
+        return messages
 
     @property
     def zid(self) -> str:
@@ -95,8 +95,8 @@ def request(sender: str, command: object, **fields: Any) -> dict[str, Any]:
 
 def stolen_source(attacker: Attacker, victim: str) -> Any:
     """The source that the victim puts on its own messages."""
-    heard = attacker.hear(f"strands/{victim}/presence")
-    return eventually(lambda: heard and heard[0].source_info, what=f"a heartbeat of {victim}")
+    received = attacker.hear(f"strands/{victim}/presence")
+    return eventually(lambda: received and received[0].source_info, what=f"a heartbeat of {victim}")
 
 
 def audited(net: Network, peer: str, event: str) -> None:
@@ -137,30 +137,30 @@ def test_a_hijacked_reply_does_not_count(net: OverZenoh, attacker: Attacker, sto
         attacker.put(f"strands/console/response/arm-1/{turn}", {**body, "timestamp": time.time()}, source)
         forged.append(turn)
 
-    def asked() -> bool:
+    def enough() -> bool:
         assert "forged" not in console.ask("send", "arm-1", {"action": "status"}, 20)["result"]
-        # A new subscription takes a moment to reach everybody, and a forgery that comes after the answer is no news.
+        # A new subscription takes a moment to reach all peers, and a forgery that comes after the answer is ignored.
         return len(forged) >= 5 and "response_hijack_rejected" in console.ask("audited")
 
-    heard = attacker.session.declare_subscriber("strands/arm-1/cmd", answer)
-    eventually(asked, what="five forged answers, one of them before the arm's own")
-    heard.undeclare()
+    received = attacker.session.declare_subscriber("strands/arm-1/cmd", answer)
+    eventually(enough, what="five forged answers, one of them before the arm's own")
+    received.undeclare()
 
 
 def test_a_recorded_command_moves_nothing_when_it_is_played_back(net: OverZenoh, attacker: Attacker) -> None:
     console, sim, arm = (net.peers[name] for name in ("console", "sim-1", "arm-1"))
-    heard = attacker.hear("strands/*/cmd")
-    # A new subscription takes a moment to reach everybody.
-    eventually(lambda: console.ask("ping", "sim-1") and heard)
-    heard.clear()
+    received = attacker.hear("strands/*/cmd")
+    # A new subscription takes a moment to reach all peers.
+    eventually(lambda: console.ask("ping", "sim-1") and received)
+    received.clear()
     step = {"action": "step", "steps": 2}
     assert console.ask("send", "sim-1", step, 20)["result"]["status"] == "success"
     assert console.ask("send", "arm-1", WAVE, 20)["result"]["status"] == "success"
     assert console.ask("send", "arm-1", {"action": "stop"}, 20)["result"]["ok"] is True
 
     def recorded() -> dict[str, Any] | None:
-        found = {json.loads(sample.payload.to_bytes())["command"]["action"]: sample for sample in list(heard)}
-        return found if {"step", "start"} <= set(found) else None
+        messages = {json.loads(sample.payload.to_bytes())["command"]["action"]: sample for sample in list(received)}
+        return messages if {"step", "start"} <= set(messages) else None
 
     tapes = eventually(recorded) or {}
     steps = sim.ask("steps")
@@ -182,12 +182,12 @@ def test_a_command_in_a_stolen_name_does_not_move_the_arm(net: OverZenoh, attack
 
 @pytest.mark.parametrize("sender", ["*", "**", "a/*", "$*", "", "a/b", None, 7, "x" * 129])
 def test_a_sender_that_is_no_identifier_gets_no_reply(net: OverZenoh, attacker: Attacker, sender: object) -> None:
-    heard = attacker.hear("strands/**")
-    eventually(lambda: any(str(sample.key_expr) == "strands/sim-1/presence" for sample in heard))
+    received = attacker.hear("strands/**")
+    eventually(lambda: any(str(sample.key_expr) == "strands/sim-1/presence" for sample in received))
     attacker.put("strands/sim-1/cmd", {**request("x", {"action": "ping"}), "sender_id": sender})
     attacker.put("strands/sim-1/cmd", request("probe", {"action": "ping"}))
-    eventually(lambda: any("/response/" in str(sample.key_expr) for sample in heard))
-    replies = [str(sample.key_expr) for sample in heard if "/response/" in str(sample.key_expr)]
+    eventually(lambda: any("/response/" in str(sample.key_expr) for sample in received))
+    replies = [str(sample.key_expr) for sample in received if "/response/" in str(sample.key_expr)]
     assert all(key.startswith("strands/probe/response/sim-1/") for key in replies)
     audited(net, "sim-1", "command_rejected")
 
@@ -215,7 +215,7 @@ def test_message_above_its_topics_size_is_dropped(net: OverZenoh, attacker: Atta
 
 
 def floods(attacker: Attacker) -> dict[str, Callable[[int], tuple[str, object]]]:
-    """What each topic is flooded with; the worst that passes its decoder, where there is one."""
+    """The worst messages for each topic that pass its decoder."""
     zid, now, assertion = attacker.zid, time.time(), {"v": 1, "epoch": "0" * 32, "targets": ["sim-1"], "nonce": "n"}
     frame = {"peer_id": "console", "device": "leader", "method": "arm", "t": now, "action": {"j": 1.0}}
     telemetry = ("pose", "imu", "odom", "health", "lidar_summary", "lidar_state", "map_info", "state", "stream")
@@ -236,7 +236,7 @@ def floods(attacker: Attacker) -> dict[str, Callable[[int], tuple[str, object]]]
     }  # fmt: skip
     for name, leaf in sensors.items():
         made[name] = lambda n, leaf=leaf: (f"strands/m/{leaf}", {"peer_id": "m", "t": now, "n": n})  # type: ignore[misc]
-    # Last, because it locks everybody.
+    # Last, because it locks every peer.
     made["estop"] = lambda n: (
         "strands/safety/estop",
         {"peer_id": "m", "t": now, "estop_id": f"{n:032x}", "source_zid": "0" if n % 2 else zid},
@@ -289,7 +289,7 @@ def test_a_flood_on_any_topic_leaves_pings_and_stops_answered_and_nothing_behind
     sent = console.ask("rest")["frames"]
 
     def taken() -> int:
-        # Frames of the leader's that a busy machine held up and brought together may be thinned out, others may not.
+        # Frames of the leader that a busy machine delayed and delivered together may be dropped, others may not.
         stats = arm.ask("followed")
         count: int = stats["frames_received"] + stats["rate_dropped"]
         return count
@@ -314,7 +314,7 @@ def test_a_flood_on_any_topic_leaves_pings_and_stops_answered_and_nothing_behind
     followed = arm.ask("unfollow")
     assert received <= followed["frames_received"] <= sent
     assert followed["rejected_source"] > FLOOD
-    assert len(console.ask("heard", "everything")) == 256
+    assert len(console.ask("received", "everything")) == 256
     assert arm.ask("epoch") == f"{0:032x}"
     console.ask("deaf", "everything")
     grown = [last - first for first, last in zip(sizes[0], sizes[-1], strict=True)]

@@ -81,7 +81,7 @@ def test_peers_command_each_other_and_report_the_delivery(join: Join) -> None:
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
     assert console.ask("send", "sim-1", start, 20)["result"]["status"] == "success"
     assert sim.ask("moving") == ["left"]
-    offline = console.ask("ping", "nobody")
+    offline = console.ask("ping", "absent")
     assert (offline["status"], offline["reason"], offline["via"]) == ("offline", "offline", "direct")
 
 
@@ -132,16 +132,16 @@ def test_late_joiner_locks_on_a_retained_stop_unless_it_was_resumed(join: Join, 
 def test_stop_crosses_the_bridge_in_both_directions(join: Join) -> None:
     local = {"STRANDS_MESH_PORT": str(free_port())}
     bridge = join("bridge", "none", STRANDS_MESH_BACKEND="bridge", **local)
-    near, far = join("sim-1", STRANDS_MESH_BACKEND="zenoh", **local), join("sim-2")
+    local_peer, remote_peer = join("sim-1", STRANDS_MESH_BACKEND="zenoh", **local), join("sim-2")
     bridge.sees("sim-1", "sim-2")
-    far.sees("bridge")
+    remote_peer.sees("bridge")
     bridge.ask("estop")
-    for peer in (near, far):
+    for peer in (local_peer, remote_peer):
         eventually(lambda peer=peer: peer.ask("epoch") == bridge.ask("epoch"))
-    for peer in (near, far, bridge):
+    for peer in (local_peer, remote_peer, bridge):
         peer.ask("clear")
-    far.ask("estop")
-    eventually(lambda: bridge.ask("epoch") == far.ask("epoch"))
+    remote_peer.ask("estop")
+    eventually(lambda: bridge.ask("epoch") == remote_peer.ask("epoch"))
 
 
 @pytest.mark.system

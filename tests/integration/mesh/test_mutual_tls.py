@@ -18,7 +18,7 @@ Fleet = dict[str, dict[str, str]]
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Fleet:
-    """Certificates of one authority and access rules by which only the console commands."""
+    """Certificates and access rules by which only the console commands."""
     folder = tmp_path / "keys"
     keys.init(folder)
     names = ("console", "sim-1", "sim-2")
@@ -124,7 +124,7 @@ def test_the_fleet_of_the_guide_works_with_rules_and_stated_endpoints(join: Join
     assert console.ask("ping", "sim-1")["status"] == console.ask("ping", "sim-2")["status"] == "ok"
     assert one.ask("ping", "sim-2", 0.5)["status"] == "timeout"
     one.ask("start", "wave")
-    # A robot commands nobody, but its emergency stop is everybody's.
+    # A robot may not command, but its emergency stop counts for every peer.
     two.ask("estop")
     eventually(lambda: one.ask("epoch") == console.ask("epoch") == two.ask("epoch"))
     eventually(lambda: one.ask("moving") == [], what="it stands still")

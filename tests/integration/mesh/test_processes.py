@@ -1,4 +1,4 @@
-"""Peers in real processes over real Zenoh on loopback, with no configuration but a port."""
+"""Peers in real processes over real Zenoh on loopback."""
 
 from __future__ import annotations
 
@@ -106,9 +106,9 @@ def test_a_locked_robot_comes_back_locked_from_a_restart(join: Join, tmp_path: P
     console.ask("estop")
     eventually(lambda: robot.ask("epoch"))
     epoch = robot.ask("epoch")
-    # It is locked at once and kept a moment later, because no disk may delay a halt.
-    kept = tmp_path / "arm-1" / "lockouts.json"
-    eventually(lambda: kept.exists() and epoch in kept.read_text())
+    # It is locked at once and stored a moment later, because no disk may delay a halt.
+    stored = tmp_path / "arm-1" / "lockouts.json"
+    eventually(lambda: stored.exists() and epoch in stored.read_text())
     robot.kill()
     assert join("arm-1", "arm").ask("epoch") == epoch
 
@@ -139,7 +139,7 @@ def test_a_leader_in_another_process_moves_the_follower_until_it_is_stopped(join
             leader.ask("publish", "strands/leader-1/input/leader", {**frame, "action": {"j": number / 10}})
             time.sleep(0.02)
 
-    # One after another: frames that were held up and come as a flood may be thinned out.
+    # One after another: delayed frames that arrive together may be dropped.
     for number in range(20):
         lead(number, 1)
         eventually(lambda number=number: len(follower.ask("actions")) == number + 1)

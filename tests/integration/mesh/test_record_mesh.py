@@ -1,4 +1,4 @@
-"""Peers of the mesh are recorded from elsewhere: joints, pictures where they publish any, and the fleet's stops."""
+"""Peers of the mesh are recorded by another process."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def settings(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def seen(run: Path) -> set[str]:
-    """The cameras whose pictures are in the recording so far."""
+    """The cameras whose frames are in the recording so far."""
     return {item.camera for item in read_items(run) if isinstance(item, RecordedPicture)}
 
 
-def started(*words: str) -> Any:
-    return subprocess.Popen([*COMMAND, *words, "--json"], stdout=subprocess.PIPE, text=True)
+def started(*arguments: str) -> Any:
+    return subprocess.Popen([*COMMAND, *arguments, "--json"], stdout=subprocess.PIPE, text=True)
 
 
 @pytest.mark.usefixtures("settings")

@@ -1,4 +1,4 @@
-"""A recording leads a follower of another process over the mesh, and does no more than the follower allows."""
+"""A recording leads a follower of another process over the mesh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Join = Callable[..., MeshPeer]
 
 @pytest.fixture
 def wave(tmp_path: Path) -> Path:
-    """Twenty seconds of a joint that the followers here have; it moves for ten of them."""
+    """Twenty seconds of a joint of these followers; it moves for ten of them."""
     frames = [(0.1 * step, {"shoulder.pos": min(0.1 * step, 10.0)}) for step in range(200)]
     write_csv(tmp_path / "wave.csv", frames)
     return tmp_path / "wave.csv"
@@ -32,9 +32,9 @@ def replay(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("STRANDS_MESH_PORT", str(port))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
 
-    def start(*words: str) -> subprocess.Popen[str]:
+    def start(*arguments: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [*COMMAND, "replay", *words, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [*COMMAND, "replay", *arguments, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
 
     return start
@@ -52,8 +52,8 @@ def followed(arm: MeshPeer, least: int) -> None:
 
 def test_an_approved_arm_is_led_to_the_end_and_stopped(join: Join, replay: Any, wave: Path) -> None:
     arm = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive")
-    code, [told] = ended(replay(str(wave), "--to", "mesh:arm-1", "--speed", "10"))
-    assert (code, told["stopped"], told["errors"]) == (0, True, 0), told
+    code, [report] = ended(replay(str(wave), "--to", "mesh:arm-1", "--speed", "10"))
+    assert (code, report["stopped"], report["errors"]) == (0, True, 0), report
     actions = [action["shoulder.pos"] for action in arm.ask("actions")]
     assert actions == sorted(actions)
     assert actions[-1] == pytest.approx(10.0)
@@ -64,10 +64,10 @@ def test_without_approval_nothing_moves_and_the_command_that_approves_is_named(
     join: Join, replay: Any, wave: Path
 ) -> None:
     arm = join("arm-1", "arm")
-    code, [told] = ended(replay(str(wave), "--to", "mesh:arm-1"))
+    code, [report] = ended(replay(str(wave), "--to", "mesh:arm-1"))
     assert code == 1
-    assert "teleop_receive" in told["reason"]
-    assert "grant" in told["reason"]
+    assert "teleop_receive" in report["reason"]
+    assert "grant" in report["reason"]
     assert arm.ask("actions") == []
 
 
@@ -91,8 +91,8 @@ def test_ctrl_c_stops_the_follower_first(join: Join, replay: Any, wave: Path) ->
     replaying = replay(str(wave), "--to", "mesh:arm-1")
     followed(arm, 10)
     replaying.send_signal(signal.SIGINT)
-    code, [told] = ended(replaying)
-    assert (code, told["why"], told["stopped"]) == (0, "Ctrl-C.", True)
+    code, [report] = ended(replaying)
+    assert (code, report["why"], report["stopped"]) == (0, "Ctrl-C.", True)
     assert len(arm.ask("halts")[0]) == 1
 
 
@@ -101,16 +101,16 @@ def test_lost_follower_is_reported_as_not_having_answered_the_stop(join: Join, r
     replaying = replay(str(wave), "--to", "mesh:arm-1")
     followed(arm, 5)
     arm.kill()
-    code, [told] = ended(replaying)
+    code, [report] = ended(replaying)
     assert code in (1, 3)
-    assert "stop" in told["reason"]
-    assert "arm-1" in told["reason"]
+    assert "stop" in report["reason"]
+    assert "arm-1" in report["reason"]
 
 
 def test_absent_follower_is_reported_in_one_sentence(replay: Any, wave: Path) -> None:
-    code, [told] = ended(replay(str(wave), "--to", "mesh:nobody-1"))
+    code, [report] = ended(replay(str(wave), "--to", "mesh:absent-1"))
     assert code == 3
-    assert "nobody-1" in told["reason"]
+    assert "absent-1" in report["reason"]
 
 
 def test_a_leader_that_is_published_drives_a_robot_of_this_machine(replay: Any, wave: Path, tmp_path: Path) -> None:
@@ -127,21 +127,21 @@ def test_a_leader_that_is_published_drives_a_robot_of_this_machine(replay: Any, 
             done = subprocess.run([*COMMAND, *line], stdout=subprocess.PIPE, text=True, check=False, timeout=90)
             return [json.loads(each) for each in done.stdout.splitlines()] if done.returncode == 0 else []
 
-        [told] = eventually(following, what="the leader is on the mesh")
+        [report] = eventually(following, what="the leader is on the mesh")
     finally:
         leading.kill()
         leading.communicate()
-    assert told["stopped"] is True
-    assert told["frames_received"] > 10
-    assert (told["errors"], told["rejected"]) == (0, 0)
+    assert report["stopped"] is True
+    assert report["frames_received"] > 10
+    assert (report["errors"], report["rejected"]) == (0, 0)
 
 
 def test_leader_is_published_without_a_local_follower(replay: Any, wave: Path) -> None:
     line = [*COMMAND, "teleop", str(wave), "none", "--for", "2", "--json"]
     done = subprocess.run([*line, "--publish", "lead-1"], stdout=subprocess.PIPE, text=True, check=True, timeout=90)
-    told = json.loads(done.stdout)
-    assert told["frames"] > 10
-    assert told["errors"] == 0
+    report = json.loads(done.stdout)
+    assert report["frames"] > 10
+    assert report["errors"] == 0
     refused = subprocess.run(line, stdout=subprocess.PIPE, text=True, check=False, timeout=90)
     assert refused.returncode == 2
     assert "--publish" in json.loads(refused.stdout)["reason"]

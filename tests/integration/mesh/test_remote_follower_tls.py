@@ -1,4 +1,4 @@
-"""A follower is led by an operator whose certificate speaks for the command, under rules that deny everything else."""
+"""A certified operator leads a follower under rules that deny all else."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_an_operator_leads_a_certified_peer(hub: str, side: Callable[..., Mappin
     finally:
         serving.kill()
         serving.communicate()
-    told = json.loads(done.stdout.splitlines()[-1])
-    assert done.returncode == 0, told
-    assert told["stopped"] is True
-    assert told["frames"] > 10
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert done.returncode == 0, report
+    assert report["stopped"] is True
+    assert report["frames"] > 10

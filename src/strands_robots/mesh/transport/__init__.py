@@ -1,4 +1,4 @@
-"""Transports of the mesh: what every backend offers, and the backends themselves, each loaded when it is named.
+"""Transports of the mesh: their protocol, and the backends, loaded when named.
 
 ``zenoh`` is the default, ``iot`` is MQTT 5, ``bridge`` is both at once, ``memory`` stays inside one process.
 """
@@ -95,10 +95,10 @@ class Transport(Protocol):
         """True between connect and close, as far as the transport can tell."""
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
-        """Publish. Raises TransportError when closed, WireError for a message above its topic's size."""
+        """Publish. Raises TransportError when closed, WireError when too large."""
 
     def declare_subscriber(self, key: str, callback: Callback) -> Declaration:
-        """Receive a key expression; ``*`` is one segment, ``**`` any number. Raises TransportError when closed."""
+        """Receive a key expression of ``*`` (one segment) and ``**`` (any number)."""
 
 
 @runtime_checkable

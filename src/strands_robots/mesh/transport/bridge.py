@@ -1,4 +1,4 @@
-"""Two transports as one: everything on Zenoh, the local leg, and the bridged topics on MQTT, the cloud leg."""
+"""Two transports as one: a local leg for everything, a cloud leg for some."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LOCAL_FIRST = frozenset({"presence", "response", "health", "safety_event"})
 
 
 class SeenCommands:
-    """Commands that came by one leg and are not served again for the other; bounded by age and number."""
+    """Commands that came by one leg already; bounded by age and number."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -94,7 +94,7 @@ class _NoToken:
 
 
 class _BridgedSubscriber:
-    """One subscriber on the legs that carry its topic; ``pending`` are those it is not declared on yet."""
+    """One subscriber on several legs; ``pending`` are those it lacks yet."""
 
     def __init__(self, key: str, callbacks: list[tuple[Transport, Callback]]) -> None:
         self.key = key
@@ -104,7 +104,7 @@ class _BridgedSubscriber:
         self._lock = threading.Lock()
 
     def declare(self) -> list[str]:
-        """Declare on every pending leg that is up; return the reason of each that refused."""
+        """Declare on every pending leg that is up; return the refusals."""
         problems: list[str] = []
         with self._lock:
             for entry in [] if self.gone else list(self.pending):
@@ -269,7 +269,7 @@ class BridgeTransport:
         return problems
 
     def _repair(self) -> None:
-        """Start a thread that connects, declares and publishes until nothing is missing on either leg."""
+        """Start a thread that works until both legs have everything."""
         with self._lock:
             if self._repairing is None and not self._closed.is_set() and not self._complete():
                 self._repairing = threading.Thread(target=self._run, name="mesh-bridge-repair", daemon=True)
@@ -330,7 +330,7 @@ def _bridged_names() -> frozenset[str]:
 
 
 def _publisher(key: str) -> str:
-    """Return the peer that publishes on a key; on the key of a reply that is the responder."""
+    """Return the publisher of a key; of a reply's key that is the responder."""
     parts = key.split("/")
     if len(parts) > 3 and parts[2] == "response":
         return parts[3]
@@ -338,7 +338,7 @@ def _publisher(key: str) -> str:
 
 
 def _without_session(topic: topics.Topic, data: bytes) -> bytes:
-    """Remove the session from a stop or a resume: receivers refuse it where samples carry no session."""
+    """Remove the session from a stop or resume, which the cloud leg lacks."""
     if topic.name not in SAFETY:
         return data
     try:
@@ -350,7 +350,7 @@ def _without_session(topic: topics.Topic, data: bytes) -> bytes:
 
 
 def _safety_id(data: bytes, topic: topics.Topic) -> str:
-    """Return the id of a stop or the nonce of a resume, by which two messages are the same one."""
+    """Return a stop's id or a resume's nonce, which identifies the message."""
     try:
         body = wire.decode(data, topic.max_bytes)
     except wire.WireError:

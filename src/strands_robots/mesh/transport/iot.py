@@ -48,7 +48,7 @@ class Account:
 
     @classmethod
     def from_settings(cls) -> Account:
-        """The account that the environment names. Raises TransportError for a setting or file that is missing."""
+        """The account of the environment. Raises TransportError for what is missing."""
         endpoint, thing = settings.raw("STRANDS_IOT_ENDPOINT"), settings.raw("STRANDS_IOT_THING_NAME")
         folder = settings.raw("STRANDS_IOT_CERT_DIR")
         stated = {
@@ -83,7 +83,7 @@ class _Subscriber:
 
 
 class IotMqttTransport:
-    """One MQTT 5 client, which reconnects by itself and subscribes anew where the broker has no session of it."""
+    """One MQTT 5 client that reconnects and subscribes anew by itself."""
 
     def __init__(self, account: Account | None = None) -> None:
         self._account = account
@@ -147,7 +147,7 @@ class IotMqttTransport:
         self._publish(key, payload)
 
     def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
-        """Publish and return whether the topic has subscribers; None where the broker did not answer in time."""
+        """Publish; return whether the topic has subscribers, None if unanswered."""
         future = self._publish(key, payload)
         if future is None:
             return None

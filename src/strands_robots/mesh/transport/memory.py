@@ -37,7 +37,7 @@ class MemoryBus:
         self._cut: set[MemoryTransport] = set()
 
     def join(self, declared: _Declared) -> None:
-        """Add a subscriber, watcher or token; a watcher is called for the tokens there are."""
+        """Add a subscriber, watcher or token; watchers learn of existing tokens."""
         with self._lock:
             self._declared.append(declared)
             tokens, watchers = self._tokens(), self._watchers()
@@ -68,7 +68,7 @@ class MemoryBus:
             return [each for each in self._declared if each.owner is owner]
 
     def partition(self, transport: MemoryTransport, cut: bool = True) -> None:
-        """Lose every message from and to a session, until it is healed with ``cut=False``."""
+        """Lose every message from and to a session; ``cut=False`` heals it."""
         with self._lock:
             (self._cut.add if cut else self._cut.discard)(transport)
 

@@ -1,4 +1,4 @@
-"""Zenoh as a transport: one session a process, and a loopback hub that survives the process that opened it."""
+"""Zenoh as a transport: one session a process, and a hub on loopback."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class ZenohTransport:
 
     @property
     def posture(self) -> Posture | None:
-        """The posture that the session was opened with; None before the first connect where none was given."""
+        """The posture that the session was opened with; None before it is known."""
         return self._posture
 
     def connect(self) -> None:
@@ -117,7 +117,7 @@ class ZenohTransport:
         return bool(session.info.peers_zid() or session.info.routers_zid())
 
     def anchored(self) -> bool:
-        """True while liveliness tokens of others can reach us: we listen ourselves, or are linked to the hub."""
+        """True while tokens of others can reach us: we listen, or the hub is linked."""
         posture = self._posture
         listens = self._hub or (posture is not None and bool(posture.listen))
         return listens or self.linked()
@@ -189,7 +189,7 @@ class ZenohTransport:
             raise TransportError(f"{key}: {exc}") from None
 
     def _put_once(self, key: str, data: bytes) -> None:
-        """Publish on a key that is used once, such as that of a reply, without declaring a publisher."""
+        """Publish on a key that is used once, without declaring a publisher."""
         zenoh, session = self._zenoh, self._require()
         session.put(
             key,

@@ -1,4 +1,4 @@
-"""The Zenoh configuration of one session: endpoints, certificates, access rules, rates and sizes.
+"""The Zenoh configuration of a session: endpoints, TLS, access, rates, sizes.
 
 A mesh bound to loopback alone comes up without certificates. Leaving loopback needs mutual TLS, or an opt-in
 that says in its name what it is.
@@ -133,7 +133,7 @@ class Posture:
 
 
 def discovery_timeout(default: float) -> float:
-    """Seconds to wait for a peer to be seen: :data:`LINK_DISCOVERY_S` with stated endpoints, else ``default``."""
+    """Seconds to wait for a peer: longer than ``default`` with stated endpoints."""
     return LINK_DISCOVERY_S if settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT") else default
 
 
@@ -152,7 +152,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def hub(posture: Posture, session: str | None = None) -> dict[str, Any]:
-    """Configure a session that listens on the loopback hub's endpoint, and fails where it is taken."""
+    """Configure a session that listens as the loopback hub, or fails."""
     config = _base(posture, session)
     config["mode"] = "peer"
     config["listen"] = {"endpoints": [posture.hub], "exit_on_failure": True}
@@ -160,7 +160,7 @@ def hub(posture: Posture, session: str | None = None) -> dict[str, Any]:
 
 
 def child(posture: Posture, session: str | None = None, timeout_ms: int = 1000) -> dict[str, Any]:
-    """Configure a client of the loopback hub; opening it fails when no hub answers within ``timeout_ms``."""
+    """Configure a client of the loopback hub; opening fails without a hub."""
     config = _base(posture, session)
     config["mode"] = "client"
     config["listen"] = {"endpoints": []}
@@ -169,7 +169,7 @@ def child(posture: Posture, session: str | None = None, timeout_ms: int = 1000) 
 
 
 def explicit(posture: Posture, session: str | None = None) -> dict[str, Any]:
-    """Configure a session with stated endpoints; a listener must bind, a connection may come later.
+    """Configure a session with stated endpoints; a connection may come later.
 
     It is a router, because Zenoh does not forward between two peers that are connected to a third. Like a peer it
     connects to those that gossip tells of, or multicast where that is on. Measured on 1.10 with peers, clients and
@@ -233,7 +233,7 @@ def _base(posture: Posture, session: str | None) -> dict[str, Any]:
 
 
 def _access_control(posture: Posture, prefix: str) -> dict[str, Any]:
-    """The operator's rules, or the table's topics for every holder of a certificate and nothing else.
+    """The operator's rules, or by default every topic for certified peers.
 
     Raises:
         TransportError: rules that cannot be read, are switched off, or allow by default without the opt-in.
@@ -321,7 +321,7 @@ def _refuse_to_leave_loopback(endpoints: tuple[str, ...], multicast: bool) -> No
     if not outside:
         return
     if _insecure():
-        logger.warning("The mesh is open to everybody on the network: %s, without certificates.", ", ".join(outside))
+        logger.warning("The mesh is open to everyone on the network: %s, without certificates.", ", ".join(outside))
         return
     raise TransportError(
         f"{', '.join(outside)} leaves this machine, and the mesh has no certificates: run '{KEYS_COMMAND}' and set "
