@@ -12,16 +12,15 @@ import pytest
 from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, log_safety_event
-from strands_robots.safety import integrity
-from strands_robots.safety.journal import Entry, Journal
+from strands_robots.audit.journal import AuditEntry, Journal, verify
 
 WRITER = """
 import sys
 from pathlib import Path
-from strands_robots.safety.journal import Entry, Journal
+from strands_robots.audit.journal import AuditEntry, Journal
 journal = Journal(Path(sys.argv[1]))
 for number in range(int(sys.argv[3])):
-    journal.append([Entry(0.0, "e", sys.argv[2], {"n": number, "fill": "x" * 500})])
+    journal.append([AuditEntry(0.0, "e", sys.argv[2], {"n": number, "fill": "x" * 500})])
     print(number, flush=True)
 """
 
@@ -46,7 +45,7 @@ def test_four_processes_at_once_leave_one_whole_chain(tmp_path: Path) -> None:
     for each in writers:
         each.communicate(timeout=60)
         assert each.returncode == 0
-    found = integrity.verify(Journal(tmp_path), keyed=False)
+    found = verify(Journal(tmp_path), keyed=False)
     assert (found["total"], found["gaps"], found["ok"]) == (160, 0, True)
 
 
@@ -61,14 +60,12 @@ def test_a_writer_killed_in_the_middle_loses_nothing_it_acknowledged(tmp_path: P
     acknowledged = max([acknowledged, *map(int, rest)])
     journal = Journal(tmp_path)
     assert {each["payload"]["n"] for each in journal.records()} >= set(range(acknowledged + 1))
-    journal.append([Entry(0.0, "e", "arm-1", {"n": -1})])
-    found = integrity.verify(journal, keyed=False)
+    journal.append([AuditEntry(0.0, "e", "arm-1", {"n": -1})])
+    found = verify(journal, keyed=False)
     assert found["ok"], found
 
 
-def test_a_disk_that_fills_refuses_the_record_aloud_and_what_was_acknowledged_stays(
-    tmp_path: Path, state_directory: Path
-) -> None:
+def test_full_disk_is_logged_and_acknowledged_records_stay(tmp_path: Path, state_directory: Path) -> None:
     run = subprocess.run([sys.executable, "-c", FULL], capture_output=True, text=True, timeout=60, check=True)
     answers = [line == "True" for line in run.stdout.split()]
     assert True in answers
@@ -77,11 +74,11 @@ def test_a_disk_that_fills_refuses_the_record_aloud_and_what_was_acknowledged_st
     journal = Journal(state_directory)
     kept = [each["payload"]["n"] for each in journal.records()]
     assert kept[: answers.count(True)] == list(range(answers.count(True)))
-    journal.append([Entry(0.0, "e", "arm-1", {"n": 99})])
-    assert integrity.verify(journal, keyed=False)["ok"]
+    journal.append([AuditEntry(0.0, "e", "arm-1", {"n": 99})])
+    assert verify(journal, keyed=False)["ok"]
 
 
-def test_a_directory_that_cannot_be_written_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_directory_that_cannot_be_written_delays_no_caller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = tmp_path / "file"
     place.write_text("in the way")
     monkeypatch.setenv("STRANDS_MESH_AUDIT_DIR", str(place))

@@ -1,4 +1,4 @@
-"""The safety record: who stopped what, who resumed it, what was refused.
+"""The safety audit: a record of every stop, resume and refusal.
 
 :func:`log_safety_event` hands the record to one writer thread and returns at once: it never waits for a disk and
 never raises, so that it may stand on the way of a stop. A record is acknowledged when :func:`flush_audit` returns
@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.safety import integrity
+from strands_robots.audit.journal import AuditEntry, Journal, verify
 from strands_robots.safety.approval import state_dir
-from strands_robots.safety.journal import Entry, Journal
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -45,13 +44,13 @@ def log_safety_event(event_type: str, peer_id: str, payload: dict[str, Any]) -> 
     Args:
         event_type: short lower-case name, such as ``emergency_stop``.
         peer_id: the robot or peer that it happened at.
-        payload: what is to be known; what JSON cannot hold is recorded by its short ``repr``.
+        payload: facts of the event; a value that JSON cannot hold is recorded by its short ``repr``.
     """
-    _WRITER.put(_journal_key(), Entry(time.time(), _text(event_type), _text(peer_id), payload))
+    _WRITER.put(_journal_key(), AuditEntry(time.time(), _text(event_type), _text(peer_id), payload))
 
 
 def flush_audit(timeout: float = FLUSH_S) -> bool:
-    """True when every record handed over so far is on the disk; waits ``timeout`` seconds at most."""
+    """Return True when every record so far is on the disk; waits ``timeout`` seconds at most."""
     if not _WRITER.used:
         return True
     done = threading.Event()
@@ -60,19 +59,19 @@ def flush_audit(timeout: float = FLUSH_S) -> bool:
 
 
 def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
-    """Every record over all rotations, oldest first; with ``since`` (wall-clock s) only those not older."""
+    """Return every record over all rotations, oldest first; with ``since`` (wall-clock s) only those not older."""
     flush_audit(FLUSH_S)
-    records = _journal(_journal_key()).records()
+    records = Journal(*_journal_key()).records()
     return [each for each in records if since is None or _time(each) >= since]
 
 
 def verify_audit_integrity() -> dict[str, Any]:
     """Counts ``total``, ``signed``, ``verified``, ``bad``, ``missing``, ``gaps``, ``torn``, ``broken``, the list
-    ``breaks`` that says where, ``head``, and ``ok``; see :func:`strands_robots.safety.integrity.verify`.
+    ``breaks`` that says where, ``head``, and ``ok``; see :func:`strands_robots.audit.journal.verify`.
     """
     flush_audit(FLUSH_S)
     key = _journal_key()
-    return integrity.verify(_journal(key), keyed=key[1] is not None)
+    return verify(Journal(*key), keyed=key[1] is not None)
 
 
 _Key = tuple[Path, bytes | None]
@@ -81,10 +80,6 @@ _Key = tuple[Path, bytes | None]
 def _journal_key() -> _Key:
     secret = settings.raw("STRANDS_MESH_AUDIT_PSK")
     return audit_directory(), secret.encode() if secret else None
-
-
-def _journal(key: _Key) -> Journal:
-    return Journal(*key)
 
 
 def _text(value: object) -> str:
@@ -97,15 +92,15 @@ def _time(record: dict[str, Any]) -> float:
 
 
 class _Pending:
-    """Records of one journal that are not on the disk yet, and who waits for them."""
+    """Records of one journal that are not on the disk yet, and the flushes that wait for them."""
 
     def __init__(self, key: _Key) -> None:
         self.directory = key[0]
-        self.journal = _journal(key)
-        self.entries: deque[Entry] = deque()
+        self.journal = Journal(*key)
+        self.entries: deque[AuditEntry] = deque()
         self.waiting: list[threading.Event] = []
         self.failing = False
-        self._told = 0
+        self._reported = 0
 
     def write(self) -> None:
         """Put everything on the disk, or keep it and say so."""
@@ -119,7 +114,7 @@ class _Pending:
             return
         if self.failing:
             logger.warning("The safety audit in %s is written again.", self.directory)
-        self.failing, self._told = False, 0
+        self.failing, self._reported = False, 0
         self.entries.clear()
         for done in self.waiting:
             done.set()
@@ -131,9 +126,9 @@ class _Pending:
         if not self.failing:
             logger.critical("The safety audit in %s cannot be written: %s. Records are kept.", self.directory, exc)
         self.failing = True
-        for entry in list(self.entries)[self._told :]:
+        for entry in list(self.entries)[self._reported :]:
             logger.critical("Audit not on disk: %s %s %s", entry.event, entry.peer_id, shown(entry.payload))
-        self._told = len(self.entries)
+        self._reported = len(self.entries)
 
     def _shed(self) -> None:
         lost = len(self.entries) - PENDING_MAX
@@ -143,20 +138,20 @@ class _Pending:
         for _ in range(lost + 1):
             gone = self.entries.popleft()
             counted += gone.payload["lost"] - 1 if gone.event == LOST else 0
-        self.entries.appendleft(Entry(time.time(), LOST, "audit", {"lost": lost + counted}))
-        self._told = min(self._told, len(self.entries))
+        self.entries.appendleft(AuditEntry(time.time(), LOST, "audit", {"lost": lost + counted}))
+        self._reported = min(self._reported, len(self.entries))
 
 
 class _Writer:
     """The thread that owns the journals. Everything reaches it through one queue that is never full."""
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[tuple[_Key, Entry | threading.Event]] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[_Key, AuditEntry | threading.Event]] = queue.SimpleQueue()
         self._pending: dict[_Key, _Pending] = {}
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def put(self, key: _Key, item: Entry | threading.Event) -> None:
+    def put(self, key: _Key, item: AuditEntry | threading.Event) -> None:
         """Hand over a record, or an event to set when all before it are on the disk."""
         self._queue.put((key, item))
         # A fork leaves the child with the object and without the thread.
@@ -184,19 +179,19 @@ class _Writer:
             key, item = self._queue.get(timeout=RETRY_S if unwritten else None)
             while True:
                 pending = self._pending.setdefault(key, _Pending(key))
-                if isinstance(item, Entry):
+                if isinstance(item, AuditEntry):
                     pending.entries.append(item)
                 else:
                     pending.waiting.append(item)
                 key, item = self._queue.get_nowait()
 
 
-_told: set[Path] = set()
+_warned: set[Path] = set()
 
 
 def _warn_of_readers(directory: Path) -> None:
-    if directory not in _told:
-        _told.add(directory)
+    if directory not in _warned:
+        _warned.add(directory)
         if stat.S_IMODE(directory.stat().st_mode) & 0o077:
             logger.warning("%s is open to other users; the safety audit belongs in a 0700 directory.", directory)
 

@@ -1,4 +1,4 @@
-"""The audit file: one chained record a line, append only, shared by every process under one lock.
+"""The audit file: one chained record a line, append only, shared by every process under one lock, and its check.
 
 A record is sorted compact JSON with ``ts`` (wall-clock s), ``event``, ``peer_id``, ``payload``, ``seq`` (per peer,
 never reused), ``prev`` (SHA-256 of the line before it) and, with a key, ``sig`` (HMAC-SHA256 of the rest). The head
@@ -27,12 +27,13 @@ NAME = "mesh_audit.jsonl"
 GENESIS = "0" * 64
 MAX_BYTES = 100 * 2**20
 KEPT_FILES = 5
+BREAKS_SHOWN = 100
 PAYLOAD_MAX_BYTES = 256 * 2**10
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """What is to be recorded."""
+class AuditEntry:
+    """An event to be recorded."""
 
     ts: float
     event: str
@@ -42,7 +43,7 @@ class Entry:
 
 @dataclass(slots=True)
 class Head:
-    """Where the chain stands: hash of the last line, size and inode of its file, last number of each peer.
+    """State of the chain: hash of the last line, size and inode of its file, last number of each peer.
 
     ``origin`` is the hash that the oldest kept record continues from.
     """
@@ -72,9 +73,11 @@ class Journal:
         self._kept = kept
         self._head: Head | None = None
 
-    def append(self, entries: Sequence[Entry]) -> None:
-        """Write every entry and return when all of them are on the disk; on an error none is
-        acknowledged, though some may have got there: a second try may record them twice, never not at all."""
+    def append(self, entries: Sequence[AuditEntry]) -> None:
+        """Write every entry and return when all of them are on the disk.
+
+        On an error none is acknowledged, though some may have been written: a second try may record them twice.
+        """
         self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         with self._locked():
             head = self._current()
@@ -95,32 +98,32 @@ class Journal:
             self._head = head
 
     def lines(self) -> Iterator[tuple[Path, int, bytes]]:
-        """Every line, oldest first: file, line number from 1, bytes without the line's end."""
+        """Yield every line, oldest first: file, line number from 1, bytes without the line's end."""
         for path in self.files():
             with contextlib.suppress(FileNotFoundError), path.open("rb") as file:  # rotated away meanwhile
                 for number, line in enumerate(file, 1):
                     yield path, number, line.rstrip(b"\n")
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """Every whole record, oldest first."""
+        """Yield every whole record, oldest first."""
         for _, _, line in self.lines():
             record = parse(line)
             if record is not None:
                 yield record
 
     def files(self) -> list[Path]:
-        """The files that exist, oldest first."""
+        """Return the files that exist, oldest first."""
         names = [self._rotated(number) for number in range(self._kept, 0, -1)]
         return [path for path in (*names, self.path) if path.exists()]
 
-    def signature_holds(self, record: dict[str, Any]) -> bool:
+    def signature_valid(self, record: dict[str, Any]) -> bool:
         """True when the key made the record's ``sig``."""
         bare = {name: value for name, value in record.items() if name != "sig"}
         sig = record.get("sig")
         return self._key is not None and isinstance(sig, str) and hmac.compare_digest(sig, self._sign(bare))
 
     def head(self) -> Head | None:
-        """The head file's word, or None where it is missing, unreadable or not signed by the key."""
+        """Return the content of the head file, or None where it is missing, unreadable or not signed by the key."""
         try:
             data = json.loads(_read(self._head_path))
             sig = data.pop("sig", "")
@@ -129,7 +132,7 @@ class Journal:
         except (OSError, ValueError, TypeError, AttributeError):
             return None
 
-    def _line(self, entry: Entry, head: Head) -> bytes:
+    def _line(self, entry: AuditEntry, head: Head) -> bytes:
         seq = head.seqs.get(entry.peer_id, 0) + 1
         record: dict[str, Any] = {
             "ts": entry.ts,
@@ -231,7 +234,7 @@ class Journal:
 
 
 def parse(line: bytes) -> dict[str, Any] | None:
-    """The record of a line, or None for one that was torn or is no record."""
+    """Return the record of a line, or None for one that was torn or is no record."""
     try:
         record = json.loads(line)
     except (ValueError, RecursionError):
@@ -241,7 +244,7 @@ def parse(line: bytes) -> dict[str, Any] | None:
 
 
 def storable(payload: Any) -> Any:
-    """``payload`` where JSON can hold it, else a record that says so, with what could be kept."""
+    """Return ``payload`` where JSON can hold it, else a record that says so, with the part that was kept."""
     try:
         text = canonical({"payload": payload})
         if len(text) <= PAYLOAD_MAX_BYTES:
@@ -251,6 +254,79 @@ def storable(payload: Any) -> Any:
         reason = f"{type(exc).__name__}: {exc}"[:200]
     items = list(payload.items())[:64] if isinstance(payload, dict) else [("value", payload)]
     return {"SERIALISE_FAILED": reason, "kept": {shown(key): shown(value) for key, value in items}}
+
+
+@dataclass(slots=True)
+class Findings:
+    """Counts of a check of the log; ``breaks`` are the places of its breaks, in order."""
+
+    total: int = 0
+    signed: int = 0
+    verified: int = 0
+    bad: int = 0
+    missing: int = 0
+    gaps: int = 0
+    torn: int = 0
+    broken: int = 0
+    breaks: list[dict[str, Any]] = field(default_factory=list)
+
+    def note(self, where: str, why: str) -> None:
+        """Remember a break; beyond the first hundred only the counts go on."""
+        if len(self.breaks) < BREAKS_SHOWN:
+            self.breaks.append({"where": where, "why": why})
+
+
+def verify(journal: Journal, *, keyed: bool) -> dict[str, Any]:
+    """Check the log: its chain, its numbers and its signatures.
+
+    ``bad`` are invalid signatures, ``missing`` records without one although a key is set, ``gaps`` jumps
+    in a peer's numbers, ``broken`` records that do not continue the one before, ``torn`` lines that a dying writer
+    left and the chain passes over. ``head`` is ok, missing (a cut at the end cannot be excluded) or cut.
+    """
+    head = journal.head()
+    found, last, first = Findings(), head.origin if head else None, True
+    seqs: dict[str, int] = {}
+    reached_head = head is not None and head.last == head.origin
+    for path, number, line in journal.lines():
+        where = f"{path.name}:{number}"
+        record = parse(line)
+        if record is None:
+            found.torn += 1
+            continue
+        found.total += 1
+        if last is not None and record["prev"] != last:
+            found.broken += 1
+            found.note(where, "does not continue the record before it")
+        expected = seqs.get(record["peer_id"])
+        if expected is not None and record["seq"] != expected + 1:
+            found.gaps += 1
+            found.note(where, f"{record['peer_id']} went from {expected} to {record['seq']}")
+        seqs[record["peer_id"]] = record["seq"]
+        _signature(journal, record, found, where, keyed=keyed)
+        last, first = hashlib.sha256(line).hexdigest(), False
+        reached_head = reached_head or (head is not None and head.last == last)
+    standing = "missing" if head is None and not first else "ok" if head is None or reached_head else "cut"
+    if standing == "cut":
+        found.note("end", "the last record that was acknowledged is not there")
+    counts = {name: getattr(found, name) for name in Findings.__slots__}
+    whole = not (found.bad or found.missing or found.gaps or found.broken) and standing != "cut"
+    return {**counts, "head": standing, "ok": whole}
+
+
+def _signature(journal: Journal, record: dict[str, Any], found: Findings, where: str, *, keyed: bool) -> None:
+    if "sig" not in record:
+        if keyed:
+            found.missing += 1
+            found.note(where, "not signed")
+        return
+    found.signed += 1
+    if not keyed:
+        return
+    if journal.signature_valid(record):
+        found.verified += 1
+    else:
+        found.bad += 1
+        found.note(where, "the signature does not hold")
 
 
 def _advance(head: Head, line: bytes) -> None:

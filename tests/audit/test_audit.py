@@ -1,4 +1,4 @@
-"""The safety record: chained, signed, shared by processes, and never in the way."""
+"""The safety audit: chained, signed, shared by processes, and never waited for."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ from fixtures.waiting import eventually
 
 from strands_robots import audit
 from strands_robots.audit import flush_audit, log_safety_event, read_audit_log, verify_audit_integrity
-from strands_robots.safety import integrity
-from strands_robots.safety.journal import GENESIS, NAME, Entry, Journal
+from strands_robots.audit.journal import GENESIS, NAME, AuditEntry, Journal, verify
 
 
-def entry(number: int, peer: str = "arm-1", **payload: Any) -> Entry:
-    return Entry(float(number), "emergency_stop", peer, {"n": number, **payload})
+def entry(number: int, peer: str = "arm-1", **payload: Any) -> AuditEntry:
+    return AuditEntry(float(number), "emergency_stop", peer, {"n": number, **payload})
 
 
 def check(journal: Journal, *, keyed: bool = False) -> dict[str, Any]:
-    return integrity.verify(journal, keyed=keyed)
+    return verify(journal, keyed=keyed)
 
 
 @pytest.fixture
@@ -209,7 +208,7 @@ def test_many_threads_lose_nothing() -> None:
     assert (found["total"], found["gaps"], found["ok"]) == (400, 0, True)
 
 
-def test_beyond_the_bound_the_oldest_records_give_way_to_one_that_counts_them(
+def test_oldest_records_beyond_the_bound_are_replaced_by_their_count(
     state_directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(audit, "PENDING_MAX", 10)
