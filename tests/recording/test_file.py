@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.recording import (
+from strands_robots.recording import file
+from strands_robots.recording.file import (
     CHUNK_BYTES,
     RecordedJoints,
     RecordedPicture,
     Recorder,
-    file,
     read_events,
     read_items,
     recorded_actions,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +16,16 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.hardware import HardwareRobot
-from strands_robots.recording import (
+from strands_robots.recording.cameras import Frames, chosen_frames, frames_of
+from strands_robots.recording.file import (
     RecordedEvent,
     RecordedJoints,
     RecordedPicture,
     Recorder,
-    RobotRecording,
     read_events,
     read_items,
 )
-from strands_robots.recording.cameras import chosen_frames, frames_of
+from strands_robots.recording.sampling import RobotRecording
 from strands_robots.simulation import Simulation
 from strands_robots.teleoperators.leader import ScriptedLeader
 from strands_robots.utils import ValidationError
@@ -67,6 +69,12 @@ def arm(patient_halts: None) -> Any:
     robot.cleanup()
 
 
+@contextmanager
+def recording(robot: Any, path: Path, device: str = "arm-1", frames: Frames | None = None) -> Iterator[Recorder]:
+    with Recorder(path, joints_of_events=False) as recorder, RobotRecording(robot, recorder, device, frames=frames):
+        yield recorder
+
+
 def events(path: Path) -> list[str]:
     # A busy machine may skip a beat, which the recording reports at its end.
     return [event.event for event in read_events(path) if event.event != "samplesSkipped"]
@@ -74,10 +82,7 @@ def events(path: Path) -> list[str]:
 
 def test_idle_arm_is_recorded_with_joints_and_pictures(arm: HardwareRobot, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with (
-        Recorder(path, joints_of_events=False) as recorder,
-        RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
-    ):
+    with recording(arm, path, frames=frames_of(arm)) as recorder:
         eventually(lambda: recorder.counts["/arm-1/joint_states"] >= 25)
         eventually(lambda: recorder.counts["/arm-1/camera/front"] >= 5)
     items = list(read_items(path))
@@ -89,7 +94,7 @@ def test_idle_arm_is_recorded_with_joints_and_pictures(arm: HardwareRobot, tmp_p
 def test_task_halt_and_lock_are_recorded_in_their_order(arm: HardwareRobot, tmp_path: Path) -> None:
     path, lockout = tmp_path / "run.mcap", FakeLockout()
     arm.gate.attach(lockout)
-    with Recorder(path, joints_of_events=False) as recorder, RobotRecording(arm, recorder, "arm-1"):
+    with recording(arm, path) as recorder:
         arm.start_task("wave", duration=120)
         eventually(lambda: recorder.counts["/arm-1/streamStep"] > 5)
         lockout.locked = True
@@ -105,7 +110,7 @@ def test_task_halt_and_lock_are_recorded_in_their_order(arm: HardwareRobot, tmp_
 
 def test_teleoperation_is_recorded_like_a_task(arm: HardwareRobot, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with Recorder(path, joints_of_events=False) as recorder, RobotRecording(arm, recorder, "arm-1"):
+    with recording(arm, path) as recorder:
         arm.attach_teleop(ScriptedLeader({"pan.pos": (0.0, 10.0, 1.0)}))
         assert arm.teleoperate(duration=0.3)["status"] == "success"
         eventually(lambda: recorder.counts["/arm-1/taskComplete"] == 1)
@@ -116,10 +121,7 @@ def test_teleoperation_is_recorded_like_a_task(arm: HardwareRobot, tmp_path: Pat
 def test_failing_camera_is_reported_once_and_joints_go_on(arm: HardwareRobot, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     arm.device.cameras["front"].broken = True
-    with (
-        Recorder(path, joints_of_events=False) as recorder,
-        RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
-    ):
+    with recording(arm, path, frames=frames_of(arm)) as recorder:
         eventually(lambda: arm.device.cameras["front"].reads > 15)
         eventually(lambda: recorder.counts["/arm-1/joint_states"] >= 10)
     assert events(path) == ["notRecorded"]
@@ -129,10 +131,7 @@ def test_failing_camera_does_not_affect_the_other_cameras(arm: HardwareRobot, tm
     path = tmp_path / "run.mcap"
     arm.device.cameras["wrist"] = Camera()
     arm.device.cameras["front"].broken = True
-    with (
-        Recorder(path, joints_of_events=False) as recorder,
-        RobotRecording(arm, recorder, "arm-1", frames=frames_of(arm)),
-    ):
+    with recording(arm, path, frames=frames_of(arm)) as recorder:
         eventually(lambda: recorder.counts["/arm-1/notRecorded"] == 1)
         eventually(lambda: recorder.counts["/arm-1/camera/wrist"] >= 15)
     (payload,) = [event.payload for event in read_events(path) if event.event == "notRecorded"]
@@ -153,7 +152,7 @@ def test_each_robot_of_a_world_is_recorded(tmp_path: Path) -> None:
     world.add_robot("left", "so100")
     world.add_robot("right", "so100", position=(0.0, 0.5, 0.0))
     try:
-        with Recorder(path, joints_of_events=False) as recorder, RobotRecording(world, recorder, "sim-1"):
+        with recording(world, path, "sim-1") as recorder:
             world.start_policy("left", "wave", duration=120)
             eventually(lambda: recorder.counts["/sim-1/streamStep"] > 5)
             for name in ("left", "right"):

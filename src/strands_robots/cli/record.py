@@ -16,8 +16,9 @@ import typer
 from strands_robots.cli.command import command
 from strands_robots.cli.network import Network, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, progress_bar, table
-from strands_robots.recording import STEP, Recorder, RobotRecording
 from strands_robots.recording.cameras import chosen_frames
+from strands_robots.recording.file import STEP, Recorder
+from strands_robots.recording.sampling import RobotRecording
 from strands_robots.utils import identifier, number
 
 if TYPE_CHECKING:

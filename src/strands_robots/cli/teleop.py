@@ -288,7 +288,7 @@ def _recorded_leader(path: Path, device: str | None = None, speed: float = 1.0) 
         ValidationError: it cannot be read, or it has no actions of that device.
         MissingExtraError: the package that reads it is not installed.
     """
-    from strands_robots.recording import recorded_actions  # noqa: PLC0415 - as above
+    from strands_robots.recording.file import recorded_actions  # noqa: PLC0415 - as above
     from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames  # noqa: PLC0415
 
     if path.suffix == ".mcap":

@@ -7,31 +7,3 @@
 | ``/DEVICE/camera/CAMERA`` | ``foxglove.CompressedImage`` | pictures, JPEG |
 | ``/DEVICE/log`` | ``foxglove.Log`` | one line for each event that is not steady: tasks, stops, locks |
 """
-
-from __future__ import annotations
-
-from strands_robots.recording.file import (
-    CHUNK_BYTES,
-    STEP,
-    RecordedEvent,
-    RecordedJoints,
-    RecordedPicture,
-    Recorder,
-    read_events,
-    read_items,
-    recorded_actions,
-)
-from strands_robots.recording.sampling import RobotRecording
-
-__all__ = [
-    "CHUNK_BYTES",
-    "STEP",
-    "RecordedEvent",
-    "RecordedJoints",
-    "RecordedPicture",
-    "Recorder",
-    "RobotRecording",
-    "read_events",
-    "read_items",
-    "recorded_actions",
-]

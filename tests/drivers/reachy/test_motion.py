@@ -17,7 +17,7 @@ class IdleConnection:
     """The part of a connection that a write of the motors' torque uses."""
 
     connects, alive, motor_mode = 1, False, "enabled"
-    last_poll = SimpleNamespace(moves=frozenset())
+    moves: frozenset[str] = frozenset()
     stop_rest = SimpleNamespace(get=lambda path, within_s=None: [])
 
     def refusal(self) -> str | None:

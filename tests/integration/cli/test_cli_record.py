@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
-from strands_robots.recording import RecordedEvent, read_events, read_items, recorded_actions
+from strands_robots.recording.file import RecordedEvent, read_events, read_items, recorded_actions
 from strands_robots.simulation import Simulation
 
 pytest.importorskip("mcap")

@@ -10,14 +10,8 @@ import pytest
 from fixtures.feetech_bus import FeetechBus
 from fixtures.waiting import eventually
 
-from strands_robots.recording import (
-    RecordedEvent,
-    RecordedJoints,
-    Recorder,
-    RobotRecording,
-    read_items,
-    recorded_actions,
-)
+from strands_robots.recording.file import RecordedEvent, RecordedJoints, Recorder, read_items, recorded_actions
+from strands_robots.recording.sampling import RobotRecording
 
 pytestmark = pytest.mark.system
 

@@ -14,7 +14,7 @@ from fixtures.command_line import COMMAND
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
 
-from strands_robots.recording import RecordedEvent, RecordedJoints, RecordedPicture, read_items
+from strands_robots.recording.file import RecordedEvent, RecordedJoints, RecordedPicture, read_items
 
 pytest.importorskip("mcap")
 

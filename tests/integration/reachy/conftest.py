@@ -17,6 +17,14 @@ REAL = [Kind("1.13.0", "mock-up"), Kind("1.13.0", "mujoco"), Kind("1.4.1", "mock
 Connect = Callable[..., ReachyDriver]
 
 
+def finished(reachy: ReachyDriver) -> dict[str, str]:
+    """Wait for the end of the present motion and return its facts."""
+    motion = reachy.motions.current
+    assert motion is not None
+    eventually(motion.done.is_set, what=f"the end of {motion.name}")
+    return motion.facts()
+
+
 def every(kinds: list[Kind]) -> list[object]:
     marks = [pytest.mark.timeout(180)]
     system = [*marks, pytest.mark.system]

@@ -10,6 +10,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.reachy_daemon.process import Daemon
 from fixtures.waiting import eventually, free_port
+from tests.integration.reachy.conftest import finished
 
 from strands_robots.device_connect import (
     FleetClient,
@@ -126,22 +127,16 @@ def test_wake_up_recorded_move_and_sleep_complete(call: Call, device: ReachyMini
     if daemon.kind.simulation == "mujoco":
         pytest.skip("its motors cannot be switched off")
 
-    def ended() -> dict[str, str]:
-        motion = device.reachy.motions.current
-        assert motion is not None
-        eventually(motion.done.is_set, what=motion.name)
-        return motion.facts()
-
     assert call("disableMotors")["motor_mode"] == "disabled"
     assert "the motors are disabled" in call("nod")["reason"]
     assert call("wakeUp")["motor_mode"] == "enabled"
-    assert ended()["state"] == "completed"
+    assert finished(device.reachy)["state"] == "completed"
     assert sorted(call("listMoves")["moves"]) == ["no1", "yes1"]
     assert call("playMove", move_name="yes1")["move"] == "yes1"
-    assert ended()["state"] == "completed"
+    assert finished(device.reachy)["state"] == "completed"
     assert "unknown" in call("listMoves", library="dances")["reason"]
     assert call("sleep")["status"] == "success"
-    assert ended() == {"name": "sleep", "state": "completed", "detail": ""}
+    assert finished(device.reachy) == {"name": "sleep", "state": "completed", "detail": ""}
     assert call("getStatus")["motor_mode"] == "disabled"
 
 
@@ -195,7 +190,7 @@ def test_emergency_stop_halts_and_locks_until_a_signed_resume(
         call("wakeUp")
         report = controller.stop(["head-1"], "test")
         assert report.ok, report
-        assert daemon.request("GET", "/api/move/running").json() == []
+        assert daemon.running_moves() == []
         sent = device.reachy.motions.frames_sent
         for function in MOTIONS:
             assert report.estop_id in call(function)["reason"], function

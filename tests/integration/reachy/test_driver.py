@@ -10,22 +10,11 @@ from collections.abc import Callable
 import pytest
 from fixtures.reachy_daemon.process import Daemon
 from fixtures.waiting import eventually
-from tests.integration.reachy.conftest import Connect
+from tests.integration.reachy.conftest import Connect, finished
 
 from strands_robots.drivers.reachy import ReachyDriver, connection
 from strands_robots.drivers.reachy.target import HeadPose, Target
 from strands_robots.safety.gate import MotionRefused
-
-
-def finished(reachy: ReachyDriver) -> dict[str, str]:
-    motion = reachy.motions.current
-    assert motion is not None
-    eventually(motion.done.is_set, what=f"the end of {motion.name}")
-    return motion.facts()
-
-
-def running(daemon: Daemon) -> list[str]:
-    return [move["uuid"] for move in daemon.request("GET", "/api/move/running").json()]
 
 
 def test_link_follows_the_version_and_not_the_badge(daemon: Daemon, reachy: ReachyDriver) -> None:
@@ -105,10 +94,10 @@ def test_halt_ends_a_gesture_and_no_frame_follows(reachy: ReachyDriver) -> None:
 
 def test_halt_stops_a_move_of_the_daemon(daemon: Daemon, reachy: ReachyDriver) -> None:
     reachy.wake_up()
-    assert len(running(daemon)) == 1
+    assert len(daemon.running_moves()) == 1
     verdict = reachy.halt("test")
     assert (verdict.stopped, verdict.halted) == (True, ("moves of the daemon",))
-    assert running(daemon) == []
+    assert daemon.running_moves() == []
     assert finished(reachy)["state"] == "stopped"
 
 
@@ -117,7 +106,7 @@ def test_halt_stops_the_moves_of_other_clients(daemon: Daemon, reachy: ReachyDri
         daemon.request("POST", "/api/move/goto", json={"antennas": [antenna, antenna], "duration": 60.0})
     eventually(lambda: reachy.facts()["foreign_moves"] == 2, what="both moves are reported")
     assert reachy.halt("test").halted == ("moves of the daemon",)
-    assert running(daemon) == []
+    assert daemon.running_moves() == []
 
 
 def test_new_move_stops_the_one_before_it(daemon: Daemon, reachy: ReachyDriver) -> None:
@@ -126,9 +115,9 @@ def test_new_move_stops_the_one_before_it(daemon: Daemon, reachy: ReachyDriver) 
     assert first is not None
     reachy.gesture("nod")
     assert first.facts() == {"name": "wakeUp", "state": "stopped", "detail": "replaced by nod"}
-    assert running(daemon) == []
+    assert daemon.running_moves() == []
     reachy.wake_up()
-    assert len(running(daemon)) == 1
+    assert len(daemon.running_moves()) == 1
     reachy.catalogue.names("emotions")
     reachy.halt("test")
 
@@ -151,9 +140,9 @@ def test_concurrent_callers_leave_at_most_one_move(daemon: Daemon, reachy: Reach
         assert not caller.is_alive()
     # On a busy machine a sleep may end, with the motors off, before the next caller starts.
     assert all("motors are disabled" in reason for reason in refused)
-    assert len(running(daemon)) <= 1
+    assert len(daemon.running_moves()) <= 1
     assert reachy.halt("test").stopped
-    assert running(daemon) == []
+    assert daemon.running_moves() == []
 
 
 def test_recorded_move_plays_and_an_unknown_one_is_refused(reachy: ReachyDriver) -> None:
@@ -237,7 +226,7 @@ def test_two_drivers_on_one_robot_see_and_stop_one_another(
 
     eventually(seen, what="the other's move is seen")
     two.gesture("nod")
-    assert running(daemon) == []
+    assert daemon.running_moves() == []
     first = one.motions.current
     assert first is not None
     eventually(first.done.is_set, what="the first driver notices")

@@ -21,10 +21,6 @@ def robot(reachy: ReachyDriver) -> Iterator[HardwareRobot]:
     made.cleanup()
 
 
-def running(daemon: Daemon) -> list[str]:
-    return [move["uuid"] for move in daemon.request("GET", "/api/move/running").json()]
-
-
 def test_joints_ranges_and_lockout_key_are_those_of_the_driver(robot: HardwareRobot, reachy: ReachyDriver) -> None:
     assert set(robot.get_state()["joints"]) == set(ACTION_KEYS)
     assert robot.get_features()["ranges"] == {key: list(pair) for key, pair in BOUNDS.items()}
@@ -62,6 +58,6 @@ def test_halt_of_the_robot_stops_the_moves_of_its_daemon(
     daemon: Daemon, robot: HardwareRobot, reachy: ReachyDriver
 ) -> None:
     reachy.wake_up()
-    assert len(running(daemon)) == 1
+    assert len(daemon.running_moves()) == 1
     assert robot.halt("test").stopped is True
-    assert running(daemon) == []
+    assert daemon.running_moves() == []

@@ -192,17 +192,6 @@ def _numbers(values: object, length: int) -> tuple[float, ...] | None:
     return tuple(float(v) for v in values) if good else None
 
 
-@dataclass(frozen=True, slots=True)
-class PollResult:
-    """Facts that the daemon gives only on request.
-
-    ``holder`` is the application that holds the robot, empty for none; ``moves`` are the uuids of running REST moves.
-    """
-
-    holder: str = ""
-    moves: frozenset[str] = frozenset()
-
-
 class Connection:
     """Connection to one daemon; ``start`` it, and check ``refusal`` before sending.
 
@@ -234,7 +223,10 @@ class Connection:
         self._session, self._zenoh_port = session, port("zenoh_port", zenoh_port)
         self.feed = Feed()
         self.connects = 0
-        self.last_poll = PollResult()
+        self.holder = ""
+        """Application that holds the robot, as last polled; empty for none."""
+        self.moves: frozenset[str] = frozenset()
+        """Uuids of the daemon's running moves, as last polled."""
         self._info: DaemonInfo | None = None
         self._link: Link | None = None
         self._reason = "not connected"
@@ -303,8 +295,8 @@ class Connection:
         if not self.alive:
             silent = self._up.is_set() and not self.feed.alive
             return f"no joint data for {self.feed.silent_s:.1f} s" if silent else self._reason
-        if self.last_poll.holder:
-            return f"the robot is held by {self.last_poll.holder}"
+        if holder := self.holder:
+            return f"the robot is held by {holder}"
         return None
 
     def link(self) -> Link:
@@ -381,11 +373,11 @@ class Connection:
 
     def _poll(self) -> None:
         info = self._info
-        holder = self._holder(info) if info is not None else ""
+        self.holder = self._ask_holder(info) if info is not None else ""
         # The moves are asked for over the stop's own connection, which is thereby open and warm when a stop comes.
-        self.last_poll = PollResult(holder, running_moves(self.stop_rest.get(RUNNING_PATH)))
+        self.moves = running_moves(self.stop_rest.get(RUNNING_PATH))
 
-    def _holder(self, info: DaemonInfo) -> str:
+    def _ask_holder(self, info: DaemonInfo) -> str:
         """Return the application that holds the robot, by the daemon's lock or app."""
         if info.since(APP_LOCK_SINCE):
             lock = self.rest.get(LOCK_PATH)

@@ -418,11 +418,11 @@ class ReachyDriver:
             "daemon_state": info.state if info else "",
             "daemon_error": info.error if info else "",
             "motor_mode": connection.motor_mode,
-            "app": connection.last_poll.holder,
+            "app": connection.holder,
             "data_age_s": round(time.monotonic() - joints.at, 3) if joints else None,
             "moving": motion.name if motion and motion.running else "",
             "last_motion": motion.facts() if motion else None,
-            "foreign_moves": len(connection.last_poll.moves - {motion.uuid if motion else ""}),
+            "foreign_moves": len(connection.moves - {motion.uuid if motion else ""}),
             "head_error_rad": round(sent.angle_to(measured), 4) if sent and measured else None,
             "unusable_frames": feed.unusable_frames,
         }

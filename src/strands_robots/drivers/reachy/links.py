@@ -50,34 +50,6 @@ Sink = Callable[[str, str | bytes], None]
 """Takes the kind and the text of a received message."""
 
 
-class Link(Protocol):
-    """A stream to one daemon."""
-
-    kind: str
-
-    def open(self, sink: Sink) -> None:
-        """Connect and hand every message to ``sink``."""
-
-    def close(self) -> None:
-        """Disconnect; sending afterwards raises :class:`DaemonUnreachableError`."""
-
-    @property
-    def closed(self) -> bool:
-        """The transport itself reports that it is closed; an open one may still be dead."""
-
-    def send_target(self, target: Target) -> None:
-        """Go there with the next control tick. Checked values only."""
-
-    def send_torque(self, on: bool, ids: Sequence[str] | None) -> None:
-        """Switch the torque of some motors by name, or of all for None."""
-
-    def send_automatic_body_yaw(self, on: bool) -> None:
-        """Let the daemon turn the body along with the head."""
-
-    def stop_move(self) -> bool:
-        """End the daemon's current move; False where the link has no such message."""
-
-
 def open_socket(stack: contextlib.ExitStack, host: str, api_port: int, path: str) -> Any:
     """Open a WebSocket that closes with ``stack``; raises ``DaemonUnreachableError``."""
     try:
@@ -113,21 +85,25 @@ class WebSocketLink:
         self._closed = threading.Event()
 
     def open(self, sink: Sink) -> None:
+        """Connect and hand every message to ``sink``; raises ``DaemonUnreachableError``."""
         self._stack = contextlib.ExitStack()
         self._socket = open_socket(self._stack, self._host, self._port, "/ws/sdk")
         self._closed.clear()
         threading.Thread(target=self._read, args=(self._socket, sink), name="reachy-link", daemon=True).start()
 
     def close(self) -> None:
+        """Disconnect; sending afterwards raises :class:`DaemonUnreachableError`."""
         self._closed.set()
         self._socket = None
         self._stack.close()
 
     @property
     def closed(self) -> bool:
+        """The transport reports that it is closed; an open one may still be dead."""
         return self._closed.is_set()
 
     def send_target(self, target: Target) -> None:
+        """Go to a checked target with the next control tick."""
         parts: dict[str, Any] = {}
         if target.head is not None:
             parts["head"] = target.head.matrix()
@@ -143,12 +119,15 @@ class WebSocketLink:
             self.send({"type": kinds[name], name: value})
 
     def send_torque(self, on: bool, ids: Sequence[str] | None) -> None:
+        """Switch the torque of some motors by name, or of all for None."""
         self.send({"type": "set_torque", "on": on, **({"ids": list(ids)} if ids is not None else {})})
 
     def send_automatic_body_yaw(self, on: bool) -> None:
+        """Let the daemon turn the body along with the head."""
         self.send({"type": "set_automatic_body_yaw", "enabled": on})
 
     def stop_move(self) -> bool:
+        """End the daemon's current move; False where the link has no such message."""
         if self._can_stop:
             self.send({"type": "stop_move"})
         return self._can_stop
@@ -217,6 +196,8 @@ def key_prefix(value: object) -> str:
 class ZenohLink:
     """Keys under a prefix, on a given session or on one of its own to the daemon.
 
+    It has the methods of :class:`WebSocketLink`.
+
     Args:
         host: of the daemon's Zenoh router, port 7447, when no ``session`` is given.
         prefix: of the robot's keys.
@@ -283,6 +264,9 @@ class ZenohLink:
             session.publish(f"{self._prefix}/command", json.dumps(command, allow_nan=False).encode())
         except Exception as exc:
             raise DaemonUnreachableError(f"The link to the daemon broke: {exc}.") from exc
+
+
+Link = WebSocketLink | ZenohLink
 
 
 class ClientSession:

@@ -8,6 +8,7 @@ waits for the write in flight, and stops every move that the daemon reports as r
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import threading
@@ -339,7 +340,7 @@ class MotionController:
         if before is not None and running:
             before.detail = f"replaced by {name}"
             before.cancelled.set()
-        moves = set(self._connection.last_poll.moves)
+        moves = set(self._connection.moves)
         if before is not None and before.uuid:
             if running:
                 moves.add(before.uuid)
@@ -400,29 +401,25 @@ class MotionController:
             return
         threading.Thread(target=self._run, args=(motion, second, frames), name="reachy-frames", daemon=True).start()
 
-    def _run(self, motion: ReachyMotion, target: Target, frames: Frames) -> None:
+    def _run(self, motion: ReachyMotion, second: Target, frames: Frames) -> None:
+        due = time.monotonic()
         try:
-            self._stream_frames(motion, target, frames)
+            for target in itertools.chain((second,), frames):
+                due += FRAME_S
+                if motion.cancelled.wait(max(0.0, due - time.monotonic())):
+                    self._end(motion, "stopped")
+                    return
+                self._send(motion, target)
+                # A delayed thread continues from now: several late frames at once would be a jump.
+                due = max(due, time.monotonic() - FRAME_S)
+            self._next_frame_at = time.monotonic() + JITTER_SHARE * FRAME_S
+            self._end(motion, "completed")
         except MotionRefused:
             self._end(motion, "stopped")
         except DaemonUnreachableError as exc:
             logger.warning("%s: %s ended early: %s", self._robot, motion.name, exc)
         finally:
             self._end(motion, "error", "its frames ended with a fault; the log has it")
-
-    def _stream_frames(self, motion: ReachyMotion, target: Target | None, frames: Frames) -> None:
-        due = time.monotonic()
-        while target is not None:
-            due += FRAME_S
-            if motion.cancelled.wait(max(0.0, due - time.monotonic())):
-                self._end(motion, "stopped")
-                return
-            self._send(motion, target)
-            # A delayed thread continues from now: several late frames at once would be a jump.
-            due = max(due, time.monotonic() - FRAME_S)
-            target = next(frames, None)
-        self._next_frame_at = time.monotonic() + JITTER_SHARE * FRAME_S
-        self._end(motion, "completed")
 
     def _forget_sent(self) -> None:
         """Forget the last target, because something else moved the robot."""

@@ -16,14 +16,12 @@ from dataclasses import dataclass, replace
 
 from strands_robots.utils import ValidationError, number, shown
 
-TILT = math.radians(40)
-TILT_SUM = math.radians(60)
-HEAD_YAW = math.pi
-BODY_YAW = math.radians(160)
+TILT, TILT_SUM = math.radians(40), math.radians(60)
+"""Largest pitch or roll of the head, and largest sum of the two."""
+
 NECK_YAW = math.radians(65)
-SIDEWAYS_M = 0.025
-DOWN_M, UP_M = 0.030, 0.015
-ANTENNA = math.pi
+"""Largest angle between head and body."""
+
 STREAM_HZ = 50.0
 FRAME_STEP = 0.3
 RAMP_STEP = 0.1
@@ -38,15 +36,15 @@ HEAD_KEYS = ("head_x", "head_y", "head_z", "head_roll", "head_pitch", "head_yaw"
 ACTION_KEYS = (*HEAD_KEYS, "body_yaw", "antenna_right", "antenna_left")
 
 BOUNDS = {
-    "head_x": (-SIDEWAYS_M, SIDEWAYS_M),
-    "head_y": (-SIDEWAYS_M, SIDEWAYS_M),
-    "head_z": (-DOWN_M, UP_M),
+    "head_x": (-0.025, 0.025),
+    "head_y": (-0.025, 0.025),
+    "head_z": (-0.030, 0.015),
     "head_roll": (-TILT, TILT),
     "head_pitch": (-TILT, TILT),
-    "head_yaw": (-HEAD_YAW, HEAD_YAW),
-    "body_yaw": (-BODY_YAW, BODY_YAW),
-    "antenna_right": (-ANTENNA, ANTENNA),
-    "antenna_left": (-ANTENNA, ANTENNA),
+    "head_yaw": (-math.pi, math.pi),
+    "body_yaw": (-math.radians(160), math.radians(160)),
+    "antenna_right": (-math.pi, math.pi),
+    "antenna_left": (-math.pi, math.pi),
 }
 """Lowest and highest value of every action key."""
 
