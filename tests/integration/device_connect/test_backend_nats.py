@@ -1,7 +1,6 @@
 """Our NATS backend against the real server, with the bare framework at the other end."""
 
 import asyncio
-import contextlib
 import json
 
 import pytest
@@ -11,7 +10,7 @@ from fixtures.certificates import Authority
 from fixtures.echo_device import EchoDevice
 from fixtures.nats_credentials import NatsAccounts, credentials_file
 from fixtures.nats_server import NatsServer
-from fixtures.waiting import eventually_async, free_port, until
+from fixtures.waiting import until
 
 from strands_robots.device_connect.backends import LinkConfig, link_from_environment, open_client
 
@@ -24,25 +23,6 @@ def link_to(server, **fields):
 def server():
     with NatsServer() as running:
         yield running
-
-
-async def test_bare_agent_and_our_device_understand_each_other_over_nats(server):
-    with EchoDevice("arm-1", link_to(server)):
-        async with Caller("nats", servers=(server.url,)) as bare:
-            await bare.sees("arm-1")
-            assert (await bare.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
-            received = await bare.collect("arm-1", "tick")
-            await bare.call("arm-1", "burst", {"count": 50, "hz": 1000})
-            await until(lambda: len(received) == 50)
-            assert [each["n"] for each in received] == list(range(50))
-
-
-async def test_our_client_and_a_bare_device_understand_each_other_over_nats(server):
-    bare = {"NATS_URL": server.url, "DEVICE_CONNECT_DISCOVERY_MODE": "d2d"}
-    with EchoDevice("arm-1", environment=bare):
-        async with Caller(client=await open_client(link_to(server))) as caller:
-            await caller.sees("arm-1")
-            assert (await caller.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
 
 
 async def test_quick_call_is_answered_while_a_slow_one_runs_on_nats(server):
@@ -74,37 +54,6 @@ async def test_result_the_server_would_refuse_is_answered_with_the_limit():
             answer = await bare.call("arm-1", "large", {"size": 30_000})
     assert answer["error"]["code"] == -32603
     assert "20000" in answer["error"]["message"]
-
-
-async def test_device_answers_when_a_killed_server_has_come_back(server):
-    with EchoDevice("arm-1", link_to(server)):
-        async with Caller("nats", servers=(server.url,)) as bare:
-            await bare.sees("arm-1")
-        server.kill()
-        await asyncio.sleep(1.0)
-        server.start()
-        async with Caller(client=await open_client(link_to(server))) as caller:
-
-            async def answered():
-                with contextlib.suppress(MessagingError):
-                    return (await caller.call("arm-1", "getStatus", wait_s=0.5)).get("result")
-
-            await eventually_async(answered, what="an answer after the restart")
-
-
-async def test_request_without_a_responder_fails_at_once_on_nats(server):
-    async with Caller(client=await open_client(link_to(server))) as caller:
-        started = asyncio.get_running_loop().time()
-        with pytest.raises(MessagingError, match="no device answers"):
-            await caller.call("absent", "getStatus", wait_s=60)
-        assert asyncio.get_running_loop().time() - started < 30
-
-
-async def test_connecting_to_an_absent_server_ends():
-    link = LinkConfig(transport="nats", connect=(f"nats://127.0.0.1:{free_port()}",), connect_timeout_s=1.0)
-    with pytest.raises(MessagingError, match="no NATS connection"):
-        async with asyncio.timeout(30):
-            await open_client(link)
 
 
 async def test_jwt_credentials_over_tls_admit_a_device_as_itself_alone(tmp_path, monkeypatch):

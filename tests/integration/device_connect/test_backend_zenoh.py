@@ -1,6 +1,5 @@
 """Our Zenoh backend between peers and through a router, with the bare framework at the other end."""
 
-import asyncio
 import contextlib
 import json
 import os
@@ -60,40 +59,6 @@ def test_of_two_peers_that_meet_by_gossip_only_the_unreachable_one_dials():
         assert str(one.dst) == listening
 
 
-async def test_bare_device_is_found_and_called_by_our_client(router):
-    environment = {"ZENOH_CONNECT": router.endpoint, "DEVICE_CONNECT_DISCOVERY_MODE": "d2d"}
-    with EchoDevice("arm-1", environment=environment):
-        async with Caller(client=await open_client(LinkConfig(connect=(router.endpoint,)))) as caller:
-            await caller.sees("arm-1")
-            assert (await caller.call("arm-1", "getStatus", {"value": "hi"}))["result"]["value"] == "hi"
-            received = await caller.collect("arm-1", "tick")
-            await caller.call("arm-1", "burst", {"count": 50, "hz": 500})
-            await until(lambda: len(received) == 50)
-
-
-async def test_device_behind_a_router_answers_soon_after_the_router_was_killed(router):
-    link = LinkConfig(connect=(router.endpoint,))
-    with EchoDevice("arm-1", link):
-        async with Caller(client=await open_client(link)) as caller:
-            await caller.sees("arm-1")
-            router.kill()
-            await until(lambda: not caller.client.is_connected, what="the lost router noticed")
-            with pytest.raises(MessagingError, match="not connected"):
-                await caller.call("arm-1", "getStatus")
-            router.start()
-
-            async def answered():
-                with contextlib.suppress(MessagingError):
-                    return (await caller.call("arm-1", "getStatus", wait_s=0.5)).get("result")
-
-            await eventually_async(answered, what="an answer after the restart")
-            async with Caller(servers=(router.endpoint,)) as bare:
-                await bare.sees("arm-1")
-                received = await bare.collect("arm-1", "tick")
-                await bare.call("arm-1", "burst", {"count": 3})
-                await until(lambda: len(received) == 3)
-
-
 async def test_client_reports_the_loss_and_the_return_of_a_router(router):
     reported = []
 
@@ -112,13 +77,6 @@ async def test_client_reports_the_loss_and_the_return_of_a_router(router):
         await until(lambda: reported == ["lost", "back"])
     finally:
         await client.close()
-
-
-async def test_absent_router_is_reported_within_the_deadline():
-    link = LinkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=1.0)
-    with pytest.raises(MessagingError, match="no Zenoh link"):
-        async with asyncio.timeout(30):
-            await open_client(link)
 
 
 async def test_access_rules_admit_a_device_as_itself_alone(tmp_path):
