@@ -55,7 +55,7 @@ class Bridge(RosTelemetryBase):
         self.link = MemoryLink()
         self._begin(self.link, "commands")
 
-    def told(self) -> list[str]:
+    def reported(self) -> list[str]:
         return [topic for topic, _ in self.link.sent]
 
 
@@ -72,7 +72,7 @@ def bridge(arm: Arm) -> RosTelemetryBase:
 
 
 @given(names=NAMES, positions=st.lists(NUMBERS, max_size=4))
-def test_a_joint_command_is_taken_whole_or_not_at_all(names: list[str], positions: list[Any]) -> None:
+def test_joint_command_is_applied_whole_or_not_at_all(names: list[str], positions: list[Any]) -> None:
     arm = Arm()
     usable = (
         bool(names)
@@ -86,40 +86,40 @@ def test_a_joint_command_is_taken_whole_or_not_at_all(names: list[str], position
     assert arm.taken == ([{n: float(p) for n, p in zip(names, positions, strict=True)}] if usable else [])
 
 
-def test_what_a_robot_or_a_camera_is_called_becomes_one_word_of_a_topic() -> None:
+def test_names_of_robots_and_cameras_become_one_word_of_a_topic() -> None:
     assert RosTelemetryBase.joint_states_topic("my arm/2") == "/my_arm_2/joint_states"
     assert RosTelemetryBase.image_topic("1st", "front left") == "/_1st/front_left/image_raw"
     assert RosTelemetryBase.joint_states_topic("---") == "/robot/joint_states"
     assert bridge(Arm()).command_topic == "/arm/joint_command"
 
 
-def test_a_robots_joints_and_cameras_are_told_once_or_at_a_rate() -> None:
+def test_joints_and_cameras_are_published_once_or_at_a_rate() -> None:
     telling = Bridge(Arm())
     telling.publish(["front"])
-    assert telling.told() == ["/arm/joint_states", "/arm/front/image_raw"]
+    assert telling.reported() == ["/arm/joint_states", "/arm/front/image_raw"]
     assert telling.link.sent[0][1]["position"] == [0.5]
     try:
         telling.start(100.0)
-        eventually(lambda: len(telling.told()) > 5)
+        eventually(lambda: len(telling.reported()) > 5)
         with pytest.raises(ValidationError, match="called before"):
             telling.start()
     finally:
         telling.shutdown()
-    told = len(telling.told())
+    reported = len(telling.reported())
     telling.publish_joint_states("arm", ["a.pos"], [0.5])
-    assert len(telling.told()) == told
+    assert len(telling.reported()) == reported
 
 
-def test_joints_that_could_not_be_read_are_not_told() -> None:
+def test_joints_that_could_not_be_read_are_not_published() -> None:
     arm = Arm()
     arm.state["joints_error"] = "the bus is silent"
     telling = Bridge(arm)
     telling.publish()
-    assert telling.told() == []
+    assert telling.reported() == []
     telling.shutdown()
 
 
-def test_what_cannot_be_told_is_refused_before_a_thread_begins() -> None:
+def test_invalid_publication_is_refused_before_a_thread_starts() -> None:
     for options, named in (({"rate_hz": 0}, "rate_hz"), ({"cameras": ["rear"]}, "cameras must be among front")):
         with pytest.raises(ValidationError, match=named):
             Bridge(Arm()).start(**options)

@@ -14,10 +14,10 @@ class Operator:
 
     def __init__(self, answer: object) -> None:
         self.answer = answer
-        self.asked: list[tuple[str, Any]] = []
+        self.requests: list[tuple[str, Any]] = []
 
     def interrupt(self, name: str, reason: Any = None) -> object:
-        self.asked.append((name, reason))
+        self.requests.append((name, reason))
         return self.answer
 
 
@@ -51,27 +51,27 @@ def gate(*allowed: str, bypass: bool = False) -> CommandGate:
         ("/scan", None),
     ],
 )
-def test_a_surface_is_known_by_a_word_of_its_name(name: str, surface: str | None) -> None:
+def test_command_surface_is_recognized_by_a_part_of_its_name(name: str, surface: str | None) -> None:
     assert surface_of(name) == surface
 
 
-def test_a_twist_is_a_velocity_command_whatever_its_topic_is_called() -> None:
+def test_twist_is_a_velocity_command_on_any_topic() -> None:
     assert surface_of("/base/please", "geometry_msgs/msg/Twist") == "cmd_vel"
     assert surface_of("/base/please", "geometry_msgs/Twist") == "cmd_vel"
     assert surface_of("/chatter", "std_msgs/msg/String") is None
 
 
-def test_what_moves_nothing_is_never_asked_about() -> None:
+def test_harmless_topic_needs_no_approval() -> None:
     operator = Operator("no")
     assert gate().refusal("/chatter", "std_msgs/msg/String", "publish", operator) is None
-    assert operator.asked == []
+    assert operator.requests == []
 
 
 @pytest.mark.parametrize("entry", ["cmd_vel", "/turtle1/cmd_vel", "/turtle1/*"])
 def test_a_listed_surface_or_name_passes_without_asking(entry: str) -> None:
     operator = Operator("no")
     assert gate(entry).refusal("/turtle1/cmd_vel", None, "drive", operator) is None
-    assert operator.asked == []
+    assert operator.requests == []
 
 
 def test_a_list_for_another_surface_does_not_pass() -> None:
@@ -94,7 +94,7 @@ def test_anything_but_a_yes_refuses(answer: object) -> None:
     assert "did not approve" in refusal["reason"]
 
 
-def test_without_anybody_to_ask_it_refuses_and_names_the_way() -> None:
+def test_refusal_without_an_operator_names_the_setting() -> None:
     refusal = gate().refusal("/cmd_vel", None, "drive", None)
     assert refusal is not None
     assert refusal["surface"] == "cmd_vel"
@@ -102,12 +102,12 @@ def test_without_anybody_to_ask_it_refuses_and_names_the_way() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "/", "cmd vel", "/1st", "a//b", "a__b", "/a/", 3, None, "x" * 256])
-def test_a_name_that_is_none_is_refused_by_its_argument(name: object) -> None:
+def test_invalid_graph_name_is_refused_by_its_argument(name: object) -> None:
     with pytest.raises(ValidationError, match="topic must be a ROS name"):
         graph_name("topic", name)
 
 
 @pytest.mark.parametrize("kind", ["Twist", "geometry_msgs", "geometry_msgs/twist", "a/b/C", "", None, "g/msg/T;x"])
-def test_a_type_that_is_none_is_refused_by_its_argument(kind: object) -> None:
+def test_invalid_interface_type_is_refused_by_its_argument(kind: object) -> None:
     with pytest.raises(ValidationError, match="kind must be a ROS type"):
         interface("kind", kind)

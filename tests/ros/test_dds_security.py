@@ -38,9 +38,7 @@ def member(pki: DdsPki) -> dict[str, str]:
         lambda config: HardwareRtpsBridge(domain_id=DOMAIN, dds_security_config=config),
     ],
 )
-def test_a_library_without_the_plugins_is_refused_with_the_way_to_one_that_has_them(
-    make: Any, member: dict[str, str]
-) -> None:
+def test_library_without_the_plugins_is_refused_with_installation_advice(make: Any, member: dict[str, str]) -> None:
     with pytest.raises(ValidationError, match=r"no DDS Security plugins.*cyclonedds 0\.10\.5 built on Debian"):
         make(member)
 
@@ -56,7 +54,7 @@ def test_paths_and_file_and_data_uris_name_the_same_credentials(member: dict[str
     assert given.document("identity_ca") == ca.read_bytes()
 
 
-def test_the_permissions_authority_is_that_of_the_identities_unless_it_is_given(member: dict[str, str]) -> None:
+def test_permissions_authority_defaults_to_the_identity_authority(member: dict[str, str]) -> None:
     alone = {key: member[key] for key in REQUIRED}
     read = checked_credentials(alone)
     assert read is not None
@@ -78,9 +76,7 @@ def test_the_permissions_authority_is_that_of_the_identities_unless_it_is_given(
         ({"password": "x"}, "an unknown password"),
     ],
 )
-def test_a_credential_that_cannot_be_presented_is_refused_by_name(
-    change: dict[str, Any], named: str, member: dict[str, str]
-) -> None:
+def test_invalid_credential_is_refused_by_name(change: dict[str, Any], named: str, member: dict[str, str]) -> None:
     with pytest.raises(ValidationError) as refused:
         checked_credentials({**member, **change})
     assert named in str(refused.value)
@@ -93,7 +89,7 @@ def test_a_missing_credential_is_named(missing: str, member: dict[str, str]) -> 
         checked_credentials(member)
 
 
-def test_credentials_are_an_object() -> None:
+def test_credentials_must_be_an_object() -> None:
     with pytest.raises(ValidationError, match="not list"):
         checked_credentials(["identity_ca"])
 
@@ -138,11 +134,11 @@ def test_a_strict_governance_leaves_a_topic_closed(tmp_path: Path) -> None:
         ("", f"no rule for domain {DOMAIN}"),
     ],
 )
-def test_a_governance_that_leaves_a_topic_open_is_told_with_the_reason(tmp_path: Path, laws: str, why: str) -> None:
+def test_governance_that_leaves_a_topic_open_is_reported_with_the_reason(tmp_path: Path, laws: str, why: str) -> None:
     assert why in (governance_gap(signed(tmp_path, laws), DOMAIN, TOPIC) or "")
 
 
-def test_the_first_topic_rule_that_fits_is_the_one_that_counts(tmp_path: Path) -> None:
+def test_first_matching_topic_rule_applies(tmp_path: Path) -> None:
     laws = governance(DOMAIN)
     start, end = laws.index("<topic_rule>"), laws.index("</topic_access_rules>")
     lax = laws[start:end].replace("<topic_expression>*", "<topic_expression>rt/*_arm/*").replace("true", "false")

@@ -69,7 +69,7 @@ def converted(declared: Any, value: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_every_type_is_written_as_an_independent_serializer_writes_it(kind: str) -> None:
+def test_every_type_serializes_as_by_an_independent_serializer(kind: str) -> None:
     rng = random.Random(kind)
     for _ in range(5):
         message = sample(KINDS[kind], rng)
@@ -116,6 +116,6 @@ def test_fields_are_filled_by_name_and_the_rest_is_zero() -> None:
         (Image, {"height": 1.5}, "height must be a int"),
     ],
 )
-def test_a_field_that_does_not_fit_is_refused_by_its_place(struct: Any, fields: Any, named: str) -> None:
+def test_invalid_field_is_refused_by_its_path(struct: Any, fields: Any, named: str) -> None:
     with pytest.raises(RosError, match=named):
         filled(struct, fields)

@@ -27,7 +27,7 @@ def sourced() -> Any:
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_an_empty_message_is_told_alike_over_rclpy_and_over_bare_dds(kind: str) -> None:
+def test_empty_message_is_the_same_over_rclpy_and_bare_dds(kind: str) -> None:
     assert plain(made(kind)) == dds.plain(KINDS[kind]())
 
 
@@ -42,14 +42,14 @@ FILLED: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("kind", FILLED)
-def test_a_filled_message_is_told_alike_over_rclpy_and_over_bare_dds(kind: str) -> None:
+def test_filled_message_is_the_same_over_rclpy_and_bare_dds(kind: str) -> None:
     fields = FILLED[kind]
     message = filled(made(kind), fields)
     assert plain(message) == dds.plain(dds.filled(KINDS[kind], fields))
     assert to_idl(message).serialize() == dds.filled(KINDS[kind], fields).serialize()
 
 
-def test_numpy_arrays_and_lists_of_bytes_are_taken_too() -> None:
+def test_numpy_arrays_and_lists_of_bytes_are_accepted() -> None:
     image = filled(made("sensor_msgs/Image"), {"data": [1, 2, 255]})
     assert image.data == array("B", [1, 2, 255])
     picture = filled(made("sensor_msgs/Image"), {"data": np.array([[1, 2], [3, 255]], dtype=np.uint8)})
@@ -76,7 +76,7 @@ def test_numpy_arrays_and_lists_of_bytes_are_taken_too() -> None:
         ("sensor_msgs/BatteryState", {"present": 1}, "present must be a boolean, not 1"),
     ],
 )
-def test_a_value_in_the_wrong_place_is_refused_by_its_place(kind: str, fields: dict[str, Any], said: str) -> None:
+def test_invalid_value_is_refused_by_its_path(kind: str, fields: dict[str, Any], said: str) -> None:
     with pytest.raises(RosError, match=said):
         filled(made(kind), fields)
 

@@ -17,7 +17,7 @@ from strands_robots.ros.dds_types import Header, PoseStamped, Time
 from strands_robots.ros.rclpy_session import sourced
 
 
-def test_it_is_there_only_inside_its_block() -> None:
+def test_stand_in_is_importable_only_inside_its_block() -> None:
     assert not sourced()
     with rclpy_stand_in.installed():
         assert sourced()
@@ -27,7 +27,7 @@ def test_it_is_there_only_inside_its_block() -> None:
     assert "nav2_msgs.action" not in sys.modules
 
 
-def test_what_it_does_not_have_raises() -> None:
+def test_missing_parts_of_the_stand_in_raise() -> None:
     with rclpy_stand_in.installed():
         rclpy, contexts = import_module("rclpy"), import_module("rclpy.context")
         with pytest.raises(NotImplementedError):
@@ -40,7 +40,7 @@ def test_what_it_does_not_have_raises() -> None:
             rclpy.shutdown(context=contexts.Context())
 
 
-def test_its_messages_refuse_what_rosidl_refuses() -> None:
+def test_messages_of_the_stand_in_refuse_what_rosidl_refuses() -> None:
     with rclpy_stand_in.installed():
         twist = import_module("geometry_msgs.msg").Twist()
         with pytest.raises(AssertionError):
@@ -69,7 +69,7 @@ def same(ours: Any, theirs: Any, kind: str) -> bool:
     return mine[: len(other)] == other and not mine[len(other) :].strip(b"\0")
 
 
-def test_what_it_writes_beside_messages_is_laid_out_as_an_independent_serializer_does() -> None:
+def test_wire_structures_of_the_stand_in_match_an_independent_serializer() -> None:
     types, some = STORE.types, list(range(16))
     uuid = types["unique_identifier_msgs/msg/UUID"](uuid=np.array(some, np.uint8))
     stamp = types["builtin_interfaces/msg/Time"](sec=5, nanosec=6)
@@ -84,8 +84,8 @@ def test_what_it_writes_beside_messages_is_laid_out_as_an_independent_serializer
     gid = types["rmw_dds_common/msg/Gid"](data=np.array(some, np.uint8))
     kind = "rmw_dds_common/msg/ParticipantEntitiesInfo"
     info = idl.NodeEntitiesInfo(node_namespace="/", node_name="rover", reader_gid_seq=[], writer_gid_seq=[])
-    told = idl.ParticipantEntitiesInfo(gid=idl.Gid(data=some), node_entities_info_seq=[info])
-    assert same(told, types[kind](gid=gid, node_entities_info_seq=[node]), kind)
+    ours = idl.ParticipantEntitiesInfo(gid=idl.Gid(data=some), node_entities_info_seq=[info])
+    assert same(ours, types[kind](gid=gid, node_entities_info_seq=[node]), kind)
 
 
 def test_a_request_carries_the_header_of_rmw_cyclonedds_and_then_its_body() -> None:

@@ -15,7 +15,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, *, rclpy: bool, cyclonedds: bool)
     monkeypatch.setattr("strands_robots.ros.ros2.find_spec", lambda name: object() if cyclonedds else None)
 
 
-def test_a_sourced_ros_2_is_nearer_than_bare_dds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sourced_ros_2_is_preferred_to_bare_dds(monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, rclpy=True, cyclonedds=True)
     assert isinstance(Ros2Link(3).open(), RclpyLink)
     installed(monkeypatch, rclpy=False, cyclonedds=True)
@@ -23,7 +23,7 @@ def test_a_sourced_ros_2_is_nearer_than_bare_dds(monkeypatch: pytest.MonkeyPatch
     assert ros2_backend() == "dds"
 
 
-def test_no_road_at_all_is_one_sentence_that_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_backends_are_an_error_that_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, rclpy=False, cyclonedds=False)
     with pytest.raises(RosError, match="No way to a ROS 2 graph"):
         Ros2Link().publish("/a", "std_msgs/msg/String", {})
@@ -32,11 +32,11 @@ def test_no_road_at_all_is_one_sentence_that_says_what_to_install(monkeypatch: p
     assert "pip install -e '.[ros2]'" in answer["reason"]
 
 
-def test_rclpy_asked_for_by_name_and_not_there_says_to_source_it() -> None:
+def test_rclpy_by_name_without_a_ros_2_says_to_source_one() -> None:
     assert "source a ROS 2 installation" in ros_action("list_topics", backend="rclpy")["reason"]
 
 
-def test_a_goal_over_bare_dds_says_what_carries_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_goal_over_bare_dds_is_refused_with_the_backends_that_carry_it(monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, rclpy=False, cyclonedds=True)
     with pytest.raises(RosError, match="bare DDS carries topics only"):
         Ros2Link(3).send_goal("/go", "nav2_msgs/action/NavigateToPose", {}, 1.0)
@@ -54,6 +54,6 @@ def test_a_goal_over_bare_dds_says_what_carries_it(monkeypatch: pytest.MonkeyPat
         ({"match_s": -1}, "match_s"),
     ],
 )
-def test_a_link_that_cannot_be_is_refused(options: dict[str, object], named: str) -> None:
+def test_invalid_link_argument_is_refused_by_name(options: dict[str, object], named: str) -> None:
     with pytest.raises(ValidationError, match=f"{named} must be"):
         RclpyLink(**options)  # type: ignore[arg-type]

@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
+from fixtures.ros_bases import Lock
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
-from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
@@ -41,7 +41,7 @@ def sent(robot: AckermannRosRobot) -> list[dict[str, Any]]:
     radius=st.floats(0.3, 50.0),
     left=st.sampled_from([1, -1]),
 )
-def test_the_steering_angle_gives_back_the_yaw_rate_that_was_asked(linear: float, radius: float, left: int) -> None:
+def test_steering_angle_corresponds_to_the_requested_yaw_rate(linear: float, radius: float, left: int) -> None:
     robot = car()
     angular = left * abs(linear) / radius
     message = robot.command_message(linear, angular)
@@ -53,7 +53,7 @@ def test_the_steering_angle_gives_back_the_yaw_rate_that_was_asked(linear: float
 
 @hypothesis_settings(max_examples=200, deadline=None)
 @given(linear=st.floats(-1e308, 1e308), angular=st.floats(-1e308, 1e308))
-def test_no_command_leaves_the_servos_range(linear: float, angular: float) -> None:
+def test_no_command_exceeds_the_servo_range(linear: float, angular: float) -> None:
     message = car().command_message(linear, angular)
     assert -1 <= message["angle"] <= 1
     assert -1 <= message["throttle"] <= 1
@@ -66,7 +66,7 @@ def test_a_turn_in_place_is_refused_before_the_handshake() -> None:
     assert robot.link.called == []  # type: ignore[attr-defined]
 
 
-def test_the_handshake_runs_once_in_its_order_and_the_drive_ends_with_a_zero() -> None:
+def test_handshake_runs_once_in_order_and_the_drive_ends_with_a_zero() -> None:
     robot = car()
     assert robot.drive(0.75, 0.0, duration=0.003)["status"] == "success"
     assert robot.drive(5.0, 0.0, count=2)["linear"] == 1.5
@@ -74,7 +74,7 @@ def test_the_handshake_runs_once_in_its_order_and_the_drive_ends_with_a_zero() -
     assert [m["throttle"] for m in sent(robot)] == [0.5] * 3 + [0.0] + [1.0] * 2 + [0.0]
 
 
-def test_a_failed_handshake_sends_nothing_and_is_tried_again_from_its_start() -> None:
+def test_failed_handshake_sends_nothing_and_is_repeated_from_its_start() -> None:
     link = MemoryLink({STATE: ok})
     robot = car(link)
     answer = robot.drive(0.5)
@@ -84,7 +84,7 @@ def test_a_failed_handshake_sends_nothing_and_is_tried_again_from_its_start() ->
 
 
 @pytest.mark.parametrize("refused", [{"error": 1}, {"error": -2}, {"success": False}, {"error": "no calibration"}])
-def test_a_service_that_answers_a_failure_ends_the_handshake_and_latches_nothing(refused: dict[str, Any]) -> None:
+def test_service_that_answers_a_failure_fails_the_handshake(refused: dict[str, Any]) -> None:
     link = MemoryLink({STATE: ok, ENABLE: lambda _: refused})
     robot = car(link)
     answer = robot.drive(0.5)
@@ -94,7 +94,7 @@ def test_a_service_that_answers_a_failure_ends_the_handshake_and_latches_nothing
     assert [service for service, _ in link.called] == [STATE, ENABLE, STATE, ENABLE]
 
 
-def test_a_car_that_nobody_approved_is_neither_armed_nor_driven() -> None:
+def test_unapproved_car_is_neither_armed_nor_driven() -> None:
     drive_only = CommandGate(lambda _: ("manual_drive",), lambda: False)
     robot = car(command_gate=drive_only)
     assert "needs operator approval" in robot.drive(0.5)["reason"]
@@ -105,17 +105,13 @@ def test_a_car_that_nobody_approved_is_neither_armed_nor_driven() -> None:
 
 
 def test_a_locked_car_is_not_armed() -> None:
-    class Lock:
-        def refusal(self, verb: str) -> Envelope | None:
-            return error(f"{verb} is locked")
-
     robot = car()
     robot.gate.attach(Lock())
     assert robot.enable()["reason"] == "enable is locked"
     assert robot.link.called == []  # type: ignore[attr-defined]
 
 
-def test_a_stop_needs_no_handshake_and_inside_one_ends_it() -> None:
+def test_stop_needs_no_handshake_and_ends_a_running_one() -> None:
     link = MemoryLink({ENABLE: ok})
     robot = car(link)
     link.offer(STATE, lambda _: {"halted": robot.halt("in between").stopped})
@@ -124,7 +120,7 @@ def test_a_stop_needs_no_handshake_and_inside_one_ends_it() -> None:
     robot.disconnect()
 
 
-def test_a_stop_while_the_operator_is_asked_arms_nothing() -> None:
+def test_stop_while_the_operator_is_asked_prevents_arming() -> None:
     """Asking takes as long as the operator takes; the handshake is part of the drive that was stopped meanwhile."""
     robot = car(command_gate=CommandGate(lambda _: (), lambda: False))
 
@@ -140,7 +136,7 @@ def test_a_stop_while_the_operator_is_asked_arms_nothing() -> None:
     robot.disconnect()
 
 
-def test_its_drive_tool_tells_the_turning_radius_and_it_has_no_pose() -> None:
+def test_drive_tool_states_the_turning_radius_and_the_car_has_no_pose() -> None:
     robot = car()
     assert not hasattr(robot, "get_pose")
     assert robot.min_radius_m == pytest.approx(0.164 / math.tan(0.5236))
@@ -160,6 +156,6 @@ def test_its_drive_tool_tells_the_turning_radius_and_it_has_no_pose() -> None:
         ("init_services", [{"service": "a b", "type": "p/srv/S"}]),
     ],
 )
-def test_an_argument_that_makes_no_car_is_refused_by_name(option: str, value: object) -> None:
+def test_invalid_car_argument_is_refused_by_name(option: str, value: object) -> None:
     with pytest.raises(ValidationError, match=option):
         car(**{option: value})

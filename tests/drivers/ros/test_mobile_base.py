@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,7 +40,7 @@ def test_a_timed_drive_sends_its_count_and_one_zero(linear: float, angular: floa
     assert sent[messages:] == ([] if linear == angular == 0 else [(0.0, 0.0)])
 
 
-def test_a_late_complaint_about_a_command_does_not_cost_the_base_its_zero() -> None:
+def test_late_error_about_a_command_does_not_suppress_the_zero() -> None:
     class Complaining(MemoryLink):
         def publish(self, topic: str, kind: str, fields: Mapping[str, Any]) -> None:
             if len(self.sent) == 3 and not self.complained:
@@ -62,7 +63,7 @@ def test_a_late_complaint_about_a_command_does_not_cost_the_base_its_zero() -> N
     count=st.integers(min_value=1, max_value=5),
     linear=st.floats(min_value=0.1, max_value=3),
 )
-def test_whatever_fails_a_repeated_drive_tries_its_zero_and_tells_the_truth(
+def test_repeated_drive_with_failing_messages_tries_its_zero_and_reports_the_failure(
     faults: set[int], count: int, linear: float
 ) -> None:
     link = FaultyLink(tuple(faults))
@@ -81,7 +82,7 @@ def test_whatever_fails_a_repeated_drive_tries_its_zero_and_tells_the_truth(
 
 @hypothesis_settings(max_examples=80, deadline=None)
 @given(linear=speed, angular=speed, max_linear=st.floats(0.01, 5), max_angular=st.floats(0.01, 5))
-def test_what_is_sent_never_exceeds_the_limits(
+def test_sent_velocities_never_exceed_the_limits(
     linear: float, angular: float, max_linear: float, max_angular: float
 ) -> None:
     link = MemoryLink()
@@ -95,7 +96,7 @@ def test_what_is_sent_never_exceeds_the_limits(
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), True, "1", None, 10**400])
 @pytest.mark.parametrize("argument", ["linear", "angular"])
-def test_a_velocity_that_is_no_number_is_refused_first(made: Made, argument: str, bad: object) -> None:
+def test_invalid_velocity_is_refused_before_any_other_argument(made: Made, argument: str, bad: object) -> None:
     robot = made()
     answer = robot.drive(**{argument: bad}, duration=-1)  # type: ignore[arg-type]
     assert argument in answer["reason"]
@@ -117,7 +118,7 @@ def test_a_count_outside_its_domain_sends_nothing(made: Made, bad: Any) -> None:
     assert memory(robot).sent == []
 
 
-def test_a_drive_longer_than_the_platform_allows_is_refused_not_cut(made: Made) -> None:
+def test_drive_longer_than_the_limit_is_refused_not_shortened(made: Made) -> None:
     robot = made(max_duration=0.5, publish_rate=10.0)
     assert "0.5" in robot.drive(0.1, duration=0.6)["reason"]
     assert "count must be at most 5" in robot.drive(0.1, count=6)["reason"]
@@ -129,7 +130,7 @@ def test_duration_takes_precedence_over_count(made: Made) -> None:
     assert robot.drive(0.1, duration=0.003, count=500)["messages"] == 3
 
 
-def test_a_bare_single_drive_latches_and_stop_ends_it(made: Made) -> None:
+def test_single_message_latches_until_stop(made: Made) -> None:
     robot = made()
     assert "until it is stopped" in robot.drive(0.2)["content"][0]["text"]
     assert velocities(memory(robot)) == [(0.2, 0.0)]
@@ -138,7 +139,7 @@ def test_a_bare_single_drive_latches_and_stop_ends_it(made: Made) -> None:
     assert velocities(memory(robot))[1] == (0.0, 0.0)
 
 
-def test_a_drive_that_nobody_approved_neither_sends_nor_arms(made: Made) -> None:
+def test_unapproved_drive_neither_sends_nor_arms(made: Made) -> None:
     robot = made(command_gate=SHUT)
     robot.handshake = lambda *_: pytest.fail("armed")  # type: ignore[method-assign]
     assert "needs operator approval" in robot.drive(0.1)["reason"]
@@ -161,7 +162,7 @@ def test_a_failed_handshake_aborts_the_drive(made: Made) -> None:
     assert robot.drive(0.1)["status"] == "success"
 
 
-def test_a_halt_inside_the_handshake_lets_nothing_but_zeros_out(made: Made) -> None:
+def test_halt_during_the_handshake_lets_only_zeros_out(made: Made) -> None:
     robot = made()
 
     def shake(*_: object) -> None:
@@ -173,7 +174,7 @@ def test_a_halt_inside_the_handshake_lets_nothing_but_zeros_out(made: Made) -> N
     assert set(velocities(memory(robot))) == {(0.0, 0.0)}
 
 
-def test_reads_answer_a_sample_or_why_not(made: Made) -> None:
+def test_reads_return_a_sample_or_the_reason(made: Made) -> None:
     link = MemoryLink()
     robot = made(link, odom_topic="/odom")
     assert "timeout" in robot.get_pose(0)["reason"]
@@ -212,12 +213,12 @@ def test_a_base_fits_the_robot_contract_and_runs_no_policies(made: Made) -> None
         ("max_duration", "3"),
     ],
 )
-def test_a_limit_that_cannot_be_kept_is_refused_at_construction(made: Made, option: str, value: object) -> None:
+def test_invalid_limit_is_refused_at_construction(made: Made, option: str, value: object) -> None:
     with pytest.raises(ValidationError, match=option):
         made(**{option: value})
 
 
-def test_the_tools_are_named_by_the_robot_and_describe_every_parameter(made: Made) -> None:
+def test_tools_have_the_robots_name_and_describe_every_parameter(made: Made) -> None:
     robot = made(odom_topic="/odom")
     specs = {tool.tool_name: tool.tool_spec for tool in robot.tools}
     assert set(specs) == {"drive_rover", "stop_rover", "status_rover", "get_pose_rover"}
@@ -243,15 +244,15 @@ class CutOff(MemoryLink):
 
 
 @pytest.mark.parametrize(("order", "left"), [({"duration": 0.1}, ()), ({}, ("drive",))], ids=["timed", "single"])
-def test_a_drive_that_a_ctrl_c_cuts_off_is_told_as_an_error_and_a_single_shot_of_it_as_going_on(
+def test_ctrl_c_makes_a_drive_an_error_and_a_single_message_still_latches(
     made: Made, order: dict[str, Any], left: tuple[str, ...]
 ) -> None:
     robot = made(CutOff(1))
-    told: list[tuple[str, str, str]] = []
-    robot.subscribe(lambda event: told.append((event.kind, event.state, event.error)))
+    events: list[tuple[str, str, str]] = []
+    robot.subscribe(lambda event: events.append((event.kind, event.state, event.error)))
     with pytest.raises(KeyboardInterrupt):
         robot.drive(0.5, **order)
-    assert told[1] == (
+    assert events[1] == (
         "finished",
         "error",
         f"The drive failed after 0 of {100 if order else 1} messages: it was interrupted.",
@@ -278,7 +279,7 @@ def test_drive_without_a_thread_ends_only_once_the_base_is_free(made: Made, monk
     assert busy == [False]
 
 
-def test_a_drive_that_gets_no_thread_leaves_the_base_free(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_without_a_thread_leaves_the_base_free(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = made()
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", none_left)
@@ -289,7 +290,7 @@ def test_a_drive_that_gets_no_thread_leaves_the_base_free(made: Made, monkeypatc
 
 
 @pytest.mark.parametrize("huge", [1e308, 1e30])
-def test_a_time_that_nothing_can_wait_out_is_refused_by_name(made: Made, huge: float) -> None:
+def test_excessive_time_is_refused_by_name(made: Made, huge: float) -> None:
     robot = made(odom_topic="/odom", scan_topic="/scan")
     for answer in (robot.drive(0.1, duration=huge), robot.start_drive(0.1, 0.0, huge)):
         assert "duration must be at most" in answer["reason"]
@@ -299,14 +300,14 @@ def test_a_time_that_nothing_can_wait_out_is_refused_by_name(made: Made, huge: f
 
 
 @pytest.mark.parametrize("count", [10**13, 10**5000], ids=["many", "more"])
-def test_a_count_that_no_drive_ends_is_refused_by_name(made: Made, count: int) -> None:
+def test_excessive_count_is_refused_by_name(made: Made, count: int) -> None:
     robot = made(max_duration=1e308)
     assert "count" in robot.drive(0.1, count=count)["reason"]
     assert "duration" in robot.drive(0.1, duration=1e308)["reason"]
     assert robot.drive(0.1)["status"] == "success"
 
 
-def test_a_rate_that_is_slower_than_any_clock_still_ends_with_a_stop(made: Made) -> None:
+def test_drive_at_an_extremely_low_rate_still_ends_with_a_stop(made: Made) -> None:
     robot = made(publish_rate=1e-300)
     assert robot.start_drive(0.1, 0.0, 300.0)["status"] == "success"
     eventually(lambda: velocities(memory(robot)) == [(0.1, 0.0)])
@@ -314,7 +315,7 @@ def test_a_rate_that_is_slower_than_any_clock_still_ends_with_a_stop(made: Made)
     assert robot.get_task_status()["task_status"] == "stopped"
 
 
-def test_only_a_base_with_odometry_has_a_pose_to_ask_for() -> None:
+def test_only_a_base_with_odometry_has_a_pose() -> None:
     assert not hasattr(MobileBaseRobot("rover", MemoryLink(), TOPIC), "get_pose")
     assert PosedBaseRobot("rover", MemoryLink(), TOPIC, odom_topic="/odom", scan_topic="/s").reads == (
         "get_pose",
@@ -322,7 +323,7 @@ def test_only_a_base_with_odometry_has_a_pose_to_ask_for() -> None:
     )
 
 
-def test_tool_names_are_what_model_apis_take_and_tell_robots_apart() -> None:
+def test_tool_names_are_unique_and_accepted_by_model_apis() -> None:
     names = ["rover", "rover-2", "a.b", "a_b", "a-b", "x" * 55, "x" * 56, "x" * 128, "x" * 127 + ".", "a." * 60]
     suffixes = [tool_suffix(name) for name in names]
     assert suffixes[:2] == ["rover", "rover-2"]
@@ -332,3 +333,22 @@ def test_tool_names_are_what_model_apis_take_and_tell_robots_apart() -> None:
         assert all(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", tool.tool_name) for tool in robot.tools)
     robot = RosBridgedRobot("y" * 128, TOPIC, "/odom", nav_action="/navigate_to_pose")
     assert all(len(tool.tool_name) <= 64 for tool in robot.tools)
+
+
+@pytest.fixture
+def restless() -> Iterator[None]:
+    """Threads take turns so often that none does two things in one turn."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.usefixtures("restless")
+def test_base_accepts_the_next_drive_once_the_last_is_reported_over(made: Made) -> None:
+    robot = made()
+    for _ in range(300):
+        answer = robot.start_drive(0.1, 0.0, 0.001)
+        assert answer["status"] == "success", answer
+        while robot.get_task_status()["task_status"] == "running":
+            pass

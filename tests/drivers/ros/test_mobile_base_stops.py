@@ -36,7 +36,7 @@ def passes_while_looking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("strands_robots.drivers.ros.mobile_base.time", clock)
 
 
-def test_a_stop_ends_a_running_drive_and_nothing_but_zeros_follows(made: Made) -> None:
+def test_stop_ends_a_running_drive_and_only_zeros_follow(made: Made) -> None:
     robot = made(publish_rate=100.0)
     events: list[tuple[str, str]] = []
     robot.subscribe(lambda event: events.append((event.kind, event.state)))
@@ -53,7 +53,7 @@ def test_a_stop_ends_a_running_drive_and_nothing_but_zeros_follows(made: Made) -
     assert robot.get_task_status()["task_status"] == "stopped"
 
 
-def test_a_new_drive_ends_the_zeros_of_the_stop_before_it(made: Made) -> None:
+def test_new_drive_ends_the_zeros_of_the_previous_stop(made: Made) -> None:
     robot = made(publish_rate=200.0)
     robot.stop()
     assert robot.drive(0.3, duration=0.05)["status"] == "success"
@@ -73,7 +73,7 @@ def test_a_locked_base_refuses_to_drive_and_still_sends_zeros(made: Made) -> Non
     assert set(velocities(memory(robot))) == {(0.0, 0.0)}
 
 
-def test_a_blind_base_is_told_zeros_for_its_time_and_no_longer(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_base_without_odometry_gets_zeros_for_the_blind_hold_only(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = made(publish_rate=200.0)
     holding_by_count(monkeypatch, 10, lambda: len(memory(robot).sent))
     robot.halt()
@@ -81,9 +81,7 @@ def test_a_blind_base_is_told_zeros_for_its_time_and_no_longer(made: Made, monke
     assert velocities(memory(robot)) == [(0.0, 0.0)] * 11
 
 
-def test_a_link_that_returns_after_the_blind_hold_still_gets_zeros_for_its_whole_time(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_link_that_returns_late_gets_zeros_for_the_whole_hold_time(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
     link = FaultyLink(tuple(range(1, 10_000)))
     holding_by_count(monkeypatch, 10, lambda: link.tries)
@@ -95,9 +93,7 @@ def test_a_link_that_returns_after_the_blind_hold_still_gets_zeros_for_its_whole
     assert len(link.sent) == 11, "as many as a link that was never down gets"
 
 
-def test_a_link_that_drops_out_within_the_hold_gets_zeros_for_its_whole_time_again(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_link_that_drops_out_during_a_hold_restarts_the_hold_time(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     link = FaultyLink(tuple(range(4, 30)))
     holding_by_count(monkeypatch, 10, lambda: link.tries)
     robot = made(link, publish_rate=200.0)
@@ -106,7 +102,7 @@ def test_a_link_that_drops_out_within_the_hold_gets_zeros_for_its_whole_time_aga
     assert len(link.sent) == 3 + 11, "three before the drop-out and the whole time after it"
 
 
-def test_a_hold_on_a_link_that_never_returns_ends_with_the_base(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hold_on_a_dead_link_ends_when_the_base_disconnects(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("strands_robots.drivers.ros.velocity_publisher.BLIND_HOLD_S", 0.05)
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
     robot = made(FaultyLink(tuple(range(1, 10_000))), publish_rate=50.0)
@@ -117,7 +113,7 @@ def test_a_hold_on_a_link_that_never_returns_ends_with_the_base(made: Made, monk
     assert not robot.holding
 
 
-def test_a_moving_base_whose_odometry_falls_silent_is_held_for_the_blind_time_from_its_last_word(
+def test_hold_time_restarts_at_the_last_odometry_sample_of_a_moving_base(
     made: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
@@ -134,18 +130,16 @@ def test_a_moving_base_whose_odometry_falls_silent_is_held_for_the_blind_time_fr
     assert len(velocities(link)) == speaks_until + 5 + 15
 
 
-def test_a_graph_that_is_asked_for_a_type_for_seconds_does_not_delay_the_zeros(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slow_type_lookup_does_not_delay_the_zeros(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     passes_while_looking(monkeypatch)
 
     class Slow(MemoryLink):
         free = threading.Event()
         watchers = 0
 
-        def watch(self, topic: str, kind: str | None, heard: OnMessage) -> Unwatch:
+        def watch(self, topic: str, kind: str | None, received: OnMessage) -> Unwatch:
             self.free.wait(60)
-            unwatch = super().watch(topic, kind, heard)
+            unwatch = super().watch(topic, kind, received)
             self.watchers += 1
 
             def done() -> None:
@@ -165,9 +159,7 @@ def test_a_graph_that_is_asked_for_a_type_for_seconds_does_not_delay_the_zeros(
     assert link.watchers == 0, "a watch that came late does not outlive the base"
 
 
-def test_a_halt_on_a_link_that_blocks_answers_in_time_that_it_did_not_stop(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_halt_on_a_blocked_link_answers_not_stopped_in_time(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
     link = FaultyLink()
     robot = made(link)
@@ -179,7 +171,7 @@ def test_a_halt_on_a_link_that_blocks_answers_in_time_that_it_did_not_stop(
     assert "in time" in verdict.not_stopped["velocity"]
 
 
-def test_a_halt_that_the_link_refuses_names_why_and_tries_again(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_halt_that_the_link_refuses_gives_the_reason_and_retries(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "1")
     robot = made(FaultyLink(tuple(range(1, 100_000))))
     verdict = robot.halt()
@@ -218,7 +210,7 @@ class Wheels:
             tell_speed(self._link, self.speed)
 
 
-def test_with_odometry_a_stop_waits_until_the_base_is_still(made: Made) -> None:
+def test_stop_with_odometry_waits_until_the_base_is_still(made: Made) -> None:
     link = MemoryLink()
     robot = made(link, odom_topic="/odom", publish_rate=50.0)
     wheels = Wheels(link, 1.0, 0.05)
@@ -235,9 +227,7 @@ def test_with_odometry_a_stop_waits_until_the_base_is_still(made: Made) -> None:
         wheels.close()
 
 
-def test_a_base_that_rolls_on_did_not_stop_and_one_that_says_nothing_is_unknown(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rolling_base_did_not_stop_and_silent_odometry_is_unknown(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     passes_while_looking(monkeypatch)
     monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 60.0)
     link = MemoryLink()
@@ -250,9 +240,7 @@ def test_a_base_that_rolls_on_did_not_stop_and_one_that_says_nothing_is_unknown(
     assert made(odom_topic="/odom").halt().stopped is None
 
 
-def test_a_stop_of_a_base_that_tells_no_speed_is_no_success_on_any_road(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stop_with_silent_odometry_is_no_success_by_any_verb(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     passes_while_looking(monkeypatch)
     robot = made(odom_topic="/odom")
     tool = next(each for each in robot.tools if each.tool_name == "stop_rover")
@@ -263,7 +251,7 @@ def test_a_stop_of_a_base_that_tells_no_speed_is_no_success_on_any_road(
         assert grade(answer) is Outcome.UNKNOWN
 
 
-def test_a_stop_whose_zero_is_not_taken_is_an_error_also_of_a_base_that_never_told_a_speed(
+def test_stop_whose_zero_fails_is_an_error_with_silent_odometry_too(
     made: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
@@ -271,9 +259,7 @@ def test_a_stop_whose_zero_is_not_taken_is_an_error_also_of_a_base_that_never_to
     assert (answer["status"], answer["stopped"]) == ("error", False)
 
 
-def test_a_drive_that_gets_no_thread_leaves_the_base_held_that_was_held(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_drive_without_a_thread_leaves_a_running_hold_running(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = made(publish_rate=100.0)
     robot.stop()
     start = threading.Thread.start
@@ -292,9 +278,7 @@ def test_a_drive_that_gets_no_thread_leaves_the_base_held_that_was_held(
     assert set(velocities(memory(robot))) == {(0.0, 0.0)}
 
 
-def test_a_halt_that_gets_no_thread_sends_its_one_zero_all_the_same(
-    made: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_halt_without_a_thread_still_sends_a_zero(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = made()
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", none_left)
@@ -302,7 +286,7 @@ def test_a_halt_that_gets_no_thread_sends_its_one_zero_all_the_same(
     assert velocities(memory(robot)) == [(0.0, 0.0)]
 
 
-def test_zeros_come_once_a_second_at_least_however_slow_the_rate(made: Made) -> None:
+def test_zeros_go_out_at_least_once_a_second_at_any_rate(made: Made) -> None:
     link = MemoryLink()
     robot = made(link, publish_rate=1e-300)
     assert robot.halt().stopped
@@ -330,7 +314,7 @@ class TwoWays(MemoryLink):
 
 
 @pytest.mark.parametrize(("second", "urgent", "behind"), [(None, 1, 0), (RosError, 0, 1), (RuntimeError, 0, 1)])
-def test_a_halt_that_gets_no_thread_sends_its_one_zero_by_whichever_way_there_is(
+def test_halt_without_a_thread_sends_a_zero_over_the_connection_that_exists(
     made: Made, monkeypatch: pytest.MonkeyPatch, second: type[Exception] | None, urgent: int, behind: int
 ) -> None:
     link = TwoWays(second)

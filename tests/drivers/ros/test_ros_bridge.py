@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from fixtures.ros_bases import memory, none_left, velocities
+from fixtures.ros_bases import Lock, memory, none_left, velocities
 from fixtures.waiting import eventually
 
 from strands_robots.contract import TaskRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
-from strands_robots.envelope import Envelope, error
+from strands_robots.envelope import Envelope
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import Goal, Message, OnMessage, RosError
 from strands_robots.ros.memory import MemoryLink
@@ -27,7 +27,7 @@ class Stack:
     """A navigation stack in memory: keeps what it was asked, ends goals as the test says."""
 
     def __init__(self) -> None:
-        self.asked: list[Message] = []
+        self.requests: list[Message] = []
         self.goals: list[Goal] = []
         self.cancels = 0
         self.feedback: OnMessage = lambda message: None
@@ -40,19 +40,12 @@ class Stack:
             if self.obeys:
                 sent.end(5, {})
 
-        self.asked.append(goal)
+        self.requests.append(goal)
         self.feedback = feedback
         sent.cancel = cancel
         self.goals.append(sent)
         if self.at_once is not None:
             sent.end(self.at_once, {"error_code": 0})
-
-
-class Lock:
-    """A lockout."""
-
-    def refusal(self, verb: str) -> Envelope | None:
-        return error(f"{verb} is locked")
 
 
 Made = Callable[..., RosBridgedRobot]
@@ -96,7 +89,7 @@ def over(thread: threading.Thread) -> None:
     assert not thread.is_alive()
 
 
-def test_a_goal_that_is_reached_tells_what_was_asked_and_felt(made: Made, stack: Stack) -> None:
+def test_reached_goal_reports_result_and_feedback(made: Made, stack: Stack) -> None:
     robot = made()
     thread, answers = going(robot, stack, yaw=math.pi / 2, frame_id="odom")
     for left in range(8):
@@ -108,7 +101,7 @@ def test_a_goal_that_is_reached_tells_what_was_asked_and_felt(made: Made, stack:
     assert (answer["status"], answer["goal_state"], answer["goal_status"]) == ("success", "succeeded", 4)
     assert (answer["result"], answer["feedback_count"], len(answer["feedback"])) == ({"error_code": 0}, 8, 5)
     assert answer["feedback"][-1] == {"distance_remaining": 7}
-    pose = stack.asked[0]["pose"]
+    pose = stack.requests[0]["pose"]
     assert pose["header"]["frame_id"] == "odom"
     assert pose["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
     assert pose["pose"]["orientation"]["z"] == pytest.approx(math.sqrt(0.5))
@@ -118,7 +111,7 @@ def test_a_goal_that_is_reached_tells_what_was_asked_and_felt(made: Made, stack:
 
 
 @pytest.mark.parametrize(("status", "state"), [(6, "aborted"), (5, "canceled"), (99, "lost")])
-def test_every_other_end_is_an_error(made: Made, stack: Stack, status: int, state: str) -> None:
+def test_goal_that_is_not_reached_is_an_error(made: Made, stack: Stack, status: int, state: str) -> None:
     stack.at_once = status
     answer = made().navigate_to(1.0, 2.0)
     assert (answer["status"], answer["goal_state"], answer["goal_status"]) == ("error", state, status)
@@ -131,7 +124,7 @@ def test_a_goal_that_takes_too_long_is_cancelled(made: Made, stack: Stack) -> No
     assert robot.get_task_status()["task_status"] == "error"
 
 
-def test_a_goal_that_does_not_obey_its_cancel_is_lost_and_every_stop_asks_again(
+def test_goal_that_ignores_its_cancel_is_lost_and_every_stop_cancels_it_again(
     made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot, stack.obeys = made(), False
@@ -149,7 +142,7 @@ def test_a_goal_that_does_not_obey_its_cancel_is_lost_and_every_stop_asks_again(
     assert (robot.halt("test").stopped, stack.cancels) == (True, 3)
 
 
-def test_a_stop_that_gets_no_thread_to_ask_a_lost_goal_again_revokes_sends_its_zero_and_says_so(
+def test_stop_without_a_thread_to_cancel_a_lost_goal_still_sends_its_zero(
     made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot, stack.obeys = made(), False
@@ -167,7 +160,7 @@ def test_a_stop_that_gets_no_thread_to_ask_a_lost_goal_again_revokes_sends_its_z
 
 
 @pytest.mark.parametrize("cut", [KeyboardInterrupt, ValueError])
-def test_a_goal_whose_wait_is_cut_off_is_over_and_in_doubt(
+def test_goal_with_an_interrupted_wait_is_in_doubt(
     made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch, cut: type[BaseException]
 ) -> None:
     begun = stack.begun
@@ -186,12 +179,12 @@ def test_a_goal_whose_wait_is_cut_off_is_over_and_in_doubt(
 
     monkeypatch.setattr(stack, "begun", begun_and_cut_off)
     robot = made()
-    told: list[tuple[str, str]] = []
-    robot.subscribe(lambda event: told.append((event.kind, event.state)))
+    events: list[tuple[str, str]] = []
+    robot.subscribe(lambda event: events.append((event.kind, event.state)))
     with pytest.raises(cut):
         robot.navigate_to(1.0, 2.0)
     assert (robot.get_task_status()["task_status"], stack.cancels) == ("error", 1)
-    assert told == [("started", "running"), ("finished", "error")]
+    assert events == [("started", "running"), ("finished", "error")]
     verdict = robot.halt("test")
     assert verdict.stopped is False
     assert "interrupted" in verdict.not_stopped["navigation"]
@@ -201,7 +194,7 @@ def test_a_goal_whose_wait_is_cut_off_is_over_and_in_doubt(
     assert robot.halt("test").stopped is True
 
 
-def test_a_stop_cancels_the_goal_and_says_so(made: Made, stack: Stack) -> None:
+def test_stop_cancels_the_goal_and_reports_it(made: Made, stack: Stack) -> None:
     robot = made()
     thread, answers = going(robot, stack)
     verdict = robot.stop()
@@ -212,7 +205,7 @@ def test_a_stop_cancels_the_goal_and_says_so(made: Made, stack: Stack) -> None:
     assert robot.stop()["halted"] == []
 
 
-def test_a_stop_whose_goal_does_not_end_in_time_did_not_stop(
+def test_stop_whose_goal_does_not_end_in_time_did_not_stop(
     made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
@@ -228,20 +221,20 @@ def test_a_stop_whose_goal_does_not_end_in_time_did_not_stop(
 
 @pytest.mark.parametrize("argument", ["x", "y", "yaw"])
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), True, "1", None])
-def test_a_place_that_is_no_number_is_refused(made: Made, stack: Stack, argument: str, bad: Any) -> None:
+def test_invalid_goal_position_is_refused(made: Made, stack: Stack, argument: str, bad: Any) -> None:
     answer = made().navigate_to(**{"x": 1.0, "y": 2.0, argument: bad})
     assert argument in answer["reason"]
-    assert stack.asked == []
+    assert stack.requests == []
 
 
 @pytest.mark.parametrize("bad", [0, -1, float("nan"), float("inf"), True, 1e308])
-def test_a_time_that_cannot_be_waited_out_is_refused(made: Made, stack: Stack, bad: Any) -> None:
+def test_invalid_goal_timeout_is_refused(made: Made, stack: Stack, bad: Any) -> None:
     assert "timeout" in made().navigate_to(1.0, 2.0, timeout=bad)["reason"]
     assert "frame_id" in made().navigate_to(1.0, 2.0, frame_id="")["reason"]
-    assert stack.asked == []
+    assert stack.requests == []
 
 
-def test_a_goal_needs_a_stack_leave_and_no_lock(made: Made, stack: Stack) -> None:
+def test_goal_needs_a_stack_an_approval_and_no_lockout(made: Made, stack: Stack) -> None:
     assert "nav_action" in made(nav_action=None).navigate_to(1.0, 2.0)["reason"]
     assert "needs operator approval" in made(command_gate=SHUT).navigate_to(1.0, 2.0)["reason"]
     locked = made()
@@ -250,7 +243,7 @@ def test_a_goal_needs_a_stack_leave_and_no_lock(made: Made, stack: Stack) -> Non
     alone = made(link=MemoryLink())
     answer = alone.navigate_to(1.0, 2.0)
     assert (answer["goal_state"], "Nobody serves" in answer["reason"]) == ("not sent", True)
-    assert stack.asked == []
+    assert stack.requests == []
 
 
 def test_a_drive_and_a_goal_exclude_each_other(made: Made, stack: Stack) -> None:
@@ -264,16 +257,12 @@ def test_a_drive_and_a_goal_exclude_each_other(made: Made, stack: Stack) -> None
     assert robot.get_task_status()["instruction"].startswith("drive")
 
 
-def test_a_goal_that_gets_no_thread_leaves_the_base_free_and_held_as_it_was(
-    made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_goal_without_a_thread_leaves_the_base_free(made: Made, stack: Stack, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = made()
     start = threading.Thread.start
 
     def no_way(thread: threading.Thread) -> None:
-        if thread.name.startswith("navigate-"):
-            raise RuntimeError("can't start new thread")
-        start(thread)
+        (none_left if thread.name.startswith("navigate-") else start)(thread)
 
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", no_way)
@@ -285,7 +274,7 @@ def test_a_goal_that_gets_no_thread_leaves_the_base_free_and_held_as_it_was(
     assert robot.drive(0.1, duration=0.01)["status"] == "success"
 
 
-def test_leaving_the_graph_cancels_the_goal_first(made: Made, stack: Stack) -> None:
+def test_disconnect_cancels_the_goal_first(made: Made, stack: Stack) -> None:
     robot = made()
     thread, answers = going(robot, stack)
     robot.disconnect()
@@ -293,7 +282,7 @@ def test_leaving_the_graph_cancels_the_goal_first(made: Made, stack: Stack) -> N
     assert (stack.cancels, answers[0]["goal_state"]) == (1, "canceled")
 
 
-def test_its_tools_are_named_by_it_and_describe_every_parameter(made: Made, stack: Stack) -> None:
+def test_tools_have_the_robots_name_and_describe_every_parameter(made: Made, stack: Stack) -> None:
     robot = made(scan_topic="/scan")
     names = [each.tool_name for each in robot.tools]
     assert names == [
@@ -320,12 +309,12 @@ def test_its_tools_are_named_by_it_and_describe_every_parameter(made: Made, stac
         ({"domain_id": 233}, "domain_id"),
     ],
 )
-def test_a_robot_that_cannot_be_is_refused(options: dict[str, Any], named: str) -> None:
+def test_invalid_constructor_argument_is_refused_by_name(options: dict[str, Any], named: str) -> None:
     with pytest.raises(ValidationError, match=named):
         RosBridgedRobot("rover", "/cmd_vel", "/odom", **options)
 
 
-def test_it_is_made_without_any_ros_and_says_what_is_missing_when_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robot_without_ros_is_constructed_and_its_verbs_name_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "1")
     monkeypatch.setattr("strands_robots.ros.ros2.sourced", lambda: False)
     monkeypatch.setattr("strands_robots.ros.ros2.find_spec", lambda name: None)
@@ -336,6 +325,6 @@ def test_it_is_made_without_any_ros_and_says_what_is_missing_when_it_is_used(mon
     robot.disconnect()
 
 
-def test_the_same_base_over_bare_dds_is_the_same_robot_to_the_lockout() -> None:
+def test_same_base_over_bare_dds_has_the_same_lockout_key() -> None:
     here, there = RosBridgedRobot("a", "/cmd_vel", "/odom", domain_id=7), RtpsRobot("b", "/cmd_vel", domain_id=7)
     assert here.safety_key == there.safety_key

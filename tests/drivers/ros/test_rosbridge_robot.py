@@ -14,20 +14,20 @@ NO_BOUNDS = [None, 0, -1.0, float("nan"), float("inf"), True, "2"]
 
 @pytest.mark.parametrize("bad", NO_BOUNDS)
 @pytest.mark.parametrize("limit", ["max_linear", "max_angular", "max_duration", "publish_rate"])
-def test_every_limit_of_a_rosbridge_base_is_owed(limit: str, bad: Any) -> None:
+def test_every_limit_of_a_rosbridge_base_is_required(limit: str, bad: Any) -> None:
     with pytest.raises(ValueError, match=limit):
         RosbridgeRobot("rover", "/cmd_vel", "/odom", **{limit: bad})
 
 
 @pytest.mark.parametrize("bad", NO_BOUNDS)
 @pytest.mark.parametrize("limit", ["wheelbase_m", "max_speed", "max_steering_rad", "max_duration", "publish_rate"])
-def test_every_limit_of_a_car_is_owed(limit: str, bad: Any) -> None:
+def test_every_limit_of_a_car_is_required(limit: str, bad: Any) -> None:
     with pytest.raises(ValueError, match=limit):
         AckermannRosRobot("racer", "/servo", **{limit: bad})
 
 
 @pytest.mark.parametrize("kind", [RosbridgeRobot, RosBridgedRobot])
-def test_a_base_that_owes_odometry_is_not_made_without(kind: Any) -> None:
+def test_base_that_needs_odometry_is_refused_without(kind: Any) -> None:
     with pytest.raises(ValueError, match="odom_topic"):
         kind("rover", "/cmd_vel", None)
 

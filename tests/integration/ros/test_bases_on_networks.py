@@ -138,7 +138,7 @@ def site(link: LinkConfig) -> Iterator[Callable[[RtpsRobot], Site]]:
         yield serve
 
 
-def test_a_locked_base_gets_zeros_until_it_stands_and_no_drive_until_a_signed_resume(
+def test_locked_base_gets_zeros_until_still_and_no_drive_until_a_signed_resume(
     made: Made, site: Callable[[RtpsRobot], Site], sent: Sent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     key = Ed25519PrivateKey.generate()
@@ -146,9 +146,9 @@ def test_a_locked_base_gets_zeros_until_it_stands_and_no_drive_until_a_signed_re
     robot = made("/odom")
     here = site(robot)
     assert "duration" in here.call("drive", {"linear": 0.5, "angular": 0.0})["reason"]
-    asked = time.monotonic()
+    began = time.monotonic()
     assert here.call("drive", DRIVE)["status"] == "success"
-    assert time.monotonic() - asked < DRIVE["duration"] - 5
+    assert time.monotonic() - began < DRIVE["duration"] - 5
     eventually(lambda: sent.all and sent.all[-1][1] == 0.5)
     report = here.controller.stop(["base-1"], "test")
     assert report.ok, report
@@ -193,7 +193,7 @@ def test_a_locked_base_without_odometry_gets_zeros_for_five_seconds_at_its_rate(
     assert "base-1" in plane().clear_local("test")
 
 
-def test_the_meshs_emergency_stop_holds_a_base_likewise(
+def test_emergency_stop_over_the_mesh_locks_a_base(
     made: Made, sent: Sent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = str(free_port())

@@ -70,7 +70,7 @@ def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: None, rover: Rtp
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(base: BaseProcess, rover: RtpsRobot) -> None:
+def test_drive_of_a_base_that_died_is_an_error_and_did_not_stop(base: BaseProcess, rover: RtpsRobot) -> None:
     obeyed(rover, lambda: x_of(rover))
     began = x_of(rover)
     assert rover.start_drive(0.5, 0.0, 30.0)["status"] == "success"
@@ -82,7 +82,7 @@ def test_a_base_that_died_inside_a_drive_is_an_error_and_did_not_stop(base: Base
     assert "Nobody subscribes to /cmd_vel" in verdict.not_stopped["velocity"]
 
 
-def test_a_type_that_is_not_given_is_asked_of_the_graph(base: None) -> None:
+def test_omitted_type_is_looked_up_on_the_graph(base: None) -> None:
     link = DdsLink(DOMAIN, match_s=20.0)
     ends = {("/cmd_vel", TWIST, "subscription"), ("/odom", "nav_msgs/msg/Odometry", "publisher")}
     try:
@@ -94,7 +94,7 @@ def test_a_type_that_is_not_given_is_asked_of_the_graph(base: None) -> None:
         link.close()
 
 
-def test_nobody_to_hear_is_an_error_for_a_drive_and_for_a_stop() -> None:
+def test_drive_and_stop_without_a_subscription_are_errors() -> None:
     robot = RtpsRobot.from_rtps("alone", "/alone/cmd_vel", domain_id=DOMAIN, command_gate=OPEN)
     try:
         assert "Nobody subscribes to /alone/cmd_vel" in robot.drive(0.1)["reason"]
@@ -105,14 +105,14 @@ def test_nobody_to_hear_is_an_error_for_a_drive_and_for_a_stop() -> None:
 
 def test_a_message_goes_from_one_link_to_another_and_a_closed_link_opens_again() -> None:
     sender, receiver = DdsLink(DOMAIN), DdsLink(DOMAIN)
-    heard: list[Mapping[str, Any]] = []
+    received: list[Mapping[str, Any]] = []
     try:
-        unwatch = receiver.watch("/picture", "sensor_msgs/Image", heard.append)
+        unwatch = receiver.watch("/picture", "sensor_msgs/Image", received.append)
         sender.publish("/picture", "sensor_msgs/msg/Image", {"height": 1, "width": 2, "data": b"\x01\x02"})
-        eventually(lambda: heard and heard[0]["data"] == b"\x01\x02")
+        eventually(lambda: received and received[0]["data"] == b"\x01\x02")
         sender.close()
         sender.publish("/picture", "sensor_msgs/msg/Image", {"width": 3})
-        eventually(lambda: heard[-1]["width"] == 3)
+        eventually(lambda: received[-1]["width"] == 3)
         unwatch()
     finally:
         sender.close()
@@ -129,23 +129,23 @@ def test_a_read_leaves_no_thread_behind(base: None) -> None:
         link.close()
 
 
-def test_a_message_that_cannot_be_read_takes_no_other_with_it(caplog: pytest.LogCaptureFixture) -> None:
+def test_unreadable_message_does_not_cost_the_others(caplog: pytest.LogCaptureFixture) -> None:
     link = DdsLink(DOMAIN)
-    heard: list[Mapping[str, Any]] = []
+    received: list[Mapping[str, Any]] = []
     garbler = subprocess.Popen(
         [sys.executable, "-m", "fixtures.dds_garbler", str(DOMAIN)], stdin=subprocess.PIPE, cwd=ROOT
     )
     try:
-        link.watch("/garbled", "std_msgs/msg/String", heard.append)
-        eventually(lambda: len(heard) >= 5)
+        link.watch("/garbled", "std_msgs/msg/String", received.append)
+        eventually(lambda: len(received) >= 5)
         assert "cannot be read" in caplog.text
-        assert {each["data"] for each in heard} == {"good"}
+        assert {each["data"] for each in received} == {"good"}
     finally:
         garbler.communicate(timeout=40)
         link.close()
 
 
-def test_what_bare_dds_cannot_do_is_said() -> None:
+def test_service_and_unknown_type_over_bare_dds_are_errors() -> None:
     link = DdsLink(DOMAIN)
     with pytest.raises(RosError, match="is a service"):
         link.call("/add", "pkg/srv/Add", {}, 1.0)
@@ -154,6 +154,6 @@ def test_what_bare_dds_cannot_do_is_said() -> None:
 
 
 @pytest.mark.parametrize("domain", [-1, 233, True, "0", 1.0])
-def test_a_domain_that_is_none_is_refused_before_anything(domain: Any) -> None:
+def test_invalid_domain_is_refused_at_construction(domain: Any) -> None:
     with pytest.raises(ValidationError, match="domain_id must be an integer from 0 to 232"):
         RtpsRobot("rover", "/cmd_vel", domain_id=domain)

@@ -51,7 +51,7 @@ def speed_of(robot: RtpsRobot) -> float:
 
 
 @pytest.mark.usefixtures("patient")
-def test_two_seconds_at_three_tenths_are_six_tenths_of_a_metre(world: None, driver: RtpsRobot) -> None:
+def test_base_drives_the_commanded_distance(world: None, driver: RtpsRobot) -> None:
     obeyed(driver, lambda: x_of(driver))
     began = x_of(driver)
     called = time.monotonic()
@@ -63,7 +63,7 @@ def test_two_seconds_at_three_tenths_are_six_tenths_of_a_metre(world: None, driv
     assert x_of(driver) - began == pytest.approx(0.3 * max(2.0, took_s), rel=0.05)
 
 
-def test_a_lost_link_leaves_it_standing(world: None, driver: RtpsRobot) -> None:
+def test_base_stops_when_its_link_is_lost(world: None, driver: RtpsRobot) -> None:
     # A driver that is gone without a word: no zero and no stop, as when a cable is pulled.
     with subprocess.Popen([sys.executable, "-c", DRIVER], cwd=ROOT) as lost:
         try:

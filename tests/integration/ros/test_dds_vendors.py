@@ -78,66 +78,66 @@ class Arm:
         self.moved.set()
 
 
-def test_it_hears_our_velocities_and_the_zero_after_them(peer: DdsPeer) -> None:
+def test_foreign_peer_receives_our_velocities_and_the_final_zero(peer: DdsPeer) -> None:
     robot = RtpsRobot("rover", "/cmd_vel", domain_id=DOMAIN, publish_rate=50, command_gate=OPEN)
     try:
         robot.advertise()
         eventually(lambda: robot.drive(0.25, -0.5, duration=0.2)["status"] == "success")
-        eventually(lambda: peer.heard and peer.heard[-1] == "twist 0 0")
-        assert "twist 0.25 -0.5" in peer.heard
+        eventually(lambda: peer.received and peer.received[-1] == "twist 0 0")
+        assert "twist 0.25 -0.5" in peer.received
     finally:
         robot.disconnect()
 
 
-def test_we_hear_its_velocities(peer: DdsPeer, link: DdsLink) -> None:
-    heard: list[Mapping[str, Any]] = []
-    link.watch("/other/cmd_vel", "geometry_msgs/msg/Twist", heard.append)
+def test_velocities_of_a_foreign_peer_are_received(peer: DdsPeer, link: DdsLink) -> None:
+    received: list[Mapping[str, Any]] = []
+    link.watch("/other/cmd_vel", "geometry_msgs/msg/Twist", received.append)
 
-    def told() -> bool:
-        peer.say("twist 0.5 -0.25")
-        return bool(heard)
+    def sent() -> bool:
+        peer.send("twist 0.5 -0.25")
+        return bool(received)
 
-    eventually(told)
-    assert heard[0] == {"linear": {"x": 0.5, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": -0.25}}
+    eventually(sent)
+    assert received[0] == {"linear": {"x": 0.5, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": -0.25}}
 
 
-def test_it_commands_the_joints_of_our_robot_and_one_out_of_range_is_dropped_whole(peer: DdsPeer) -> None:
+def test_foreign_peer_commands_joints_and_one_out_of_range_drops_the_command(peer: DdsPeer) -> None:
     arm = Arm()
     bridge = HardwareRtpsBridge(arm, domain_id=DOMAIN, joint_limits={"elbow.pos": (-1.0, 1.0)})
     try:
 
         def commanded() -> bool:
-            peer.say("joints shoulder.pos 0.5 elbow.pos -0.25")
+            peer.send("joints shoulder.pos 0.5 elbow.pos -0.25")
             return arm.moved.wait(0.05)
 
         eventually(commanded)
         assert arm.taken[0] == {"shoulder.pos": 0.5, "elbow.pos": -0.25}
         taken = len(arm.taken)
-        peer.say("joints shoulder.pos 0.7 elbow.pos 1.5")
-        peer.say("joints shoulder.pos 0.1 elbow.pos 0.2")
+        peer.send("joints shoulder.pos 0.7 elbow.pos 1.5")
+        peer.send("joints shoulder.pos 0.1 elbow.pos 0.2")
         eventually(lambda: arm.taken[-1] == {"shoulder.pos": 0.1, "elbow.pos": 0.2})
         assert all(each["shoulder.pos"] != 0.7 for each in arm.taken[taken:])
     finally:
         bridge.shutdown()
 
 
-def test_a_picture_goes_both_ways_and_nobody_crashes(peer: DdsPeer, link: DdsLink) -> None:
+def test_pictures_pass_both_ways_without_a_crash(peer: DdsPeer, link: DdsLink) -> None:
     fields = {"height": 240, "width": 320, "encoding": "rgb8", "step": 960, "data": PICTURE}
 
     def shown() -> bool:
         link.broadcast("/arm/front/image_raw", "sensor_msgs/msg/Image", fields)
-        return f"image 320 240 rgb8 {sum(PICTURE)}" in peer.heard
+        return f"image 320 240 rgb8 {sum(PICTURE)}" in peer.received
 
     eventually(shown)
-    heard: list[Mapping[str, Any]] = []
-    link.watch("/camera/image_raw", "sensor_msgs/msg/Image", heard.append)
+    received: list[Mapping[str, Any]] = []
+    link.watch("/camera/image_raw", "sensor_msgs/msg/Image", received.append)
 
     def seen() -> bool:
-        peer.say("image")
-        return bool(heard)
+        peer.send("image")
+        return bool(received)
 
     eventually(seen)
-    assert (heard[0]["width"], heard[0]["encoding"], heard[0]["data"]) == (320, "rgb8", PICTURE)
+    assert (received[0]["width"], received[0]["encoding"], received[0]["data"]) == (320, "rgb8", PICTURE)
     assert peer.alive
 
 
@@ -145,7 +145,7 @@ def x_of(robot: RtpsRobot) -> float:
     return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
-def test_a_fast_dds_base_is_driven_stopped_and_seen_standing(built: Built) -> None:
+def test_fast_dds_base_is_driven_and_stopped(built: Built) -> None:
     robot = RtpsRobot("base", "/cmd_vel", odom_topic="/odom", domain_id=DOMAIN, publish_rate=20, command_gate=OPEN)
     with DdsPeer(built(FAST_DDS), DOMAIN) as peer:
         try:
@@ -158,7 +158,7 @@ def test_a_fast_dds_base_is_driven_stopped_and_seen_standing(built: Built) -> No
             # 0.4 m; less where a far end or its server is starved of its processor, or misses the first message.
             assert 0.1 < x_of(robot) - began < 0.6
             assert robot.start_drive(1.0, 0.0, 30.0)["status"] == "success"
-            eventually(lambda: "twist 1 0" in peer.heard)
+            eventually(lambda: "twist 1 0" in peer.received)
             verdict = robot.halt("test")
             assert (verdict.stopped, verdict.halted) == (True, ("drive",))
         finally:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from fixtures import rclpy_stand_in
 from fixtures.devices import RecordingDevice
+from fixtures.ros_bases import Lock
 from fixtures.taking_arm import TakingArm
 from fixtures.waiting import eventually
 
-from strands_robots.envelope import Envelope, error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware_ros_bridge import HardwareRosBridge
 from strands_robots.ros.dds import DdsLink
@@ -75,23 +75,23 @@ def test_a_joint_command_of_a_dds_peer_drives_the_arm_whole_or_not_at_all(
     eventually(lambda: not [t for t in threading.enumerate() if t.name.startswith(ours)])
 
 
-def test_a_bridge_without_a_robot_tells_joints_and_images_to_a_dds_peer(sourced: None, peer: DdsLink) -> None:
+def test_bridge_without_a_robot_publishes_joints_and_images_to_a_dds_peer(sourced: None, peer: DdsLink) -> None:
     bridge = HardwareRosBridge(domain_id=DOMAIN)
-    heard: dict[str, Any] = {}
-    peer.watch("/my_arm/joint_states", JOINTS, lambda m: heard.update(joints=m))
-    peer.watch("/my_arm/front/image_raw", IMAGE, lambda m: heard.update(image=m))
+    received: dict[str, Any] = {}
+    peer.watch("/my_arm/joint_states", JOINTS, lambda m: received.update(joints=m))
+    peer.watch("/my_arm/front/image_raw", IMAGE, lambda m: received.update(image=m))
     picture = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
 
-    def told() -> bool:
+    def published() -> bool:
         bridge.publish_joint_states("my arm", ["a.pos"], [0.25])
         bridge.publish_joint_states("my arm", ["a.pos", "b.pos"], [9.0])
         bridge.publish_image("my arm", "front", picture)
         bridge.publish_image("my arm", "front", picture[:, :, 0])
-        return len(heard) == 2
+        return len(received) == 2
 
     try:
-        eventually(told)
-        joints, image = heard["joints"], heard["image"]
+        eventually(published)
+        joints, image = received["joints"], received["image"]
         assert (joints["name"], joints["position"], joints["header"]["stamp"]["sec"] > 0) == (["a.pos"], [0.25], True)
         assert (image["height"], image["width"], image["step"], image["encoding"]) == (2, 4, 12, "rgb8")
         assert (image["header"]["frame_id"], image["data"]) == ("front", picture.tobytes())
@@ -116,7 +116,7 @@ def test_a_bridge_without_a_robot_tells_joints_and_images_to_a_dds_peer(sourced:
         ({"joint_limits": [1]}, "joint_limits"),
     ],
 )
-def test_a_bridge_that_cannot_be_is_refused_before_ros_2_is_looked_for(
+def test_invalid_bridge_argument_is_refused_before_ros_2_is_imported(
     options: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(INSECURE, "1")
@@ -127,7 +127,7 @@ def test_a_bridge_that_cannot_be_is_refused_before_ros_2_is_looked_for(
     assert set(threading.enumerate()) <= threads
 
 
-def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists_or_secures_it(
+def test_commands_on_an_unsecured_graph_need_the_opt_out_or_ros_security(
     sourced: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     secured = dict(zip(SECURITY, ("true", "Enforce", str(tmp_path)), strict=True))
@@ -145,43 +145,36 @@ def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists_or_se
         HardwareRosBridge(TakingArm(), domain_id=DOMAIN)
 
 
-def test_without_a_ros_2_each_bridge_says_so_in_one_sentence() -> None:
+def test_bridge_without_a_ros_2_is_one_clear_error() -> None:
     for make in (HardwareRosBridge, SimRosBridge):
         with pytest.raises(RosError, match="source a ROS 2 installation"):
             make(domain_id=DOMAIN)
 
 
-def test_a_simulation_tells_its_joints_and_a_camera_to_a_dds_peer(sourced: None, peer: DdsLink) -> None:
+def test_simulation_publishes_joints_and_a_camera_to_a_dds_peer(sourced: None, peer: DdsLink) -> None:
     world = Simulation("bench")
     world.add_robot("arm", "so100")
     bridge = SimRosBridge(world, domain_id=DOMAIN)
-    heard: dict[str, Any] = {}
-    peer.watch("/arm/joint_states", JOINTS, lambda m: heard.update(joints=m))
-    peer.watch("/bench/overview/image_raw", IMAGE, lambda m: heard.update(image=m))
+    received: dict[str, Any] = {}
+    peer.watch("/arm/joint_states", JOINTS, lambda m: received.update(joints=m))
+    peer.watch("/bench/overview/image_raw", IMAGE, lambda m: received.update(image=m))
     try:
         bridge.start(20.0, ["overview"])
         with pytest.raises(ValidationError, match="called before"):
             bridge.start()
-        eventually(lambda: len(heard) == 2)
+        eventually(lambda: len(received) == 2)
         observed = world.get_observation("arm")
-        told = dict(zip(heard["joints"]["name"], heard["joints"]["position"], strict=True))
-        assert told == pytest.approx({name: observed[name] for name in told}, abs=0.05)
-        assert len(told) == 6
-        assert (heard["image"]["width"], heard["image"]["height"]) == (320, 240)
+        joints = dict(zip(received["joints"]["name"], received["joints"]["position"], strict=True))
+        assert joints == pytest.approx({name: observed[name] for name in joints}, abs=0.05)
+        assert len(joints) == 6
+        assert (received["image"]["width"], received["image"]["height"]) == (320, 240)
     finally:
         bridge.shutdown()
         bridge.shutdown()
         world.cleanup()
 
 
-class Locked:
-    """A lockout."""
-
-    def refusal(self, verb: str) -> Envelope | None:
-        return error(f"{verb} is locked")
-
-
-def test_a_real_robots_class_is_told_driven_and_locked_over_the_graph(
+def test_hardware_robot_is_published_driven_and_locked_over_the_graph(
     sourced: None, peer: DdsLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(INSECURE, "1")
@@ -189,22 +182,22 @@ def test_a_real_robots_class_is_told_driven_and_locked_over_the_graph(
     robot = HardwareRobot(device, "arm", control_hz=200)
     robot.connect()
     bridge = HardwareRosBridge(robot, domain_id=DOMAIN, spin_period=0.005)
-    heard: list[Any] = []
-    peer.watch("/arm/joint_states", JOINTS, heard.append)
+    received: list[Any] = []
+    peer.watch("/arm/joint_states", JOINTS, received.append)
     try:
         bridge.start(50.0)
-        told = eventually(lambda: heard)[-1]
-        command = {"name": told["name"], "position": [25.0] * len(told["name"])}
+        joints = eventually(lambda: received)[-1]
+        command = {"name": joints["name"], "position": [25.0] * len(joints["name"])}
 
         def obeyed() -> bool:
             peer.publish("/arm/joint_command", JOINTS, command)
-            return bool(heard[-1]["position"] == command["position"])
+            return bool(received[-1]["position"] == command["position"])
 
         eventually(obeyed)
-        robot.gate.attach(Locked())
-        peer.publish("/arm/joint_command", JOINTS, {**command, "position": [50.0] * len(told["name"])})
-        assert bridge.apply({**command, "position": [50.0] * len(told["name"])}) is False
-        assert heard[-1]["position"] == command["position"]
+        robot.gate.attach(Lock())
+        peer.publish("/arm/joint_command", JOINTS, {**command, "position": [50.0] * len(joints["name"])})
+        assert bridge.apply({**command, "position": [50.0] * len(joints["name"])}) is False
+        assert received[-1]["position"] == command["position"]
     finally:
         bridge.shutdown()
         robot.cleanup()

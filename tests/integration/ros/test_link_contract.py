@@ -68,39 +68,39 @@ def place(x: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("back", [False, True])
-def test_what_is_published_reaches_whoever_watches_until_they_do_not(ends: tuple[RosLink, RosLink], back: bool) -> None:
+def test_published_messages_reach_a_watcher_until_it_unwatches(ends: tuple[RosLink, RosLink], back: bool) -> None:
     near, far = reversed(ends) if back else ends
-    heard: list[Message] = []
-    unwatch = far.watch("/cmd_vel", TWIST, heard.append)
+    received: list[Message] = []
+    unwatch = far.watch("/cmd_vel", TWIST, received.append)
     near.publish("/cmd_vel", TWIST, {"linear": {"x": 0.25}})
-    assert eventually(lambda: heard)[0]["linear"]["x"] == 0.25
+    assert eventually(lambda: received)[0]["linear"]["x"] == 0.25
     unwatch()
     unwatch()
     again: list[Message] = []
     far.watch("/cmd_vel", TWIST, again.append)
     near.publish("/cmd_vel", TWIST, {"linear": {"x": 0.5}})
     eventually(lambda: again)
-    assert len(heard) == 1
+    assert len(received) == 1
 
 
-def test_a_watcher_that_raises_harms_nobody(ends: tuple[RosLink, RosLink]) -> None:
+def test_raising_watcher_does_not_affect_the_others(ends: tuple[RosLink, RosLink]) -> None:
     near, far = ends
-    heard: list[Message] = []
+    received: list[Message] = []
 
     def fail(message: Message) -> None:
         raise ValueError(message)
 
     far.watch("/cmd_vel", TWIST, fail)
-    far.watch("/cmd_vel", TWIST, heard.append)
+    far.watch("/cmd_vel", TWIST, received.append)
 
     def sent_again() -> bool:
         near.publish("/cmd_vel", TWIST, {})
-        return len(heard) > 1
+        return len(received) > 1
 
     eventually(sent_again)
 
 
-def test_a_read_gets_the_next_message_and_silence_is_named(ends: tuple[RosLink, RosLink]) -> None:
+def test_read_returns_the_next_message_or_names_the_silence(ends: tuple[RosLink, RosLink]) -> None:
     near, far = ends
     done = threading.Event()
 
@@ -123,26 +123,26 @@ def test_a_read_gets_the_next_message_and_silence_is_named(ends: tuple[RosLink, 
 def test_a_closed_link_opens_anew_when_it_is_used(ends: tuple[RosLink, RosLink]) -> None:
     near, far = ends
     near.close()
-    heard: list[Message] = []
-    far.watch("/cmd_vel", TWIST, heard.append)
+    received: list[Message] = []
+    far.watch("/cmd_vel", TWIST, received.append)
     near.publish("/cmd_vel", TWIST, {"linear": {"x": 1.0}})
-    eventually(lambda: heard)
+    eventually(lambda: received)
 
 
-def test_a_service_answers_and_one_that_nobody_offers_is_named(stacked: RosLink) -> None:
+def test_service_answers_and_a_missing_one_is_named(stacked: RosLink) -> None:
     assert stacked.call("/arm", ARM_KIND, {"data": True}, 20.0) == {"success": True, "message": "armed"}
     with pytest.raises(RosError, match="Nobody offers the service /disarm"):
         stacked.call("/disarm", ARM_KIND, {"data": True}, 0.1)
 
 
-def test_a_goal_that_is_reached_tells_its_feedback_and_its_end(stacked: RosLink) -> None:
+def test_reached_goal_reports_its_feedback_and_its_end(stacked: RosLink) -> None:
     felt: list[Message] = []
     report = run_goal(stacked, NAV, NAV_KIND, place(0.05), 40.0, feedback=felt.append)
     assert (report.state, report.over, report.status, report.values["error_code"]) == ("succeeded", True, 4, 0)
     eventually(lambda: felt and "distance_remaining" in felt[-1])
 
 
-def test_a_goal_is_cancelled_when_its_time_is_over_or_when_it_is_given_up(stacked: RosLink) -> None:
+def test_goal_is_cancelled_after_its_time_or_on_request(stacked: RosLink) -> None:
     report = run_goal(stacked, NAV, NAV_KIND, place(100.0), 4.0)
     assert (report.state, report.over, report.ended_by) == ("canceled", True, "its time of 4 s")
     felt: list[Message] = []
@@ -150,7 +150,7 @@ def test_a_goal_is_cancelled_when_its_time_is_over_or_when_it_is_given_up(stacke
     assert (report.state, report.over, report.ended_by) == ("canceled", True, "a stop")
 
 
-def test_a_goal_that_nobody_serves_or_that_was_given_up_before_never_begins(stacked: RosLink) -> None:
+def test_goal_without_a_server_or_cancelled_before_never_begins(stacked: RosLink) -> None:
     with pytest.raises(RosError, match="Nobody serves the action /elsewhere"):
         run_goal(stacked, "/elsewhere", NAV_KIND, place(0.0), 0.1)
     with pytest.raises(RosError, match=r"given up before|Nobody serves"):

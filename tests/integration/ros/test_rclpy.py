@@ -113,7 +113,7 @@ def test_a_stack_in_another_process_reaches_a_goal(rover: Rover) -> None:
         ("deaf", 4.0, "lost", ["goal", "cancel"]),
     ],
 )
-def test_a_goal_that_is_not_reached_says_why(
+def test_goal_that_is_not_reached_gives_the_reason(
     rover: Rover, manner: str, timeout: float, state: str, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if manner == "deaf":
@@ -126,7 +126,7 @@ def test_a_goal_that_is_not_reached_says_why(
         assert process.end() == said
 
 
-def test_an_end_that_was_lost_on_its_way_is_asked_for_again(rover: Rover) -> None:
+def test_lost_result_is_requested_again(rover: Rover) -> None:
     with nav2(DOMAIN, "forgetful"):
         robot = rover(nav_action="/navigate_to_pose")
         answer = robot.navigate_to(0.05, 0.0, timeout=4.0)
@@ -149,7 +149,7 @@ def test_a_stop_cancels_the_goal_of_a_stack_in_another_process(rover: Rover) -> 
         assert (speed, process.end()) == (0.0, ["goal", "cancel"])
 
 
-def test_a_graph_is_looked_at_read_and_asked_through_ros_action(sourced: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ros_action_lists_reads_and_calls_a_graph(sourced: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_ROS2_COMMAND_ALLOW", "navigate_to_pose")
     at: dict[str, Any] = {"domain_id": DOMAIN, "timeout": 30.0}
     with nav2(DOMAIN, "reach"):
@@ -159,8 +159,8 @@ def test_a_graph_is_looked_at_read_and_asked_through_ros_action(sourced: None, m
         eventually(lambda: ros_action("list_services", **at)["services"] == ["/arm"])
         eventually(lambda: ros_action("info", name="/odom", **at).get("type") == "nav_msgs/msg/Odometry")
         assert len(ros_action("echo", name="/odom", count=2, **at)["messages"]) == 2
-        asked = ros_action("service_call", name="/arm", type="std_srvs/srv/SetBool", fields={"data": True}, **at)
-        assert asked["response"] == {"success": True, "message": "armed"}
+        requests = ros_action("service_call", name="/arm", type="std_srvs/srv/SetBool", fields={"data": True}, **at)
+        assert requests["response"] == {"success": True, "message": "armed"}
         kind = "nav2_msgs/action/NavigateToPose"
         goal = {"pose": {"pose": {"position": {"x": 0.05}}}}
         done = ros_action("action_goal", name="/navigate_to_pose", type=kind, fields=goal, **at)
@@ -176,7 +176,7 @@ def car() -> Iterator[list[Any]]:
     """A DeepRacer's graph on plain DDS: it notes each service request and each servo message."""
     confine(domain, DOMAIN)
     participant = DomainParticipant(DOMAIN)
-    asked: list[Any] = []
+    requests: list[Any] = []
     services = {
         name: Service(participant, f"/ctrl_pkg/{name}", SERVICES[f"deepracer_interfaces_pkg/{kind}"])
         for name, kind in (("vehicle_state", "ActiveStateSrv"), ("enable_state", "EnableStateSrv"))
@@ -188,14 +188,14 @@ def car() -> Iterator[list[Any]]:
         while not done.wait(0.002):
             for name, service in services.items():
                 for request in service.requests():
-                    asked.append(name)
+                    requests.append(name)
                     service.answer(request, error=0)
-            told = [each for each in servo.take(N=100) if each.sample_info.valid_data]
-            asked.extend((round(each.angle, 3), round(each.throttle, 3)) for each in told)
+            commands = [each for each in servo.take(N=100) if each.sample_info.valid_data]
+            requests.extend((round(each.angle, 3), round(each.throttle, 3)) for each in commands)
 
     thread = threading.Thread(target=serve)
     thread.start()
-    yield asked
+    yield requests
     done.set()
     thread.join()
 

@@ -23,10 +23,10 @@ class Operator:
 
     def __init__(self, answer: object) -> None:
         self.answer = answer
-        self.asked: list[str] = []
+        self.requests: list[str] = []
 
     def interrupt(self, name: str, reason: Any = None) -> object:
-        self.asked.append(name)
+        self.requests.append(name)
         return self.answer
 
 
@@ -56,7 +56,7 @@ def over(server: RosbridgeServer, action: str, **options: Any) -> dict[str, Any]
     return ros_action(action, backend="rosbridge", host="127.0.0.1", port=server.port, **options)
 
 
-def test_a_graph_behind_rosbridge_is_looked_at(server: RosbridgeServer) -> None:
+def test_ros_action_lists_a_graph_behind_rosbridge(server: RosbridgeServer) -> None:
     assert over(server, "status")["topics"] == 2
     assert over(server, "list_topics")["topics"][0] == {"topic": "/cmd_vel", "type": "g/Twist"}
     assert over(server, "list_nodes")["nodes"] == ["/rover"]
@@ -82,28 +82,28 @@ def test_a_topic_is_echoed_with_its_bytes_counted(server: RosbridgeServer) -> No
     assert answer["messages"] == [{"data": "3 bytes"}] * 2
 
 
-def test_what_moves_nothing_is_published_and_called_without_asking(server: RosbridgeServer) -> None:
+def test_harmless_publish_and_call_need_no_approval(server: RosbridgeServer) -> None:
     answer = over(server, "publish", name="/chatter", type="std_msgs/String", fields={"data": "hi"}, count=3, rate=100)
     assert answer["messages"] == 3
     eventually(lambda: server.published == [("/chatter", {"data": "hi"})] * 3)
     assert over(server, "service_call", name="/add", type="p/Add", fields={"a": 1, "b": 2})["response"] == {"sum": 3}
 
 
-def test_a_command_asks_the_operator_and_a_zero_is_one_too(server: RosbridgeServer) -> None:
+def test_command_needs_approval_even_if_it_is_zero(server: RosbridgeServer) -> None:
     twist = {"name": "/cmd_vel", "type": "geometry_msgs/Twist", "fields": {}}
     assert "needs operator approval" in over(server, "publish", **twist)["reason"]
     no, yes = Operator("no"), Operator("yes")
     assert "did not approve" in over(server, "publish", tool_context=no, **twist)["reason"]
     assert server.published == []
     assert over(server, "publish", tool_context=yes, **twist)["status"] == "success"
-    assert no.asked == yes.asked == ["ros_command:/cmd_vel"]
+    assert no.requests == yes.requests == ["ros_command:/cmd_vel"]
     motors = {"name": "/base/enable_motors", "type": "p/Enable"}
     assert "enable_motors command" in over(server, "service_call", **motors)["reason"]
     goal = {"name": "/navigate_to_pose", "type": "nav2_msgs/action/NavigateToPose"}
     assert "navigate_to_pose command" in over(server, "action_goal", **goal)["reason"]
 
 
-def test_a_goal_tells_its_end(server: RosbridgeServer) -> None:
+def test_goal_reports_its_end(server: RosbridgeServer) -> None:
     ends = [4, 6]
     server.on_goal = lambda goal: [{"op": "action_result", "values": {"n": 3}, "status": ends.pop(0), "result": True}]
     answer = over(server, "action_goal", name="/count", type="p/action/Count")
@@ -132,15 +132,15 @@ def test_an_argument_outside_its_domain_is_refused_by_name(action: str, options:
     assert ros_action(action, **options)["reason"].startswith(f"{named} must be")
 
 
-def test_a_graph_over_dds_is_looked_at_and_read(tmp_path: Path) -> None:
+def test_ros_action_lists_and_reads_a_graph_over_dds(tmp_path: Path) -> None:
     with base_process(DOMAIN):
         odom = {"topic": "/odom", "type": "nav_msgs/msg/Odometry", "publishers": 1, "subscriptions": 0}
         eventually(lambda: odom in ros_action("list_topics", domain_id=DOMAIN)["topics"])
         sample = ros_action("echo", name="/odom", domain_id=DOMAIN)["messages"][0]
         assert sample["twist"]["twist"]["linear"] == {"x": 0.0, "y": 0.0, "z": 0.0}
-        told = {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "fields": {"linear": {"x": 0.1}}}
+        command = {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "fields": {"linear": {"x": 0.1}}}
         at: dict[str, Any] = {"domain_id": DOMAIN, "tool_context": Operator(True)}
-        eventually(lambda: ros_action("publish", **at, **told)["status"] == "success")
+        eventually(lambda: ros_action("publish", **at, **command)["status"] == "success")
     for action, options in (
         ("service_call", {"name": "/add", "type": "p/Add"}),
         ("action_goal", {"name": "/go", "type": "p/Go"}),

@@ -39,7 +39,7 @@ def test_the_example_navigates_and_is_stopped_on_its_way(tmp_path: Path) -> None
     assert "The goal was canceled after a stop ended it." in said
 
 
-def test_the_example_drives_an_arm_over_both_roads_and_shows_a_picture(tmp_path: Path) -> None:
+def test_the_example_drives_an_arm_over_rclpy_and_dds_and_shows_a_picture(tmp_path: Path) -> None:
     said = run("ros_arm", tmp_path)
     for bridge in ("HardwareRtpsBridge: commanded 0.5", "HardwareRosBridge: commanded -0.5", "SimRosBridge: a picture"):
         assert bridge in said

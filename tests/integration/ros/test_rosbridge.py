@@ -66,7 +66,7 @@ def test_a_service_answers_and_its_failure_is_an_error(link: RosbridgeLink) -> N
         link.call("/refuse", "pkg/Refuse", {"verb": "jump"}, 20.0)
 
 
-def test_a_status_error_ends_the_request_it_names_at_once(link: RosbridgeLink) -> None:
+def test_status_error_fails_its_request_at_once(link: RosbridgeLink) -> None:
     began = time.monotonic()
     with pytest.raises(RosError, match="no service /nobody"):
         link.call("/nobody", "pkg/Nobody", {}, 60.0)
@@ -113,13 +113,13 @@ def test_bytes_go_out_as_base64_and_a_nan_not_at_all(server: RosbridgeServer, li
 
 
 def test_fragments_are_put_together_in_any_order(server: RosbridgeServer, link: RosbridgeLink) -> None:
-    heard: list[Mapping[str, Any]] = []
-    link.watch("/long", "std_msgs/String", heard.append)
+    received: list[Mapping[str, Any]] = []
+    link.watch("/long", "std_msgs/String", received.append)
     eventually(lambda: server.seen("subscribe"))
     whole = json.dumps({"op": "publish", "topic": "/long", "msg": {"data": "word " * 50}})
     for number, part in ((1, whole[40:]), (0, whole[:40])):
         server.send({"op": "fragment", "id": "7", "num": number, "total": 2, "data": part})
-    eventually(lambda: heard == [{"data": "word " * 50}])
+    eventually(lambda: received == [{"data": "word " * 50}])
 
 
 @pytest.mark.parametrize(
@@ -127,22 +127,22 @@ def test_fragments_are_put_together_in_any_order(server: RosbridgeServer, link: 
     ["{", "[]", '{"no": "op"}', '{"op": "publish"}', '{"op": "fragment", "id": "1", "num": 2, "total": 1}',
      '{"op": "service_response", "id": []}', '{"op": "publish", "topic": "/t", "msg": 3}', "[" * 5000],
 )  # fmt: skip
-def test_a_frame_that_makes_no_sense_is_survived(server: RosbridgeServer, link: RosbridgeLink, frame: str) -> None:
-    heard: list[Mapping[str, Any]] = []
-    link.watch("/t", None, heard.append)
+def test_malformed_frame_is_ignored(server: RosbridgeServer, link: RosbridgeLink, frame: str) -> None:
+    received: list[Mapping[str, Any]] = []
+    link.watch("/t", None, received.append)
     eventually(lambda: server.seen("subscribe"))
     server.send(frame)
     server.tell("/t", {"data": 1})
-    eventually(lambda: heard == [{"data": 1}])
+    eventually(lambda: received == [{"data": 1}])
 
 
-def test_a_lost_server_refuses_at_once_and_is_found_again_with_its_subscriptions(
+def test_lost_server_refuses_at_once_and_is_reconnected_with_its_subscriptions(
     server: RosbridgeServer, link: RosbridgeLink
 ) -> None:
-    heard: list[Mapping[str, Any]] = []
-    link.watch("/odom", "nav_msgs/Odometry", heard.append)
+    received: list[Mapping[str, Any]] = []
+    link.watch("/odom", "nav_msgs/Odometry", received.append)
     link.publish("/cmd_vel", TWIST, {})
-    eventually(lambda: server.tell("/odom", {"n": 1}) and heard)
+    eventually(lambda: server.tell("/odom", {"n": 1}) and received)
     server.stop()
 
     def refuses() -> bool:
@@ -154,15 +154,15 @@ def test_a_lost_server_refuses_at_once_and_is_found_again_with_its_subscriptions
 
     eventually(refuses)
     server.ops.clear()
-    heard.clear()
+    received.clear()
     server.start()
-    eventually(lambda: server.tell("/odom", {"n": 2}) and heard)
+    eventually(lambda: server.tell("/odom", {"n": 2}) and received)
     link.publish("/cmd_vel", TWIST, {"back": 1})
     eventually(lambda: ("/cmd_vel", {"back": 1}) in server.published)
     assert [op["topic"] for op in server.seen("advertise")] == ["/cmd_vel"]
 
 
-def test_a_server_that_is_not_there_is_told_and_can_be_dialled_later() -> None:
+def test_missing_server_is_an_error_and_can_be_connected_later() -> None:
     port = free_port()
     link = RosbridgeLink("127.0.0.1", port, connect_s=20.0)
     with pytest.raises(RosError, match=f"127.0.0.1:{port}"):
@@ -182,7 +182,7 @@ def test_a_server_that_is_not_there_is_told_and_can_be_dialled_later() -> None:
 @pytest.mark.parametrize(
     "where", [{"host": "ws://robot"}, {"host": "a b"}, {"host": ""}, {"port": 0}, {"port": 70000}, {"port": True}]
 )
-def test_a_host_or_port_that_cannot_be_dialled_is_refused_before_anything(where: dict[str, Any]) -> None:
+def test_invalid_host_or_port_is_refused_at_construction(where: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(where))):
         RosbridgeRobot("rover", "/cmd_vel", "/odom", **where)
 
@@ -192,10 +192,10 @@ def test_an_action_goal_reports_feedback_and_its_end(server: RosbridgeServer, li
         {"op": "action_feedback", "values": {"left": goal["args"]["metres"]}},
         {"op": "action_result", "values": {"ok": 1}, "status": 4, "result": True},
     ]
-    told: list[Mapping[str, Any]] = []
-    report = run_goal(link, "/go", "pkg/action/Go", {"metres": 2}, 20.0, feedback=told.append)
+    feedback: list[Mapping[str, Any]] = []
+    report = run_goal(link, "/go", "pkg/action/Go", {"metres": 2}, 20.0, feedback=feedback.append)
     assert (report.state, report.over, report.values) == ("succeeded", True, {"ok": 1})
-    assert told == [{"left": 2}]
+    assert feedback == [{"left": 2}]
 
 
 def test_an_action_goal_that_does_not_end_is_cancelled(
@@ -219,7 +219,7 @@ def test_a_goal_whose_server_dies_is_lost_and_not_reached(server: RosbridgeServe
 
 
 def standing(server: RosbridgeServer) -> None:
-    """Let the far end be a base that does at once what it is told, and says so."""
+    """Let the server stand for a base that does at once what it is commanded, with odometry."""
 
     def obey(topic: str, message: dict[str, Any]) -> None:
         if topic == "/cmd_vel":
@@ -228,7 +228,7 @@ def standing(server: RosbridgeServer) -> None:
     server.on_publish = obey
 
 
-def test_a_rover_is_driven_stopped_and_known_to_stand(server: RosbridgeServer, rover: RosbridgeRobot) -> None:
+def test_rover_is_driven_and_stopped_with_odometry(server: RosbridgeServer, rover: RosbridgeRobot) -> None:
     standing(server)
     answer = rover.drive(9.0, -9.0, duration=0.1)
     assert (answer["status"], answer["linear"], answer["angular"]) == ("success", 2.0, -1.0)
@@ -242,7 +242,7 @@ def test_a_rover_is_driven_stopped_and_known_to_stand(server: RosbridgeServer, r
     eventually(lambda: server.published[-1][1]["linear"]["x"] == 0.0)
 
 
-def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still_move(
+def test_drive_whose_server_is_killed_says_that_the_base_may_still_move(
     server: RosbridgeServer, rover: RosbridgeRobot
 ) -> None:
     answers: list[dict[str, Any]] = []
@@ -259,7 +259,7 @@ def test_a_server_killed_inside_a_drive_makes_it_an_error_that_says_it_may_still
     assert server.published[0][1]["linear"]["x"] == 0.0
 
 
-def test_a_server_that_returns_under_the_lockout_brings_zeros_for_their_whole_time_and_nothing_else(
+def test_server_that_returns_under_the_lockout_gets_only_zeros_for_the_whole_hold_time(
     server: RosbridgeServer, rover: RosbridgeRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(velocity_publisher, "BLIND_HOLD_S", 1.0)
@@ -296,7 +296,7 @@ def test_curiosity_is_wired_to_its_simulation() -> None:
     assert rover.reads == ("get_pose",)
 
 
-def test_a_clogged_connection_holds_up_neither_a_stop_nor_its_verdict(server: RosbridgeServer) -> None:
+def test_clogged_connection_delays_neither_a_stop_nor_its_verdict(server: RosbridgeServer) -> None:
     robot = RosbridgeRobot("rover", "/cmd_vel", "/odom", host="127.0.0.1", port=server.port, command_gate=OPEN)
     server.on_publish = lambda topic, twist: server.tell("/odom", {"twist": {"twist": twist}})
     try:
@@ -323,7 +323,7 @@ def test_a_clogged_connection_holds_up_neither_a_stop_nor_its_verdict(server: Ro
         robot.disconnect()
 
 
-def test_a_clogged_link_is_closed_all_the_same(server: RosbridgeServer, link: RosbridgeLink) -> None:
+def test_clogged_link_can_be_closed(server: RosbridgeServer, link: RosbridgeLink) -> None:
     chatter = threading.Thread(target=lambda: stuffed(link, {"data": bytes(12 * 2**20)}))
     link.publish("/chatter", "std_msgs/String", {"data": "first"})
     eventually(lambda: server.seen("publish"))

@@ -58,7 +58,7 @@ def x_of(robot: RosbridgeRobot) -> float:
     return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
-def test_a_rospy_base_is_driven_and_stands_afterwards(base: RosbridgeRobot) -> None:
+def test_rospy_base_is_driven_and_stands_afterwards(base: RosbridgeRobot) -> None:
     began = x_of(base)
     answer = base.drive(0.4, 0.0, duration=1.0)
     assert (answer["status"], answer["messages"], answer["trailing_zero"]) == ("success", 20, True)
@@ -78,21 +78,21 @@ def test_a_stop_ends_the_drive_of_a_rospy_base(base: RosbridgeRobot) -> None:
     assert base.get_task_status()["task_status"] == "stopped"
 
 
-def test_its_scan_is_read_with_what_json_makes_of_infinity(base: RosbridgeRobot) -> None:
+def test_scan_is_read_with_null_for_infinity(base: RosbridgeRobot) -> None:
     scan = base.get_scan(20.0)["message"]
     assert scan["range_max"] == 8
     assert scan["ranges"] == [1, 2, None]
 
 
-def test_its_services_answer_and_one_that_is_not_there_is_said(link: RosbridgeLink, base: RosbridgeRobot) -> None:
-    told = link.call("/stand", "std_srvs/Trigger", {}, 20.0)
-    assert told == {"success": True, "message": f"{x_of(base):.3f}"}
+def test_services_answer_and_a_missing_one_is_an_error(link: RosbridgeLink, base: RosbridgeRobot) -> None:
+    received = link.call("/stand", "std_srvs/Trigger", {}, 20.0)
+    assert received == {"success": True, "message": f"{x_of(base):.3f}"}
     assert link.call("/power", "std_srvs/SetBool", {"data": True}, 20.0)["message"] == "on"
     with pytest.raises(RosError, match="/nowhere did not answer within"):
         link.call("/nowhere", "std_srvs/Trigger", {}, 0.5)
 
 
-def test_what_the_server_refuses_is_told_in_its_words(link: RosbridgeLink) -> None:
+def test_server_refusal_is_reported_verbatim(link: RosbridgeLink) -> None:
     with pytest.raises(RosError, match="rosbridge says"):
         link.call("/odd", "no_srvs/Odd", {}, 20.0)
     # This server resolves no types, and says so of a subscription that has none.
@@ -100,14 +100,14 @@ def test_what_the_server_refuses_is_told_in_its_words(link: RosbridgeLink) -> No
         link.read("/odom", None, 20.0)
 
 
-def test_a_killed_server_is_noticed_and_its_successor_is_given_the_subscriptions(
+def test_restarted_server_gets_the_subscriptions_of_the_killed_one(
     graph: Ros1Graph, base: RosbridgeRobot, link: RosbridgeLink
 ) -> None:
-    heard: list[Mapping[str, Any]] = []
-    link.watch("/odom", ODOMETRY, heard.append)
-    eventually(lambda: heard)
+    received: list[Mapping[str, Any]] = []
+    link.watch("/odom", ODOMETRY, received.append)
+    eventually(lambda: received)
     assert base.start_drive(0.3, 0.0, 30.0)["status"] == "success"
-    eventually(lambda: heard[-1]["twist"]["twist"]["linear"]["x"] > 0.2)
+    eventually(lambda: received[-1]["twist"]["twist"]["linear"]["x"] > 0.2)
     graph.stop_server()
     try:
         eventually(lambda: base.get_task_status()["task_status"] == "error")
@@ -116,10 +116,10 @@ def test_a_killed_server_is_noticed_and_its_successor_is_given_the_subscriptions
             link.call("/stand", "std_srvs/Trigger", {}, 1.0)
     finally:
         graph.start_server()
-    heard.clear()
-    eventually(lambda: heard)
+    received.clear()
+    eventually(lambda: received)
     # The base stood by its own watchdog while nobody could reach it.
-    assert heard[-1]["twist"]["twist"]["linear"]["x"] == 0
+    assert received[-1]["twist"]["twist"]["linear"]["x"] == 0
     eventually(lambda: base.stop()["stopped"])
     assert base.drive(0.3, 0.0, duration=0.5)["status"] == "success"
 
@@ -127,20 +127,20 @@ def test_a_killed_server_is_noticed_and_its_successor_is_given_the_subscriptions
 def test_an_independent_client_on_the_same_server_sees_what_we_send(graph: Ros1Graph, base: RosbridgeRobot) -> None:
     import roslibpy  # noqa: PLC0415 - its default transport starts threads when it is used
 
-    told: list[dict[str, Any]] = []
+    received: list[dict[str, Any]] = []
     seen: list[float] = []
     client = roslibpy.Ros("127.0.0.1", graph.port, transport="asyncio")
     client.run(timeout=10)
     try:
         commands = roslibpy.Topic(client, "/cmd_vel", "geometry_msgs/Twist")
         odometry = roslibpy.Topic(client, "/odom", ODOMETRY)
-        commands.subscribe(told.append)
+        commands.subscribe(received.append)
         odometry.subscribe(lambda message: seen.append(message["twist"]["twist"]["linear"]["x"]))
         eventually(lambda: seen)
         assert base.drive(0.25, 0.5, duration=0.5)["status"] == "success"
-        eventually(lambda: told and told[-1]["linear"]["x"] == 0)
-        assert {"x": 0.25, "y": 0, "z": 0} in [each["linear"] for each in told]
-        assert {"x": 0, "y": 0, "z": 0.5} in [each["angular"] for each in told]
+        eventually(lambda: received and received[-1]["linear"]["x"] == 0)
+        assert {"x": 0.25, "y": 0, "z": 0} in [each["linear"] for each in received]
+        assert {"x": 0, "y": 0, "z": 0.5} in [each["angular"] for each in received]
         assert 0.25 in seen
         # And the other way round: what it drives is what we see.
         base.stop()

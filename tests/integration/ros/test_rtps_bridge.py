@@ -58,7 +58,7 @@ def test_a_joint_command_drives_the_arm(arm: TakingArm, bridge: HardwareRtpsBrid
         {},
     ],
 )
-def test_a_command_that_is_wrong_in_one_place_is_dropped_whole(
+def test_command_with_one_invalid_joint_is_dropped_whole(
     arm: TakingArm, bridge: HardwareRtpsBridge, bad: dict[str, Any]
 ) -> None:
     assert bridge.apply(bad) is False
@@ -71,31 +71,31 @@ def test_a_locked_arm_refuses_commands_from_the_graph(arm: TakingArm, bridge: Ha
     assert arm.taken == []
 
 
-def test_joints_and_images_are_told_to_whoever_listens(controller: DdsLink) -> None:
+def test_joints_and_images_are_published(controller: DdsLink) -> None:
     bridge = HardwareRtpsBridge(domain_id=DOMAIN)
-    heard: dict[str, Any] = {}
-    controller.watch("/my_arm/joint_states", JOINTS, lambda m: heard.update(joints=m))
-    controller.watch("/my_arm/front/image_raw", "sensor_msgs/msg/Image", lambda m: heard.update(image=m))
+    received: dict[str, Any] = {}
+    controller.watch("/my_arm/joint_states", JOINTS, lambda m: received.update(joints=m))
+    controller.watch("/my_arm/front/image_raw", "sensor_msgs/msg/Image", lambda m: received.update(image=m))
     picture = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
 
-    def told() -> bool:
+    def published() -> bool:
         bridge.publish_joint_states("my arm", ["a.pos"], [0.25])
         bridge.publish_joint_states("my arm", ["a.pos", "b.pos"], [9.0])
         bridge.publish_image("my arm", "front", picture)
         bridge.publish_image("my arm", "front", picture[:, :, 0])
-        return len(heard) == 2
+        return len(received) == 2
 
     try:
-        eventually(told)
-        assert (heard["joints"]["name"], heard["joints"]["position"]) == (["a.pos"], [0.25])
-        image = heard["image"]
+        eventually(published)
+        assert (received["joints"]["name"], received["joints"]["position"]) == (["a.pos"], [0.25])
+        image = received["image"]
         assert (image["height"], image["width"], image["step"], image["encoding"]) == (2, 4, 12, "rgb8")
         assert image["data"] == picture.tobytes()
     finally:
         bridge.shutdown()
 
 
-def test_commands_on_an_unsecured_graph_are_refused_until_somebody_insists(arm: TakingArm) -> None:
+def test_commands_on_an_unsecured_graph_need_the_opt_out(arm: TakingArm) -> None:
     with pytest.raises(ValidationError, match=INSECURE):
         HardwareRtpsBridge(arm, domain_id=DOMAIN)
     HardwareRtpsBridge(arm, domain_id=DOMAIN, enable_commands=False).shutdown()
@@ -119,7 +119,7 @@ CREDENTIALS = dict.fromkeys(("identity_ca", "certificate", "private_key", "gover
         ({"dds_security_config": CREDENTIALS}, "identity_ca'\\] must name a readable file"),
     ],
 )
-def test_a_bridge_that_cannot_be_is_refused_before_anything_happens(
+def test_invalid_bridge_argument_is_refused_before_anything_starts(
     arm: TakingArm, options: dict[str, Any], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(INSECURE, "1")
