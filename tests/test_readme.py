@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+SOURCES = ROOT / "src" / "strands_robots"
+NAMED_FROM = (ROOT, SOURCES, ROOT / "tests" / "integration" / "safety")
+"""Folders that the pages name files from: safety.md has a table of its integration tests by name alone."""
+
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -42,6 +46,35 @@ def test_every_make_target_that_a_page_names_exists(page: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE))
     for named in re.findall(r"`make ([a-z-]+)", page.read_text(encoding="utf-8")):
         assert named in targets, named
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_a_page_names_exists(page: Path) -> None:
+    for span in re.findall(r"`([^`\s]+)`", page.read_text(encoding="utf-8")):
+        file, _, test = span.partition("::")
+        if file != "_compat.py" and re.fullmatch(r"[\w./-]*\w\.(py|sh)|\w[\w/]*/", file):
+            found = [root / file for root in NAMED_FROM if (root / file).exists()]
+            assert found, f"{page.name} names {span}"
+            assert not test or f"def {test}(" in found[0].read_text(encoding="utf-8"), f"{page.name} names {span}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_module_and_class_that_a_page_names_exists(page: Path) -> None:
+    for dotted in re.findall(
+        r"\b(?:strands_robots|drivers|simulation|fixtures)(?:\.(?!md\b|py\b)\w+)+", page.read_text(encoding="utf-8")
+    ):
+        parts = dotted.split(".")
+        for length in range(len(parts), 0, -1):
+            homes = [root.joinpath(*parts[:length]) for root in (ROOT, SOURCES.parent, SOURCES)]
+            files = [
+                file for home in homes for file in (home.with_suffix(".py"), home / "__init__.py") if file.is_file()
+            ]
+            if files:
+                rest = parts[length : length + 1]
+                assert not rest or re.search(rf"\b{rest[0]}\b", files[0].read_text(encoding="utf-8")), dotted
+                break
+        else:
+            raise AssertionError(f"{page.name} names {dotted}")
 
 
 def test_every_make_target_that_the_pipelines_run_exists() -> None:
