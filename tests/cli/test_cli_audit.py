@@ -19,10 +19,10 @@ def record(count: int = 3) -> None:
 
 def test_tail_prints_the_last_records_without_control_sequences(run: Run) -> None:
     record()
-    shown = run("audit", "tail")
-    assert shown.exit_code == 0
-    assert "arm-1" in shown.stdout and "resume_local" in shown.stdout
-    assert "\x1b" not in shown.stdout
+    output = run("audit", "tail")
+    assert output.exit_code == 0
+    assert "arm-1" in output.stdout and "resume_local" in output.stdout
+    assert "\x1b" not in output.stdout
     rows = [json.loads(line) for line in run("audit", "tail", "-n", "2", "--json").stdout.splitlines()]
     assert [each["event"] for each in rows] == ["emergency_stop", "resume_local"]
 
@@ -35,8 +35,8 @@ def test_tail_of_an_empty_audit_succeeds(run: Run) -> None:
 def test_records_are_found_by_stop_robot_and_event(run: Run) -> None:
     record()
 
-    def many(*words: str) -> int:
-        return len(run("audit", "show", *words, "--json").stdout.splitlines())
+    def many(*arguments: str) -> int:
+        return len(run("audit", "show", *arguments, "--json").stdout.splitlines())
 
     assert many(EPOCH) == 4
     assert many("arm-2") == 1

@@ -42,7 +42,7 @@ class FakeAgent:
         self.robot = robot
         self.at = 0.0
         self.stopped = False
-        self.asked = 0
+        self.status_calls = 0
 
     def discover(self, device_id: str) -> dict[str, Any]:
         if not self.robot.discovered:
@@ -56,8 +56,8 @@ class FakeAgent:
             self.stopped = True
             return self.robot.verdict
         if function == "getStatus":
-            self.asked += 1
-            return {"robots": {"arm": {"pan": 1.0 + (self.robot.brake if self.asked > 1 else 0.0)}}}
+            self.status_calls += 1
+            return {"robots": {"arm": {"pan": 1.0 + (self.robot.brake if self.status_calls > 1 else 0.0)}}}
         return {"robots": {"arm": {"joints": {"pan": [-2, 2]}}}}
 
     @contextmanager

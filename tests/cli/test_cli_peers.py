@@ -22,23 +22,23 @@ def test_peers_are_listed_as_table_and_as_json(run: Run, fleet: FakeFleet) -> No
     fleet.found = [arm()]
     assert "arm-1" in run("peers").stdout
     assert json.loads(run("peers", "--json").stdout)["peers"][0]["id"] == "arm-1"
-    shown = run("peers", "arm-1").stdout
-    assert "instruction: string" in shown
-    assert "Start a policy." in shown
-    assert "And more" not in shown
+    output = run("peers", "arm-1").stdout
+    assert "instruction: string" in output
+    assert "Start a policy." in output
+    assert "And more" not in output
 
 
 def test_peer_text_cannot_control_the_terminal(run: Run, fleet: FakeFleet) -> None:
     fleet.found = [Peer("arm-1", "[bold]\x1b]0;owned\x07", "\u202emodel", {"availability": "[red]x"})]
-    shown = run("peers").stdout
-    assert "\x1b" not in shown and "\x07" not in shown and "\u202e" not in shown
-    assert "[bold]" in shown
+    output = run("peers").stdout
+    assert "\x1b" not in output and "\x07" not in output and "\u202e" not in output
+    assert "[bold]" in output
 
 
-@pytest.mark.parametrize("words", [("peers",), ("peers", "arm-2"), ("stop", "--all")])
-def test_no_answer_is_exit_3(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
-    assert run(*words).exit_code == 3
-    assert json.loads(run(*words, "--json").stdout)["exit"] == 3
+@pytest.mark.parametrize("arguments", [("peers",), ("peers", "arm-2"), ("stop", "--all")])
+def test_no_answer_is_exit_3(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
+    assert run(*arguments).exit_code == 3
+    assert json.loads(run(*arguments, "--json").stdout)["exit"] == 3
 
 
 def test_call_sends_typed_values(run: Run, fleet: FakeFleet) -> None:
@@ -68,7 +68,9 @@ def test_failed_call_prints_the_reason_and_its_exit_code(
     assert run("call", "arm-1", "execute").stdout == ""
 
 
-@pytest.mark.parametrize("words", [("a=1", "a=2"), ("nothing",), ("x=NaN",), ("--timeout", "0"), ("--timeout", "nan")])
-def test_malformed_call_is_exit_2_and_sends_nothing(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
-    assert run("call", "arm-1", "execute", *words).exit_code == 2
+@pytest.mark.parametrize(
+    "arguments", [("a=1", "a=2"), ("nothing",), ("x=NaN",), ("--timeout", "0"), ("--timeout", "nan")]
+)
+def test_malformed_call_is_exit_2_and_sends_nothing(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
+    assert run("call", "arm-1", "execute", *arguments).exit_code == 2
     assert fleet.called == []

@@ -101,9 +101,9 @@ def test_robots_still_locked_are_named_with_exit_1(run: Run, fleet: FakeFleet, s
     assert "resume --local" in devices["full"]["said"]
 
 
-@pytest.mark.parametrize("words", [(), ("--local", "--key", "x"), ("--key", "nowhere"), ("--local", "a.b")])
-def test_resume_with_wrong_arguments_is_exit_2(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
-    assert run("resume", *words).exit_code == 2
+@pytest.mark.parametrize("arguments", [(), ("--local", "--key", "x"), ("--key", "nowhere"), ("--local", "a.b")])
+def test_resume_with_wrong_arguments_is_exit_2(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
+    assert run("resume", *arguments).exit_code == 2
 
 
 def test_wrong_passphrase_frees_no_robot(run: Run, fleet: FakeFleet, signed: tuple[str, ...], tmp_path: Path) -> None:
@@ -116,8 +116,10 @@ def test_wrong_passphrase_frees_no_robot(run: Run, fleet: FakeFleet, signed: tup
 def test_robot_that_is_off_is_cleared_locally_and_audited(run: Run, fleet: FakeFleet) -> None:
     hold = Hold(A, "desk", "a hand", 0.0)
     LockoutStore().save({"hardware:so101:left": Kept(LockoutState((hold,)), name="arm-1")})
-    shown = run("lockout", "--local")
-    assert "arm-1 (in this machine's file)" in shown.stdout and "by desk: a hand" in shown.stdout and A in shown.stdout
+    output = run("lockout", "--local")
+    assert (
+        "arm-1 (in this machine's file)" in output.stdout and "by desk: a hand" in output.stdout and A in output.stdout
+    )
     assert run("resume", "--local").exit_code == 0
     assert flush_audit(20)
     (record,) = [each for each in read_audit_log() if each["event"] == "resume_local"]
@@ -129,10 +131,10 @@ def test_robot_that_is_off_is_cleared_locally_and_audited(run: Run, fleet: FakeF
 def test_live_robot_outranks_the_lockout_file(run: Run, fleet: FakeFleet) -> None:
     LockoutStore().save({"k": Kept(LockoutState((Hold(A, "desk", "", 0.0),)), name="arm-1")})
     fleet.lockouts = {"arm-1": [], "arm-2": [B]}
-    told = json.loads(run("lockout", "--json").stdout)
-    assert {name: each["locked"] for name, each in told["live"].items()} == {"arm-1": False, "arm-2": True}
-    shown = run("lockout").stdout
-    assert "this machine's file" not in shown and "Free: arm-1." in shown and B in shown
+    answer = json.loads(run("lockout", "--json").stdout)
+    assert {name: each["locked"] for name, each in answer["live"].items()} == {"arm-1": False, "arm-2": True}
+    output = run("lockout").stdout
+    assert "this machine's file" not in output and "Free: arm-1." in output and B in output
     fleet.silent = {"arm-1"}
     assert "arm-1 (in this machine's file)" in run("lockout").stdout
 

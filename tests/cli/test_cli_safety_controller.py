@@ -118,8 +118,8 @@ class LinkedController:
 def drawn(fleet: FleetScreen, button: StopButton) -> str:
     out = Console(file=io.StringIO(), width=160, height=40)
     out.print(fleet.draw(button, ["ERROR something"]))
-    shown: str = out.file.getvalue()  # type: ignore[attr-defined]  # it is a StringIO
-    return shown
+    output: str = out.file.getvalue()  # type: ignore[attr-defined]  # it is a StringIO
+    return output
 
 
 def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,11 +134,11 @@ def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.Mon
             LockoutReport("arm-9", problem="no answer"),
         ]
     )
-    shown = drawn(fleet, button)
-    assert "LOCKED" in shown and "desk-1 a hand" in shown
-    assert "1.2 s left" in shown
-    assert "arm-9" not in shown
-    assert "SPACE stops everything" in shown and "ERROR something" in shown
+    output = drawn(fleet, button)
+    assert "LOCKED" in output and "desk-1 a hand" in output
+    assert "1.2 s left" in output
+    assert "arm-9" not in output
+    assert "SPACE stops everything" in output and "ERROR something" in output
     monkeypatch.setattr(safety_controller, "GONE_S", 0.0)
     fleet.update([LockoutReport("arm-1", problem="no answer")])
     assert "GONE" in drawn(fleet, button)

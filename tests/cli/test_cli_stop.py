@@ -32,13 +32,13 @@ class FakeController:
 
     def __init__(self, ends: StopReport) -> None:
         self.ends = ends
-        self.asked: list[tuple[Collection[str], str]] = []
+        self.calls: list[tuple[Collection[str], str]] = []
 
     def wait_link(self, timeout: float) -> bool:
         return True
 
     def stop(self, expected: Collection[str], reason: str, **more: Any) -> StopReport:
-        self.asked.append((expected, reason))
+        self.calls.append((expected, reason))
         return self.ends
 
     def close(self) -> None:
@@ -46,11 +46,11 @@ class FakeController:
 
 
 @pytest.mark.parametrize(
-    ("ends", "code", "shown"),
+    ("ends", "code", "printed"),
     [
         (report(answer("a")), 0, "stopped"),
         (report(answer("a"), answer("b", False, why="bus: no answer in 1 s")), 1, "DID NOT STOP"),
-        (report(answer("a"), answer("b", None, why="b: nobody can tell")), 1, "UNKNOWN"),
+        (report(answer("a"), answer("b", None, why="b: state unknown")), 1, "UNKNOWN"),
         (report(answer("a", None, why="a: this stop was resumed before it came again")), 1, "resumed before"),
         (report(answer("a"), silent=("b",)), 3, "NO ANSWER"),
         (report(), 3, "0 stopped"),
@@ -58,22 +58,24 @@ class FakeController:
     ],
 )
 def test_estop_names_each_robot_and_exits_with_the_worst(
-    run: Run, monkeypatch: pytest.MonkeyPatch, ends: StopReport, code: int, shown: str
+    run: Run, monkeypatch: pytest.MonkeyPatch, ends: StopReport, code: int, printed: str
 ) -> None:
     fake = FakeController(ends)
     monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: fake)
     result = run("estop", "a", "b", "--reason", "a hand")
     assert result.exit_code == code
-    assert shown in result.stdout
-    assert fake.asked == [(["a", "b"], "a hand")]
-    told = json.loads(run("estop", "a", "--json").stdout)
-    assert told["silent"] == list(ends.silent)
-    assert (told["status"] == "success") is (code == 0)
+    assert printed in result.stdout
+    assert fake.calls == [(["a", "b"], "a hand")]
+    facts = json.loads(run("estop", "a", "--json").stdout)
+    assert facts["silent"] == list(ends.silent)
+    assert (facts["status"] == "success") is (code == 0)
 
 
-@pytest.mark.parametrize("words", [("a", "--all"), ("a.b",), ("--deadline", "0"), ("--as", ""), ("--key", "nowhere")])
-def test_estop_with_wrong_arguments_is_exit_2(run: Run, words: tuple[str, ...]) -> None:
-    assert run("estop", *words).exit_code == 2
+@pytest.mark.parametrize(
+    "arguments", [("a", "--all"), ("a.b",), ("--deadline", "0"), ("--as", ""), ("--key", "nowhere")]
+)
+def test_estop_with_wrong_arguments_is_exit_2(run: Run, arguments: tuple[str, ...]) -> None:
+    assert run("estop", *arguments).exit_code == 2
 
 
 def test_slow_and_silent_robots_are_red() -> None:
@@ -103,9 +105,9 @@ def test_stop_prints_each_verdict_and_exits_with_the_worst(run: Run, fleet: Fake
     assert "DID NOT STOP" in run("stop", "--all").stdout
 
 
-@pytest.mark.parametrize("words", [("stop",), ("stop", "a", "--all")])
-def test_stop_takes_a_device_or_all(run: Run, fleet: FakeFleet, words: tuple[str, ...]) -> None:
-    assert run(*words).exit_code == 2
+@pytest.mark.parametrize("arguments", [("stop",), ("stop", "a", "--all")])
+def test_stop_takes_a_device_or_all(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
+    assert run(*arguments).exit_code == 2
 
 
 @pytest.mark.parametrize(

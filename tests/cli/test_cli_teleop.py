@@ -22,10 +22,10 @@ def test_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) ->
 
 
 def test_unusable_leader_is_refused_by_name(run: Run, tmp_path: Path) -> None:
-    for leader, words in (("nobody", "recording"), (str(tmp_path / "none.csv"), "cannot be read")):
+    for leader, reason in (("no-such-leader", "recording"), (str(tmp_path / "none.csv"), "cannot be read")):
         result = run("teleop", leader, "so100", "--json")
         assert result.exit_code == 2
-        assert words in json.loads(result.stdout)["reason"]
+        assert reason in json.loads(result.stdout)["reason"]
 
 
 def test_keyboard_is_refused_without_a_terminal(run: Run) -> None:

@@ -26,7 +26,7 @@ _JSON = Parameter(
     "machine",
     Parameter.KEYWORD_ONLY,
     default=False,
-    annotation=Annotated[bool, typer.Option("--json", help="Machine-readable output, on stdout alone.")],
+    annotation=Annotated[bool, typer.Option("--json", help="Machine-readable output, on stdout only.")],
 )
 _SERIAL = re.compile(r"/.|COM\d+\Z", re.IGNORECASE)
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")

@@ -28,7 +28,7 @@ FRAMEWORK = "0.2.5"
 """Release of device-connect-edge that the backends are written for."""
 
 _GROUP = "224.0.0.224"
-"""Zenoh's scouting group; any multicast address would show whether the network carries multicast."""
+"""Zenoh's scouting group; any multicast address shows whether the network carries multicast."""
 
 _EXTRAS: dict[str, tuple[str, ...]] = {
     "device-connect": ("device-connect-edge", "device-connect-agent-tools", "eclipse-zenoh", "nats-py"),
@@ -237,7 +237,7 @@ def multicast_error(within: float = 0.5) -> str | None:
 def _certificates() -> Iterator[Finding]:
     names = {part: settings.raw(f"MESSAGING_TLS_{part}_FILE") for part in ("CA", "CERT", "KEY")}
     if not any(names.values()):
-        yield Finding("certificates", Mark.OK, "none configured; this machine alone needs none")
+        yield Finding("certificates", Mark.OK, "none configured; a network inside this machine needs none")
         return
     failed, until = certificate_error(names["CA"], names["CERT"], names["KEY"])
     if failed:
@@ -274,7 +274,7 @@ def certificate_error(ca: str, cert: str, key: str, now: datetime | None = None)
 def _credentials() -> Iterator[Finding]:
     name = settings.raw("MESSAGING_CREDENTIALS_FILE") or settings.raw("NATS_CREDENTIALS_FILE")
     if not name:
-        yield Finding("credentials", Mark.OK, "none configured; this machine alone needs none")
+        yield Finding("credentials", Mark.OK, "none configured; a network inside this machine needs none")
         return
     path = Path(name)
     try:

@@ -26,8 +26,8 @@ SOURCE = "strands-robots"
 """Caller's name that goes with the calls of the command line."""
 
 _NEEDS = (
-    "Leaving this machine needs proof of who is who: certificates (--tls-ca, --tls-cert, --tls-key), "
-    "credentials (--credentials FILE) or --insecure, which lets anybody on that network drive the robot."
+    "A network beyond this machine needs authentication: certificates (--tls-ca, --tls-cert, --tls-key), "
+    "credentials (--credentials FILE) or --insecure, which lets every program on that network drive the robot."
 )
 
 
@@ -64,7 +64,7 @@ class Network:
         """Return the link that the flags describe.
 
         Raises:
-            CliError: the flags contradict one another, or leave this machine without any proof of identity.
+            CliError: the flags contradict one another, or leave this machine without authentication.
             MissingExtraError: Device Connect is not installed.
         """
         if self.nats and (self.connect or self.listen or self.multicast):
@@ -93,7 +93,7 @@ class Network:
             raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
 
     def use_mesh(self) -> None:
-        """Apply the flags to the native mesh, which takes ``--port`` alone.
+        """Apply the flags to the native mesh, which takes only ``--port``.
 
         Raises:
             CliError: another flag was given.
@@ -137,7 +137,7 @@ class Network:
 
 def describe(link: LinkConfig) -> str:
     """Describe in one sentence who can reach a robot over ``link``."""
-    proof = "both sides prove who they are" if link.authenticated else "nobody proves who they are"
+    proof = "both sides are authenticated" if link.authenticated else "neither side is authenticated"
     if link.transport == "nats":
         return f"NATS at {', '.join(link.connect) or 'its default address'}; {proof}."
     if link.meeting_point:
@@ -207,7 +207,7 @@ def _pem(flag: str, path: Path | None, otherwise: str) -> str:
     return str(path) if path is not None else otherwise
 
 
-def _endpoints(given: list[str] | None) -> tuple[str, ...]:
+def _endpoints(values: list[str] | None) -> tuple[str, ...]:
     from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
 
-    return endpoints([part for each in given or [] for part in each.split(",")])
+    return endpoints([part for each in values or [] for part in each.split(",")])

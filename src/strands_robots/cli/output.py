@@ -71,7 +71,7 @@ class Screen:
     """Output of one command: tables and sentences for people, or one JSON value a line for programs.
 
     Args:
-        machine: true with ``--json``; then stdout carries JSON alone.
+        machine: true with ``--json``; then stdout carries only JSON.
         console: in place of stdout, for recordings and tests.
     """
 

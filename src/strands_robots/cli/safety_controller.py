@@ -271,7 +271,7 @@ class FleetScreen:
         if self._check_in_s is not None:
             head += f"; checks in every {self._check_in_s:g} s"
         answers = button.progress.answered if button.progress is not None else {}
-        columns = ("robot", "lockout", "since, by whom", "last stop", "status", "heard", "check-in")
+        columns = ("robot", "lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
         rows = (_row(name, last, answers.get(name)) for name, last in sorted(self._robots.items()))
         return Group(
             label(head, "bold green" if up else "bold white on red"),

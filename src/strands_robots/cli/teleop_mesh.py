@@ -322,21 +322,21 @@ def _leading_over(
 ) -> Callable[[], str]:
     """Return a function that says why leading is over; it reads the follower's counters a few times a second."""
     began = time.monotonic()
-    asked = answered = began
+    asked_at = answered_at = began
 
     def over() -> str:
-        nonlocal asked, answered
+        nonlocal asked_at, answered_at
         now = time.monotonic()
         if bounded.done.is_set():
             return "The leader has finished."
-        if (ended := _time_over(began, seconds)) or now - asked < _ASK_EVERY_S:
+        if (ended := _time_over(began, seconds)) or now - asked_at < _ASK_EVERY_S:
             return ended
-        asked = now
+        asked_at = now
         try:
             streams = follower.ask("teleop_status").get("streams") or []
         except CliError as silent:
-            return f"{follower.peer} is out of reach: {silent.reason}" if now - answered > _SILENT_S else ""
-        answered = time.monotonic()
+            return f"{follower.peer} is out of reach: {silent.reason}" if now - answered_at > _SILENT_S else ""
+        answered_at = time.monotonic()
         counters.update(next((each for each in streams if each.get("source") == leader), {"running": False}))
         return "" if counters.get("running") else f"{follower.peer} stopped following: {_stream_end(counters)}"
 

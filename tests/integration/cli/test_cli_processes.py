@@ -43,8 +43,8 @@ def test_peers_lists_the_arm_and_its_functions(machine: Machine, arm: dict[str, 
     code, said = machine.json("peers", "--timeout", "20")
     assert code == 0
     assert [peer["id"] for peer in said["peers"]] == ["arm-1"]
-    shown = machine.run("peers", "arm-1", "--timeout", "20")
-    assert "instruction" in shown.stdout
+    output = machine.run("peers", "arm-1", "--timeout", "20")
+    assert "instruction" in output.stdout
     assert machine.json("peers", "arm-2")[0] == 3
 
 
@@ -156,11 +156,11 @@ def test_doctor_renders_in_a_process_of_its_own(machine: Machine) -> None:
 
 def test_arm_is_served_and_stopped_over_a_broker(machine: Machine) -> None:
     with NatsServer() as server:
-        there = ("--nats", server.url)
-        with machine.serving("arm-5", *there):
-            assert [peer["id"] for peer in machine.json("peers", "--timeout", "20", *there)[1]["peers"]] == ["arm-5"]
-            assert machine.json("call", "arm-5", "execute", "instruction=wave", *there)[0] == 0
-            assert machine.json("stop", "--all", *there)[0] == 0
+        network = ("--nats", server.url)
+        with machine.serving("arm-5", *network):
+            assert [peer["id"] for peer in machine.json("peers", "--timeout", "20", *network)[1]["peers"]] == ["arm-5"]
+            assert machine.json("call", "arm-5", "execute", "instruction=wave", *network)[0] == 0
+            assert machine.json("stop", "--all", *network)[0] == 0
 
 
 def test_certificates_admit_an_operator_and_refuse_a_stranger(machine: Machine, tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_certificates_admit_an_operator_and_refuse_a_stranger(machine: Machine, 
     arm, operator = authority.issue("arm"), authority.issue("operator")
     endpoint = f"tls/127.0.0.1:{free_port()}"
     with machine.serving("arm-6", "--listen", endpoint, *tls(arm)) as (_, ready):
-        assert "both sides prove who they are" in ready.get("network", ""), ready
+        assert "both sides are authenticated" in ready.get("network", ""), ready
         assert machine.json("stop", "arm-6", "--connect", endpoint, *tls(operator))[0] == 0
         stranger = Authority(tmp_path, "stranger").issue("stranger")
         assert machine.json("peers", "--connect", endpoint, *tls(stranger))[0] == 3

@@ -35,14 +35,14 @@ def test_recorded_motion_is_replayed(tmp_path: Path, monkeypatch: pytest.MonkeyP
         stop_device_connect(runtime)
         world.cleanup()
     assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout.splitlines()[-1])
-    assert told["lost"] == 0
-    assert told["messages"]["/sim-1/streamStep"] > 20
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert result["lost"] == 0
+    assert result["messages"]["/sim-1/streamStep"] > 20
     assert {"streamStep", "observationUpdate"} <= {entry.event for entry in read_events(run)}
     again = CliRunner().invoke(build(), ["replay", str(run), "--to", "so100", "--speed", "2", "--json"])
     assert again.exit_code == 0, again.output
-    told = json.loads(again.stdout.splitlines()[-1])
-    assert (told["state"], told["stopped"], told["errors"]) == ("completed", True, 0)
+    result = json.loads(again.stdout.splitlines()[-1])
+    assert (result["state"], result["stopped"], result["errors"]) == ("completed", True, 0)
 
 
 def test_serve_records_its_arm_also_while_it_stands(tmp_path: Path) -> None:
@@ -62,11 +62,11 @@ def test_serve_records_its_arm_also_while_it_stands(tmp_path: Path) -> None:
     finally:
         serving.kill()
         serving.wait()
-    told = next(each for each in rest if each["event"] == "recorded")
-    assert told["lost"] == 0
-    assert told["messages"]["/sim-1/so100/joint_states"] > 20
-    assert told["messages"]["/sim-1/policyStarted"] == 1
-    assert told["messages"]["/sim-1/halted"] >= 1
+    result = next(each for each in rest if each["event"] == "recorded")
+    assert result["lost"] == 0
+    assert result["messages"]["/sim-1/so100/joint_states"] > 20
+    assert result["messages"]["/sim-1/policyStarted"] == 1
+    assert result["messages"]["/sim-1/halted"] >= 1
     items = list(read_items(run))
     ended = [item for item in items if isinstance(item, RecordedEvent) and item.event == "policyComplete"]
     assert [entry.payload["state"] for entry in ended] == ["stopped"]

@@ -53,15 +53,15 @@ def test_emergency_stop_locks_until_the_operators_key_resumes(site: Site, arms: 
     for arm in arms:
         assert site.wave(arm)[0] == 0
         eventually(partial(site.moving, arm))
-    code, told = site.json("estop", "--reason", "a hand in the cell", "--as", "desk-1", *PATIENT)
-    assert (code, set(told["stopped"]), told["silent"]) == (0, set(arms), [])
+    code, result = site.json("estop", "--reason", "a hand in the cell", "--as", "desk-1", *PATIENT)
+    assert (code, set(result["stopped"]), result["silent"]) == (0, set(arms), [])
     assert not any(site.moving(arm) for arm in arms)
     code, said = site.wave("arm-1")
     assert code == 1
-    assert told["estop_id"] in said["reason"] and "resume" in said["reason"]
+    assert result["estop_id"] in said["reason"] and "resume" in said["reason"]
     code, known = site.json("lockout")
     hold = known["live"]["arm-1"]["holds"][0]
-    assert (hold["epoch"], hold["source"], hold["reason"]) == (told["estop_id"], "desk-1", "a hand in the cell")
+    assert (hold["epoch"], hold["source"], hold["reason"]) == (result["estop_id"], "desk-1", "a hand in the cell")
     assert set(known["kept"]) == set(arms)
     code, freed = site.signed("--targets", "arm-1")
     assert (code, freed["devices"]["arm-1"]["free"]) == (0, True)
@@ -97,15 +97,15 @@ def test_robot_that_requires_signed_stops_ignores_others_over_a_broker(site: Sit
     public = keygen(site.folder / "stop.pem", PASSPHRASE)
     signed = ("--key", str(site.folder / "stop.pem"), "--passphrase-file", str(site.passphrase))
     with NatsServer() as server:
-        there = ("--nats", server.url)
-        with site.serving("arm-5", *there, DEVICE_CONNECT_ESTOP_PUBLIC_KEYS=public):
-            stop = ("estop", "arm-5", "--deadline", "1.5", *there)
+        network = ("--nats", server.url)
+        with site.serving("arm-5", *network, DEVICE_CONNECT_ESTOP_PUBLIC_KEYS=public):
+            stop = ("estop", "arm-5", "--deadline", "1.5", *network)
             code, said = site.json(*stop)
             assert (code, said["silent"]) == (3, ["arm-5"])
-            assert site.json("lockout", *there)[1]["live"]["arm-5"]["locked"] is False
-            assert site.json("estop", "arm-5", *PATIENT, *there, *signed)[0] == 0
-            assert site.json("lockout", *there)[1]["live"]["arm-5"]["locked"] is True
-            assert site.signed(*there)[0] == 0
+            assert site.json("lockout", *network)[1]["live"]["arm-5"]["locked"] is False
+            assert site.json("estop", "arm-5", *PATIENT, *network, *signed)[0] == 0
+            assert site.json("lockout", *network)[1]["live"]["arm-5"]["locked"] is True
+            assert site.signed(*network)[0] == 0
 
 
 def test_expected_but_silent_robot_is_named_with_exit_3(site: Site, arms: tuple[str, str]) -> None:

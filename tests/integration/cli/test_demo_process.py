@@ -44,9 +44,9 @@ def gone(process: psutil.Process) -> bool:
 def test_demo_runs_every_step_and_writes_its_pictures(tmp_path: Path) -> None:
     # A network of the user's own must not get in its way.
     run = start(tmp_path, "--record", "demo.svg", "--json", NATS_URL="nats://192.0.2.1:4222", TENANT="elsewhere")
-    told, complaints = run.communicate(timeout=WITHIN_S)
+    output, complaints = run.communicate(timeout=WITHIN_S)
     assert run.returncode == 0, complaints
-    report = json.loads(told)
+    report = json.loads(output)
     assert report["status"] == "success"
     steps = {step["step"]: step for step in report["steps"]}
     safety = ["emergency stop", "refusal", "resume", "execute again"]
@@ -65,11 +65,11 @@ def test_demo_runs_every_step_and_writes_its_pictures(tmp_path: Path) -> None:
 
 
 def test_refused_motion_fails_the_demo(tmp_path: Path) -> None:
-    run = start(tmp_path, DEVICE_CONNECT_RPC_ALLOW="somebody-else")
-    told, complaints = run.communicate(timeout=WITHIN_S)
+    run = start(tmp_path, DEVICE_CONNECT_RPC_ALLOW="other-caller")
+    output, complaints = run.communicate(timeout=WITHIN_S)
     assert run.returncode == 1
     assert "execute was refused" in complaints
-    assert "What the agent can call" in told
+    assert "What the agent can call" in output
     assert not (tmp_path / "demo-output").exists()
 
 
@@ -77,9 +77,9 @@ def test_dead_robot_process_fails_the_demo(tmp_path: Path) -> None:
     run = start(tmp_path, "--json")
     served = eventually(lambda: served_by(run), within=60.0, what="the demo's robot process")
     served.kill()
-    told, _ = run.communicate(timeout=WITHIN_S)
+    output, _ = run.communicate(timeout=WITHIN_S)
     assert run.returncode == 1
-    assert json.loads(told)["status"] == "error"
+    assert json.loads(output)["status"] == "error"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])

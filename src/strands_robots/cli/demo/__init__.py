@@ -39,19 +39,19 @@ def demo(
 
     Exits with 1 when any step did not happen.
     """
-    from strands_robots.cli.demo.output import DemoScreen  # noqa: PLC0415 - the demo's modules are loaded by it alone
+    from strands_robots.cli.demo.output import DemoScreen  # noqa: PLC0415 - loaded by the demo only
     from strands_robots.cli.demo.steps import DemoReport  # noqa: PLC0415 - as above
 
-    shown, report = DemoScreen(screen, record is not None), DemoReport()
+    demo_screen, report = DemoScreen(screen, record is not None), DemoReport()
     started = time.monotonic()
     try:
         with _interrupted_by_sigterm():
-            _run(shown, report, output)
+            _run(demo_screen, report, output)
             seconds = time.monotonic() - started
-            shown.say("")
-            shown.say(f"Every step happened, in {seconds:.1f} s.", "green")
+            demo_screen.say("")
+            demo_screen.say(f"Every step happened, in {seconds:.1f} s.", "green")
             if record is not None:
-                shown.save(record)
+                demo_screen.save(record)
     except CliError as failure:
         failure.fields.update(_facts(report))
         raise
