@@ -21,7 +21,7 @@ EPOCH = "0123456789abcdef0123456789abcdef"
 
 
 class Robot:
-    """What the fake agent's robot does; a test changes one thing."""
+    """Behaviour of the fake agent's robot; a test changes one thing."""
 
     def __init__(self) -> None:
         self.functions = ["execute", "stop", "getStatus", "getFeatures"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -92,14 +93,7 @@ def _mesh_peers(screen: Screen, timeout: float) -> None:
 
 
 def _facts(peer: Peer) -> dict[str, Any]:
-    return {
-        "id": peer.id,
-        "type": peer.type,
-        "model": peer.model,
-        "status": dict(peer.status),
-        "functions": [dict(each) for each in peer.functions],
-        "events": list(peer.events),
-    }
+    return {name: value for name, value in asdict(peer).items() if name != "location"}
 
 
 def _function_names(peer: Peer) -> list[str]:

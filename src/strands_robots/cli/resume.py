@@ -133,13 +133,17 @@ def grant(
 
 @dataclass(frozen=True, slots=True)
 class LockoutReport:
-    """Lockouts and status of one robot as it reports them; ``problem`` says why it does not, empty otherwise."""
+    """Lockouts and status of one robot as it reports them; ``problem`` says why it does not, empty otherwise.
+
+    ``at`` is the time of the report in monotonic seconds.
+    """
 
     name: str
     lockouts: tuple[Hold, ...] = ()
     problem: str = ""
     facts: Mapping[str, Any] = field(default_factory=dict)
     round_trip_ms: float = 0.0
+    at: float = field(default_factory=time.monotonic)
 
 
 def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:

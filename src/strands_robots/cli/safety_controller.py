@@ -11,7 +11,6 @@ import time
 import tty
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -193,14 +192,6 @@ class StopButton:
                     return
 
 
-@dataclass(frozen=True, slots=True)
-class LastReport:
-    """Last report of a robot, and when it came (monotonic seconds)."""
-
-    report: LockoutReport
-    at: float
-
-
 class FleetScreen:
     """Table of every robot with its lockout, last answer and check-in, polled on a thread and connection of its own.
 
@@ -212,7 +203,7 @@ class FleetScreen:
 
     def __init__(self, controller: SafetyController, link: LinkConfig, check_in_s: float | None) -> None:
         self._controller, self._link, self._check_in_s = controller, link, check_in_s
-        self._robots: dict[str, LastReport] = {}
+        self._robots: dict[str, LockoutReport] = {}
         self._problem = "Looking for robots..."
         self._closed = threading.Event()
 
@@ -253,13 +244,8 @@ class FleetScreen:
 
     def update(self, reports: Sequence[LockoutReport]) -> None:
         """Take the robots' reports; a robot that did not answer keeps its last one."""
-        now, robots = time.monotonic(), dict(self._robots)
-        for each in reports:
-            known = robots.get(each.name)
-            if not each.problem:
-                robots[each.name] = LastReport(each, now)
-            elif known is not None:
-                robots[each.name] = replace(known, report=replace(known.report, problem=each.problem))
+        robots = dict(self._robots)
+        robots |= {each.name: each for each in reports if not each.problem}
         # The screen and the space bar may be reading the old dictionary, so it is replaced and not changed.
         self._robots = robots
         self._problem = "" if robots else "No robot is on this network yet."
@@ -283,8 +269,8 @@ class FleetScreen:
         )
 
 
-def _row(name: str, last: LastReport, answer: Answer | None) -> tuple[Any, ...]:
-    age, lockouts, trip_ms = time.monotonic() - last.at, last.report.lockouts, last.report.round_trip_ms
+def _row(name: str, last: LockoutReport, answer: Answer | None) -> tuple[Any, ...]:
+    age, lockouts, trip_ms = time.monotonic() - last.at, last.lockouts, last.round_trip_ms
     locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
     return (
         name,
@@ -293,7 +279,7 @@ def _row(name: str, last: LastReport, answer: Answer | None) -> tuple[Any, ...]:
         _stop_cell(answer),
         label(f"{trip_ms:.1f} ms", "red" if trip_ms > SLOW_MS else ""),
         label(f"{age:.0f} s ago" if age < GONE_S else f"GONE, {age:.0f} s", "" if age < GONE_S else "bold red"),
-        _check_in_cell(last.report.facts.get("check_in")),
+        _check_in_cell(last.facts.get("check_in")),
     )
 
 

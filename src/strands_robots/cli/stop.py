@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -114,7 +115,7 @@ def estop(
         if screen.live:
             report = _watch(screen, running)
         else:
-            report = running.wait()
+            report = running.report.result()
             screen.show(_table(report_rows(report)))
     finally:
         controller.close()
@@ -140,41 +141,28 @@ class RunningStop:
         self, controller: SafetyController, expected: list[str], reason: str, deadline_s: float, link: LinkConfig
     ) -> None:
         self.latest: Progress | None = None
-        self.report: StopReport | None = None
         self._controller, self._expected, self._reason = controller, expected, reason
         self._deadline_s, self._link = deadline_s, link
         self._id = new_epoch()
         self._lookup: threading.Thread | None = None
-        self._failed: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="estop", daemon=True)
-        self._thread.start()
-
-    def finished(self, within_s: float) -> bool:
-        """Return whether the stop has ended, after at most ``within_s`` seconds."""
-        self._thread.join(within_s)
-        return not self._thread.is_alive()
-
-    def wait(self) -> StopReport:
-        """Return the report once the stop has ended."""
-        while not self.finished(1.0):
-            continue
-        if self.report is None:
-            raise self._failed or RuntimeError("The stop ended without a report.")
-        return self.report
+        self.report: Future[StopReport] = Future()
+        threading.Thread(target=self._run, name="estop", daemon=True).start()
 
     def _run(self) -> None:
         try:
             # Nothing can leave before the link is up; then the milliseconds are the robots' and not the handshake's.
             self._controller.wait_link(LINK_WAIT_S)
-            self.report = self._controller.stop(
+            report = self._controller.stop(
                 self._expected,
                 self._reason,
                 deadline_s=self._deadline_s,
                 estop_id=self._id,
                 on_progress=self._progress,
             )
-        except BaseException as exc:  # noqa: BLE001 - raised again by wait()
-            self._failed = exc
+        except BaseException as exc:  # noqa: BLE001 - raised again by the future
+            self.report.set_exception(exc)
+        else:
+            self.report.set_result(report)
 
     def _progress(self, progress: Progress) -> None:
         self.latest = progress
@@ -240,11 +228,11 @@ def _watch(screen: Screen, running: RunningStop) -> StopReport:
 
     # The table already names what the log would report.
     with captured_log(), Live(_table([], "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
-        while not running.finished(POLL_S):
+        while not wait([running.report], POLL_S).done:
             if running.latest is not None:
                 link = "" if running.latest.link_up else ": THE LINK IS DOWN"
                 live.update(_table(progress_rows(running.latest), f"EMERGENCY STOP{link}"), refresh=True)
-        report = running.wait()
+        report = running.report.result()
         live.update(_table(report_rows(report), "EMERGENCY STOP"), refresh=True)
     return report
 

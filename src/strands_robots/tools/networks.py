@@ -1,4 +1,7 @@
-"""Networks of the ``robot_mesh`` tool: Device Connect and the native mesh behind one protocol."""
+"""Networks of the ``robot_mesh`` tool: Device Connect and the native mesh, with the same verbs.
+
+Each verb answers with an envelope and never raises.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success, text_of
@@ -35,26 +38,7 @@ class MeshUnavailableError(StrandsRobotsError, RuntimeError):
     """The native mesh is switched off, or has no session."""
 
 
-class RobotNetwork(Protocol):
-    """Verbs of the tool on one network. Each answers with an envelope and never raises."""
-
-    def peers(self) -> Envelope:
-        """List the robots that answer."""
-
-    def tell(self, target: str, instruction: str, policy_provider: str, duration: float) -> Envelope:
-        """Have ``target`` follow an instruction; returns once the motion has started."""
-
-    def status(self, target: str) -> Envelope:
-        """Return what ``target`` is doing."""
-
-    def stop(self, target: str) -> Envelope:
-        """Stop ``target``; with an empty one, every robot."""
-
-    def emergency_stop(self, reason: str) -> Envelope:
-        """Stop and lock every robot."""
-
-
-def network() -> RobotNetwork:
+def network() -> DeviceConnect | NativeMesh:
     """Return Device Connect, or the mesh where it is absent or ``STRANDS_ROBOT_MESH_DC`` says off."""
     absent = importlib.util.find_spec("device_connect_edge") is None
     if absent or settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_SPELLINGS:
