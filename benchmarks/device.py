@@ -188,7 +188,7 @@ def _blocked_stop(repeats: int) -> Row:
 
 
 def _stream(seconds: float) -> Row:
-    """A 50 Hz task from its first step to its last, as another connection hears it."""
+    """A 50 Hz task from its first step to its last, as another connection receives it."""
     robot, received = ToyRobot("stream"), []
     link = LinkConfig(mode="peer", meet_port=free_port(), multicast=False)
     runtime = init_device_connect_sync(robot, peer_id="stream", link=link)

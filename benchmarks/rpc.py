@@ -32,7 +32,7 @@ CROWD_STRETCH = 8 * IN_FLIGHT
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much is measured: a figure to quote, or a look."""
+    """Extent of a measurement: for a figure to quote, or a quick look."""
 
     turns: int
     calls: int

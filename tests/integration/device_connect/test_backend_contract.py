@@ -4,14 +4,15 @@ import asyncio
 import contextlib
 
 import pytest
+from device_connect_edge import DeviceRuntime
 from device_connect_edge.messaging.exceptions import MessagingError
 from fixtures.bare_caller import Caller
-from fixtures.echo_device import EchoDevice
+from fixtures.echo_device import EchoDevice, EchoDriver
 from fixtures.nats_server import NatsServer
 from fixtures.waiting import eventually_async, free_port, until
 from fixtures.zenoh_router import ZenohRouter
 
-from strands_robots.device_connect.backends import LinkConfig, open_client
+from strands_robots.device_connect.backends import LinkConfig, open_client, register
 
 D2D = {"DEVICE_CONNECT_DISCOVERY_MODE": "d2d"}
 
@@ -96,3 +97,23 @@ async def test_request_without_a_responder_fails_long_before_its_deadline(networ
         with pytest.raises(MessagingError, match="no device answers"):
             await caller.call("absent", "getStatus", wait_s=60)
         assert asyncio.get_running_loop().time() - started < 30
+
+
+async def test_stock_runtime_uses_a_registered_backend_by_name(network, monkeypatch):
+    monkeypatch.setenv("DEVICE_CONNECT_DISCOVERY_MODE", "d2d")
+    register()
+    runtime = DeviceRuntime(
+        driver=EchoDriver(),
+        device_id="arm-1",
+        messaging_backend=f"strands-{network.transport}",
+        messaging_urls=[network.endpoint],
+        allow_insecure=True,
+    )
+    task = asyncio.create_task(runtime.run())
+    try:
+        async with network.bare_caller() as bare:
+            await called_and_followed(bare)
+        assert runtime.messaging.link == network.link
+    finally:
+        await runtime.stop()
+        await asyncio.gather(task, return_exceptions=True)
