@@ -262,7 +262,7 @@ def test_who_hears_a_robot_may_leave_the_mesh_on_the_thread_that_announces_it(pe
 def test_a_broker_that_pins_a_peer_to_its_topics_is_shown_no_children(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(MemoryTransport, "pins_topics", True, raising=False)
+    monkeypatch.setattr(MemoryTransport, "pins_topics", True)
     mesh, console = peers.join(World("left", "right"), "sim-1", "sim"), peers.join(None, "console")
     assert mesh.children is not None
     mesh.children.refresh()

@@ -163,8 +163,11 @@ def test_subscriptions_deliver_objects_and_end_when_the_mesh_stops(peers: Fleet)
 class Linked(MemoryTransport):
     """A session that depends on a hub, which a test takes away and gives back."""
 
-    lost_link_at = -math.inf
+    lost_at = -math.inf
     up = True
+
+    def lost_link_at(self) -> float:
+        return self.lost_at
 
     def anchored(self) -> bool:
         return self.up
@@ -192,7 +195,7 @@ def test_token_lost_with_our_own_link_is_not_judged_until_the_link_is_back(
     monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
     transport, publisher, registry = watched(MemoryBus())
     key = topics.token("arm-1", "aa")
-    transport.up, transport.lost_link_at = False, time.monotonic()
+    transport.up, transport.lost_at = False, time.monotonic()
     publisher.on_token(key, there=False)
     publisher.judge_tokens()
     transport.up = True
@@ -209,7 +212,7 @@ def test_peer_whose_token_does_not_return_with_the_link_is_gone(monkeypatch: pyt
     monkeypatch.setattr(presence, "RETURN_S", 0.05)
     monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
     transport, publisher, registry = watched(MemoryBus())
-    transport.lost_link_at = time.monotonic()
+    transport.lost_at = time.monotonic()
     publisher.on_token(topics.token("arm-1", "aa"), there=False)
     publisher.judge_tokens()
     assert reachable(registry)

@@ -52,7 +52,8 @@ def test_reply_reports_the_delivery_of_the_command(
     ScriptedPeer(peers, "there", 0.0)
     plain = console.send("there", {"action": "ping"}, timeout=20)
     assert (plain["via"], plain["confirmed"]) == ("publish", False)
-    monkeypatch.setattr(MemoryTransport, "put_confirmed", put_confirmed, raising=False)
+    monkeypatch.setattr(MemoryTransport, "put_confirmed", put_confirmed)
+    monkeypatch.setattr(MemoryTransport, "confirms", True)
     for answer in (console.send("there", {"action": "ping"}, timeout=20), console.ping("there", timeout=20)):
         assert (answer["via"], answer["confirmed"]) == ("direct", taken is True)
     absent = console.send("absent", {"action": "ping"}, timeout=0.05)

@@ -21,7 +21,7 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
-from strands_robots.mesh.transport import Declaration, LiveTransport, TransportError
+from strands_robots.mesh.transport import Declaration, TransportError
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import TELEOP_VERBS, RobotStop
@@ -162,7 +162,7 @@ class Children:
     def refresh(self) -> None:
         """Announce the robots that came and take away those that went."""
         transport = self._context.transport
-        if transport is None or transport.session_id is None or getattr(transport, "pins_topics", False):
+        if transport is None or transport.session_id is None or transport.pins_topics:
             return
         names = self._world.list_robots()
         wanted = {each: name for name in names[:CHILDREN_MAX] if (each := self._id(name))} if len(names) > 1 else {}
@@ -229,7 +229,7 @@ class Children:
         handles.append(transport.declare_subscriber(topics.command(peer), server.on_command))
         handles.append(transport.declare_subscriber(topics.broadcast(), server.on_command))
         session = transport.session_id
-        if isinstance(transport, LiveTransport) and session is not None:
+        if session is not None:
             handles.append(transport.declare_token(topics.token(peer, session)))
         return child
 

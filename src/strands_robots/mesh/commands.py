@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +13,7 @@ from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.registry import attribute
+from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
@@ -43,28 +43,6 @@ TargetOf = Callable[[str], Haltable | None]
 """Gives what a stop means by a name, empty for all there is. Raises :class:`ValidationError` for an unknown name."""
 
 
-class Replays:
-    """The (sender, turn) pairs that were carried out lately; bounded by age and number."""
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
-        self._seen: dict[tuple[str, str], float] = {}
-        self._lock = threading.Lock()
-
-    def first(self, sender: str, turn: str) -> bool:
-        """True the first time."""
-        now = self._clock()
-        with self._lock:
-            while self._seen and now - next(iter(self._seen.values())) > REPLAY_S:
-                del self._seen[next(iter(self._seen))]
-            if (sender, turn) in self._seen:
-                return False
-            while len(self._seen) >= REPLAYS_MAX:
-                del self._seen[next(iter(self._seen))]
-            self._seen[sender, turn] = now
-            return True
-
-
 class SenderCheck:
     """May this sender? The mesh's part of the pipeline: freshness, replays, and attribution for real hardware.
 
@@ -75,7 +53,7 @@ class SenderCheck:
     def __init__(self, context: Context, *, hardware: bool) -> None:
         self._context = context
         self._hardware = hardware
-        self._replays = Replays(context.monotonic)
+        self._replays = RecentKeys(REPLAY_S, REPLAYS_MAX, context.monotonic)
 
     def __call__(self, command: Command, arguments: Arguments) -> None:
         """Raise :class:`Refused` where the sender may not."""
@@ -85,7 +63,7 @@ class SenderCheck:
         if command.verb.kind in (Kind.MOTION, Kind.RESUME):
             if request.timestamp is None or not wire.fresh(request.timestamp, self._context.clock()):
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the timestamp is not fresh")
-            if not self._replays.first(request.sender_id, request.turn_id):
+            if not self._replays.first((request.sender_id, request.turn_id)):
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the turn was carried out before")
         if self._hardware and command.verb.kind is Kind.MOTION:
             why = self._unattributed(request, sample)

@@ -12,7 +12,7 @@ from typing import Any
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.transport import Declaration, LiveTransport, Sample, TransportError
+from strands_robots.mesh.transport import Declaration, Sample, TransportError
 from strands_robots.mesh.wire_identity import IdentityError
 
 logger = logging.getLogger(__name__)
@@ -60,12 +60,12 @@ class PresencePublisher:
     def _declare_token(self) -> None:
         """Declare our token and watch the others, once there is a session."""
         transport, session = self._context.transport, self._context.session_id()
-        if self._token_declared or session is None or transport is None or not isinstance(transport, LiveTransport):
+        if self._token_declared or session is None or transport is None:
             return
         self._token_declared = True
         self._handles.append(transport.declare_token(topics.token(self._context.peer_id, session)))
         # Where a link can be lost, its loss and that of the tokens come in any order.
-        self._judged_later = hasattr(transport, "lost_link_at")
+        self._judged_later = transport.lost_link_at() is not None
         self._handles.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
 
     def stop(self) -> None:
@@ -160,13 +160,13 @@ class PresencePublisher:
         """
         self._declare_token()
         now, transport = time.monotonic(), self._context.transport
-        anchored, lost_link = getattr(transport, "anchored", None), getattr(transport, "lost_link_at", None)
-        if callable(anchored) and not anchored():
+        if transport is None or not transport.anchored():
             self._anchored_at = None
             return
+        lost_link = transport.lost_link_at()
         self._anchored_at = self._anchored_at if self._anchored_at is not None else now
         for mark, went in list(self._leaving.items()):
-            ours = isinstance(lost_link, float) and abs(went - lost_link) < SAME_LOSS_S
+            ours = lost_link is not None and abs(went - lost_link) < SAME_LOSS_S
             since = max(went, lost_link or went, self._anchored_at) if ours else went
             if now - since < (RETURN_S if ours else patience):
                 continue

@@ -16,7 +16,7 @@ from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.security import validate_command
-from strands_robots.mesh.transport import PutConfirmed, Sample, TransportError
+from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.utils import ValidationError, number, shown
 
@@ -234,12 +234,12 @@ class Requester:
     def _publish(self, key: str, command: dict[str, Any], turn: Turn, seconds: float | None = None) -> str | None:
         context = self._context
         request = wire.Request(context.peer_id, self._open(turn), command, context.clock())
-        confirmed: PutConfirmed | None = getattr(context.transport, "put_confirmed", None)
         try:
             body = context.identity.sign(request.to_wire())
-            if seconds is not None and confirmed is not None:
+            transport = context.transport
+            if seconds is not None and transport is not None and transport.confirms:
                 turn.via = "direct"
-                taken = confirmed(key, body, seconds)
+                taken = transport.put_confirmed(key, body, seconds)
                 turn.confirmed = taken is True
                 return None if taken is not False else OFFLINE
             context.put(key, body)

@@ -1,4 +1,4 @@
-"""Bounds on floods: audit events, log lines, and messages above a rate."""
+"""Bounds on repetition: audit events, log lines, messages above a rate, replays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any
 
@@ -116,3 +116,27 @@ class RateLimiter:
         # Half a period from now at least: a source at just this rate loses nothing, a burst is thinned out.
         self._due = max(self._due + self._period, now + self._period / 2)
         return True
+
+
+class RecentKeys:
+    """Keys that were used lately, bounded by age in seconds and by number; thread-safe."""
+
+    def __init__(self, seconds: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._seconds = seconds
+        self._most = most
+        self._clock = clock
+        self._used: dict[Hashable, float] = {}
+        self._lock = threading.Lock()
+
+    def first(self, key: Hashable) -> bool:
+        """Note the use of a key; False when it was used before."""
+        now = self._clock()
+        with self._lock:
+            while self._used and now - next(iter(self._used.values())) > self._seconds:
+                del self._used[next(iter(self._used))]
+            if key in self._used:
+                return False
+            while len(self._used) >= self._most:
+                del self._used[next(iter(self._used))]
+            self._used[key] = now
+            return True

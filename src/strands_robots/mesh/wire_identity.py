@@ -13,7 +13,6 @@ import datetime
 import hashlib
 import logging
 import secrets
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
+from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport.zenoh_config import TlsCredentials
 from strands_robots.safety.ed25519 import canonical
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
@@ -107,9 +107,7 @@ class Verifier:
     ) -> None:
         self._roots: list[Any] = list(cryptography().x509.load_pem_x509_certificates(roots)) if roots.strip() else []
         self._clock = clock
-        self._monotonic = monotonic
-        self._used: dict[tuple[str, str], float] = {}
-        self._lock = threading.Lock()
+        self._nonces = RecentKeys(NONCE_S, NONCES_MAX, monotonic)
 
     def verify(self, body: Mapping[str, Any]) -> Verified:
         """Return the certificate whose signature is on ``body``.
@@ -142,7 +140,8 @@ class Verifier:
             public.verify(signature, covered, *_parameters(sig["alg"]))
         except cryptography().exceptions.InvalidSignature:
             raise IdentityError("the signature does not fit the message") from None
-        self._use(digest, sig["nonce"])
+        if not self._nonces.first((digest, sig["nonce"])):
+            raise IdentityError("the nonce was used before")
         return Verified(digest, name)
 
     def _issued(self, certificate: x509.Certificate) -> None:
@@ -159,17 +158,6 @@ class Verifier:
         now = datetime.datetime.fromtimestamp(self._clock(), datetime.UTC)
         if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
             raise IdentityError("the certificate is not valid now")
-
-    def _use(self, digest: str, nonce: str) -> None:
-        now = self._monotonic()
-        with self._lock:
-            if (digest, nonce) in self._used:
-                raise IdentityError("the nonce was used before")
-            for key in [key for key, at in self._used.items() if now - at > NONCE_S][:64]:
-                del self._used[key]
-            while len(self._used) >= NONCES_MAX:
-                del self._used[next(iter(self._used))]
-            self._used[digest, nonce] = now
 
 
 class Identity:

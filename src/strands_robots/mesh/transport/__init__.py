@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import importlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from strands_robots.errors import StrandsRobotsError
 
@@ -17,11 +18,10 @@ __all__ = [
     "Callback",
     "Declaration",
     "IotMqttTransport",
-    "LiveTransport",
     "LivenessCallback",
     "MemoryBus",
     "MemoryTransport",
-    "PutConfirmed",
+    "NoToken",
     "Sample",
     "Transport",
     "TransportError",
@@ -78,42 +78,70 @@ class Declaration(Protocol):
         """Withdraw it: no callback starts after this returns; twice is once."""
 
 
-class Transport(Protocol):
-    """Publish and subscribe on the mesh's keys, without the namespace."""
+class NoToken:
+    """The declaration of a token on a transport that has none."""
+
+    def undeclare(self) -> None:
+        """Nothing was declared."""
+
+
+class Transport(ABC):
+    """Publish and subscribe on the mesh's keys, without the namespace.
+
+    Attributes:
+        confirms: :meth:`put_confirmed` reports whether a topic has subscribers.
+        pins_topics: the broker's policy lets a peer publish on topics of its own name alone.
+    """
+
+    confirms = False
+    pins_topics = False
 
     @property
+    @abstractmethod
     def session_id(self) -> str | None:
         """Id of our session on this transport, None where it has none or is closed."""
 
+    @abstractmethod
     def connect(self) -> None:
         """Open. Raises TransportError when that is not possible; already open is fine."""
 
+    @abstractmethod
     def close(self) -> None:
         """Close; every subscriber goes with it. Twice is once."""
 
+    @abstractmethod
     def is_alive(self) -> bool:
         """True between connect and close, as far as the transport can tell."""
 
+    @abstractmethod
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         """Publish. Raises TransportError when closed, WireError when too large."""
 
+    @abstractmethod
     def declare_subscriber(self, key: str, callback: Callback) -> Declaration:
-        """Receive a key expression of ``*`` (one segment) and ``**`` (any number)."""
+        """Receive a key expression of ``*`` (one segment) and ``**`` (any number).
 
+        Raises:
+            TransportError: the transport is closed.
+        """
 
-@runtime_checkable
-class LiveTransport(Protocol):
-    """A transport that can tell at once when a session ends."""
+    def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
+        """Publish; return whether the topic has subscribers, None if unanswered."""
+        self.put(key, payload)
+        return None
 
     def declare_token(self, key: str) -> Declaration:
         """Show ``key`` as alive until it is undeclared or this session ends."""
+        return NoToken()
 
     def watch_tokens(self, key: str, callback: LivenessCallback) -> Declaration:
         """Call back for every token that comes or goes, those already there included."""
+        return NoToken()
 
+    def anchored(self) -> bool:
+        """True while tokens of other sessions can reach us."""
+        return True
 
-PutConfirmed = Callable[[str, bytes | Mapping[str, Any], float], bool | None]
-"""``put_confirmed(key, payload, timeout)``, which a transport may have: publish, and tell if the key has subscribers.
-
-True: there is one. False: there is none. None: not known within ``timeout`` seconds.
-"""
+    def lost_link_at(self) -> float | None:
+        """Monotonic seconds at which the link to the hub was last lost; None without a hub."""
+        return None

@@ -13,11 +13,12 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics, wire
+from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import (
     Callback,
     Declaration,
     LivenessCallback,
-    LiveTransport,
+    NoToken,
     Sample,
     Transport,
     TransportError,
@@ -44,25 +45,12 @@ class SeenCommands:
     """Commands that came by one leg already; bounded by age and number."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._at: dict[bytes, float] = {}
-        self._lock = threading.Lock()
+        self._recent = RecentKeys(SEEN_S, SEEN_MAX, clock)
 
     def first(self, payload: bytes) -> bool:
         """False when a message with this sender, turn and command came before."""
         mark = _mark(payload)
-        if mark is None:
-            return True
-        now = self._clock()
-        with self._lock:
-            while self._at and now - next(iter(self._at.values())) > SEEN_S:
-                del self._at[next(iter(self._at))]
-            if mark in self._at:
-                return False
-            while len(self._at) >= SEEN_MAX:
-                del self._at[next(iter(self._at))]
-            self._at[mark] = now
-            return True
+        return mark is None or self._recent.first(mark)
 
 
 class LocalPeers:
@@ -86,11 +74,6 @@ class LocalPeers:
     def __contains__(self, peer: str) -> bool:
         at = self._at.get(peer)
         return at is not None and self._clock() - at <= LOCAL_S
-
-
-class _NoToken:
-    def undeclare(self) -> None:
-        """There is nothing to undeclare."""
 
 
 class _BridgedSubscriber:
@@ -127,7 +110,7 @@ class _BridgedSubscriber:
             each.undeclare()
 
 
-class BridgeTransport:
+class BridgeTransport(Transport):
     """Zenoh and MQTT as one transport; connected while either leg is.
 
     A leg that is down when the bridge connects is retried in the background, and is then given the subscribers that
@@ -139,7 +122,6 @@ class BridgeTransport:
     """
 
     pins_topics = True
-    """The broker's policy keeps a peer to topics of its own name."""
 
     def __init__(self, local: Transport | None = None, cloud: Transport | None = None) -> None:
         self._local = local or make_transport("zenoh")
@@ -235,25 +217,18 @@ class BridgeTransport:
         return subscriber
 
     def declare_token(self, key: str) -> Declaration:
-        local = self._local
-        return local.declare_token(key) if local.is_alive() and isinstance(local, LiveTransport) else _NoToken()
+        return self._local.declare_token(key) if self._local.is_alive() else NoToken()
 
     def watch_tokens(self, key: str, callback: LivenessCallback) -> Declaration:
-        local = self._local
-        return (
-            local.watch_tokens(key, callback) if local.is_alive() and isinstance(local, LiveTransport) else _NoToken()
-        )
-
-    @property
-    def lost_link_at(self) -> float:
-        """Monotonic seconds at which the local leg last lost its hub."""
-        at: float = getattr(self._local, "lost_link_at", -math.inf)
-        return at
+        return self._local.watch_tokens(key, callback) if self._local.is_alive() else NoToken()
 
     def anchored(self) -> bool:
-        """True while the local leg can tell which peers are alive."""
-        anchored = getattr(self._local, "anchored", None)
-        return bool(anchored()) if callable(anchored) else True
+        return self._local.anchored()
+
+    def lost_link_at(self) -> float | None:
+        # A local leg that comes up late is judged like one whose link can be lost.
+        at = self._local.lost_link_at()
+        return at if at is not None else -math.inf
 
     def _join(self) -> list[str]:
         """Connect the legs that never were; return the reason of each that failed."""

@@ -19,7 +19,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport import Callback, Sample, TransportError
+from strands_robots.mesh.transport import Callback, Sample, Transport, TransportError
 from strands_robots.utils import missing_extra
 
 logger = logging.getLogger(__name__)
@@ -82,8 +82,10 @@ class _Subscriber:
         self.owner.leave(self)
 
 
-class IotMqttTransport:
+class IotMqttTransport(Transport):
     """One MQTT 5 client that reconnects and subscribes anew by itself."""
+
+    confirms = True
 
     def __init__(self, account: Account | None = None) -> None:
         self._account = account
@@ -147,7 +149,6 @@ class IotMqttTransport:
         self._publish(key, payload)
 
     def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
-        """Publish; return whether the topic has subscribers, None if unanswered."""
         future = self._publish(key, payload)
         if future is None:
             return None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, TransportError
+from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, Transport, TransportError
 
 
 @dataclass(eq=False, slots=True)
@@ -103,7 +103,7 @@ SHARED = MemoryBus()
 """The bus of ``STRANDS_MESH_BACKEND=memory``."""
 
 
-class MemoryTransport:
+class MemoryTransport(Transport):
     """One session on a :class:`MemoryBus`.
 
     Args:

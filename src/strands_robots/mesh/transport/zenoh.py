@@ -14,7 +14,7 @@ from itertools import count
 from typing import Any
 
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, TransportError, zenoh_config
+from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, Transport, TransportError, zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.utils import missing_extra
 
@@ -26,7 +26,7 @@ STEADY_LOOKS = 10
 PUBLISHERS_MAX = 256
 
 
-class ZenohTransport:
+class ZenohTransport(Transport):
     """A Zenoh session as a transport.
 
     Without stated endpoints the first process of the machine is the hub on the loopback port and the others are
@@ -45,7 +45,7 @@ class ZenohTransport:
         self._zenoh: Any = None
         self._links: Any = None
         self._hub = False
-        self.lost_link_at = -math.inf
+        self._lost_link_at = -math.inf
         self._numbers = count()
         self._publishers: dict[str, tuple[Any, Any]] = {}
         self._closing = threading.Event()
@@ -117,10 +117,13 @@ class ZenohTransport:
         return bool(session.info.peers_zid() or session.info.routers_zid())
 
     def anchored(self) -> bool:
-        """True while tokens of others can reach us: we listen, or the hub is linked."""
+        # Where we listen ourselves, others link to us; a client depends on the hub.
         posture = self._posture
         listens = self._hub or (posture is not None and bool(posture.listen))
         return listens or self.linked()
+
+    def lost_link_at(self) -> float | None:
+        return self._lost_link_at
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         topic = topics.topic_of(key)
@@ -246,7 +249,7 @@ class ZenohTransport:
     def _watch_hub(self, session: Any) -> None:
         def changed(event: Any) -> None:
             if event.kind != self._zenoh.SampleKind.PUT and not self._closing.is_set():
-                self.lost_link_at = time.monotonic()
+                self._lost_link_at = time.monotonic()
                 threading.Thread(target=self._rescue, name="mesh-rescue", daemon=True).start()
 
         direct = self._zenoh.handlers.Callback(changed, indirect=False)
