@@ -1,7 +1,7 @@
 """``python -m benchmarks``: measure every claim of speed on this machine and print one table a part.
 
-Each part measures ours and the bare thing side by side in the same run, so that the ratio holds on any machine.
-Exits with 1 when a bound was not kept.
+Each part measures ours and the bare part side by side in the same run, so that the ratio holds on any machine. Exits
+with 1 when a bound is missed.
 """
 
 from __future__ import annotations
@@ -35,12 +35,20 @@ PARTS = {
 
 INTRODUCTION = """# Benchmarks
 
-`make bench` measures every claim of speed on your machine; `make bench ARGS="PART... --markdown docs/benchmarks.md"`
-puts the tables of those parts here. Each row sets ours beside the bare part in the same run, in turns, so take the
-ratios: the absolute figures are those of one shared machine with {cores} cores, Python {python}. Loopback only.
+Measure every claim of speed on your machine:
+
+```console
+$ make bench                                                    # all parts
+$ make bench ARGS=rpc                                           # one part
+$ make bench ARGS="rpc mesh --markdown docs/benchmarks.md"      # and put its tables into this page
+```
+
+Each row sets ours beside the bare part in the same run, in turns. Take the ratios: the absolute figures are of one
+shared machine with {cores} cores, Python {python}, on loopback only. A row with **no** misses its bound; the end of
+the page has the reason.
 
 The bare framework records a trace span for every message where the OpenTelemetry SDK is installed, as it is in the
-development environment; ours sets tracing up only where an OTLP endpoint is named.
+development environment. Ours sets tracing up only where an OTLP endpoint is named.
 """
 
 
@@ -55,7 +63,7 @@ def shown(title: str, rows: list[Row]) -> Table:
 
 
 def write(page: Path, measured: Mapping[str, str]) -> None:
-    """Put the measured tables into the page; what else stands there under a heading of its own is kept."""
+    """Put the measured tables into the page and keep its other sections."""
     before = page.read_text(encoding="utf-8").split("\n## ")[1:] if page.exists() else []
     found = dict(section.split("\n\n", 1) for section in before)
     sections = {**{title: found[title] for title in PARTS.values() if title in found}, **measured}

@@ -212,7 +212,7 @@ def _rosbridge(repeats: int) -> list[Row]:
         p50, against = _trips(child.ready, repeats)
     finally:
         child.close()
-    what = "a drive over rosbridge until {} tells it back, p50"
+    what = "a drive over rosbridge until {} reports it, p50"
     # A stand-in with nothing behind it shows what the checks of a drive cost; a robot is never that near.
     rows = [_trip_row(what.format("a stand-in without ROS"), p50, against, None)]
     if not missing():
