@@ -16,8 +16,8 @@ from strands_robots.device_connect.client import DeviceTimeoutError, Peer
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.approval import Grants
 from strands_robots.safety.ed25519 import keygen
-from strands_robots.safety.lockout import OVERFLOW, Hold, LockoutState
-from strands_robots.safety.persistence import Kept, LockoutStore
+from strands_robots.safety.lockout import OVERFLOW, Lockout, LockoutState
+from strands_robots.safety.persistence import LockoutStore, StoredLockout
 
 STRONG = "Plenty of 4 different words"
 A, B = "a" * 32, "b" * 32
@@ -114,8 +114,8 @@ def test_wrong_passphrase_frees_no_robot(run: Run, fleet: FakeFleet, signed: tup
 
 
 def test_robot_that_is_off_is_cleared_locally_and_audited(run: Run, fleet: FakeFleet) -> None:
-    hold = Hold(A, "desk", "a hand", 0.0)
-    LockoutStore().save({"hardware:so101:left": Kept(LockoutState((hold,)), name="arm-1")})
+    hold = Lockout(A, "desk", "a hand", 0.0)
+    LockoutStore().save({"hardware:so101:left": StoredLockout(LockoutState((hold,)), name="arm-1")})
     output = run("lockout", "--local")
     assert (
         "arm-1 (in this machine's file)" in output.stdout and "by desk: a hand" in output.stdout and A in output.stdout
@@ -129,7 +129,7 @@ def test_robot_that_is_off_is_cleared_locally_and_audited(run: Run, fleet: FakeF
 
 
 def test_live_robot_outranks_the_lockout_file(run: Run, fleet: FakeFleet) -> None:
-    LockoutStore().save({"k": Kept(LockoutState((Hold(A, "desk", "", 0.0),)), name="arm-1")})
+    LockoutStore().save({"k": StoredLockout(LockoutState((Lockout(A, "desk", "", 0.0),)), name="arm-1")})
     fleet.lockouts = {"arm-1": [], "arm-2": [B]}
     answer = json.loads(run("lockout", "--json").stdout)
     assert {name: each["locked"] for name, each in answer["live"].items()} == {"arm-1": False, "arm-2": True}
@@ -146,7 +146,7 @@ def test_lockout_file_is_printed_without_a_network(
         raise CliError("The network is not there.", Exit.SILENT)
 
     monkeypatch.setattr(Network, "fleet", unreachable)
-    LockoutStore().save({"k": Kept(LockoutState((Hold(A, "desk", "", 0.0),)), name="arm-1")})
+    LockoutStore().save({"k": StoredLockout(LockoutState((Lockout(A, "desk", "", 0.0),)), name="arm-1")})
     result = run("lockout")
     assert result.exit_code == 0
     assert "The network is not there." in result.stdout and "arm-1" in result.stdout

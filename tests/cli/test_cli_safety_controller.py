@@ -14,7 +14,7 @@ from strands_robots.cli.resume import LockoutReport
 from strands_robots.cli.safety_controller import FleetScreen, StopButton
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.safety.controller import Answer, StopReport
-from strands_robots.safety.lockout import Hold
+from strands_robots.safety.lockout import Lockout
 
 
 class FakeController:
@@ -125,7 +125,7 @@ def drawn(fleet: FleetScreen, button: StopButton) -> str:
 def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.MonkeyPatch) -> None:
     fake: Any = LinkedController()
     fleet, button = FleetScreen(fake, loopback_config(), 0.5), StopButton(fake, lambda: (), "")
-    hold = Hold("e" * 32, "desk-1", "a hand", 0.0)
+    hold = Lockout("e" * 32, "desk-1", "a hand", 0.0)
     checked = {"check_in": {"required": True, "timeout_s": 2.0, "time_left_s": 1.25}}
     fleet.update(
         [

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from strands_robots.safety import persistence
-from strands_robots.safety.lockout import OVERFLOW, Hold, LockoutState
-from strands_robots.safety.persistence import Kept, LockoutStore, hardware_key, simulation_key
+from strands_robots.safety.lockout import OVERFLOW, Lockout, LockoutState
+from strands_robots.safety.persistence import LockoutStore, StoredLockout, hardware_key, simulation_key
 
-HOLD = Hold("a" * 32, "safety-1", "smoke \N{FIRE}", 12.5)
+LOCKOUT = Lockout("a" * 32, "safety-1", "smoke \N{FIRE}", 12.5)
 KEY = hardware_key("so101", "usb-FTDI-1234")
 
 
@@ -24,7 +24,7 @@ def store(tmp_path: Path) -> LockoutStore:
 
 
 def test_a_lockout_comes_back_whole(store: LockoutStore) -> None:
-    kept = Kept(LockoutState((HOLD,), Hold(OVERFLOW, "s", "", 1.0)), ("b" * 32, "a" * 32))
+    kept = StoredLockout(LockoutState((LOCKOUT,), Lockout(OVERFLOW, "s", "", 1.0)), ("b" * 32, "a" * 32))
     store.save({KEY: kept})
     assert store.load(KEY) == kept
     assert store.load_all() == {KEY: kept}
@@ -32,12 +32,12 @@ def test_a_lockout_comes_back_whole(store: LockoutStore) -> None:
 
 
 def test_a_robot_that_was_never_kept_is_free(store: LockoutStore) -> None:
-    assert store.load(simulation_key("sim-1")) == Kept()
+    assert store.load(simulation_key("sim-1")) == StoredLockout()
 
 
 def test_saving_one_robot_leaves_the_others(store: LockoutStore) -> None:
-    store.save({KEY: Kept(LockoutState((HOLD,)))})
-    store.save({"other": Kept()})
+    store.save({KEY: StoredLockout(LockoutState((LOCKOUT,)))})
+    store.save({"other": StoredLockout()})
     assert store.load(KEY).state.locked
 
 
@@ -67,18 +67,18 @@ def test_what_cannot_be_read_locks_until_somebody_at_the_machine_looks(
 def test_an_unreadable_file_is_put_aside_when_the_next_lockout_is_kept(store: LockoutStore) -> None:
     store.path.parent.mkdir()
     store.path.write_text("{")
-    store.save({KEY: Kept(LockoutState((HOLD,)))})
-    assert store.load(KEY).state.epochs == (HOLD.epoch,)
+    store.save({KEY: StoredLockout(LockoutState((LOCKOUT,)))})
+    assert store.load(KEY).state.epochs == (LOCKOUT.epoch,)
     assert store.path.with_suffix(".unreadable").read_text() == "{"
 
 
 def test_a_robot_that_was_off_while_the_file_was_put_aside_comes_up_locked(store: LockoutStore) -> None:
     store.path.parent.mkdir()
     store.path.write_text('{"v":1,"robots":{"the other": {"holds": [')
-    store.save({KEY: Kept()})
+    store.save({KEY: StoredLockout()})
     assert store.load("the other").state.epochs == (OVERFLOW,)
     assert not store.load(KEY).state.locked
-    store.save({"the other": Kept()})
+    store.save({"the other": StoredLockout()})
     assert not store.load("the other").state.locked, "an operator has cleared it"
 
 
@@ -94,15 +94,16 @@ def test_a_file_that_another_process_holds_is_an_error_in_time_and_not_a_wait(st
     with store.path.with_name("lockouts.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(TimeoutError):
-            store.save({KEY: Kept()})
-    store.save({KEY: Kept()})
+            store.save({KEY: StoredLockout()})
+    store.save({KEY: StoredLockout()})
 
 
 def test_writers_at_once_lose_no_record(store: LockoutStore, monkeypatch: pytest.MonkeyPatch) -> None:
     # Each waits for all before it, each of which waits for the disk.
     monkeypatch.setattr(persistence, "LOCK_WAIT_S", 60.0)
     threads = [
-        threading.Thread(target=lambda n=n: store.save({f"robot-{n}": Kept(LockoutState((HOLD,)))})) for n in range(12)
+        threading.Thread(target=lambda n=n: store.save({f"robot-{n}": StoredLockout(LockoutState((LOCKOUT,)))}))
+        for n in range(12)
     ]
     for thread in threads:
         thread.start()

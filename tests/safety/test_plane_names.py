@@ -15,7 +15,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.safety import reporting
 from strands_robots.safety.orders import StopOrder, new_epoch
-from strands_robots.safety.persistence import Kept, LockoutStore, hardware_key
+from strands_robots.safety.persistence import LockoutStore, StoredLockout, hardware_key
 from strands_robots.safety.plane import SafetyPlane
 
 KEY = hardware_key("so101", "usb-1")
@@ -95,7 +95,7 @@ def test_what_an_operator_cleared_on_the_disk_meanwhile_stays_cleared(robot: Rec
         entry = plane.register("arm-1", robot, key=KEY)
         stop(plane)
         entry.close()
-        store.save({KEY: Kept(seen=store.load(KEY).seen)})
+        store.save({KEY: StoredLockout(seen=store.load(KEY).seen)})
         assert not plane.register("arm-1", robot, key=KEY).locked
         assert not robot.refuses()
 
@@ -111,7 +111,7 @@ def test_a_stop_whose_file_is_written_late_does_not_undo_what_was_cleared_meanwh
         run = plane.begin(StopOrder(new_epoch(), "safety-1"))
         entry.close()
         assert store.load(KEY).state.locked
-        store.save({KEY: Kept(seen=store.load(KEY).seen)})
+        store.save({KEY: StoredLockout(seen=store.load(KEY).seen)})
         halted.set()
         assert run is not None
         assert run.wait(20)

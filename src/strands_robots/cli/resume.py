@@ -20,7 +20,7 @@ from strands_robots.cli.output import CliError, Exit, Screen, label, plain, tabl
 from strands_robots.envelope import text_of
 from strands_robots.safety.approval import GRANT_S, Grants, state_dir
 from strands_robots.safety.clearance import clear_here
-from strands_robots.safety.lockout import OVERFLOW, Hold, utc
+from strands_robots.safety.lockout import OVERFLOW, Lockout, utc
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
 from strands_robots.utils import device_id, number
@@ -139,7 +139,7 @@ class LockoutReport:
     """
 
     name: str
-    lockouts: tuple[Hold, ...] = ()
+    lockouts: tuple[Lockout, ...] = ()
     problem: str = ""
     facts: Mapping[str, Any] = field(default_factory=dict)
     round_trip_ms: float = 0.0
@@ -166,7 +166,7 @@ def operator() -> str:
         return f"uid {os.getuid()}"
 
 
-def _stored_lockouts() -> dict[str, tuple[Hold, ...]]:
+def _stored_lockouts() -> dict[str, tuple[Lockout, ...]]:
     """Return the lockouts in this machine's file, by robot; by key where a robot has no name.
 
     Raises:
@@ -193,13 +193,13 @@ def _ask(fleet: FleetClient, name: str, seconds: float) -> LockoutReport:
     return LockoutReport(name, lockouts, facts=answer, round_trip_ms=took_ms)
 
 
-def _lockout(row: Mapping[str, Any]) -> Hold:
+def _lockout(row: Mapping[str, Any]) -> Lockout:
     since = row.get("since")
     at = float(since) if isinstance(since, int | float) else 0.0
-    return Hold(str(row.get("epoch", "")), str(row.get("source", "")), str(row.get("reason", "")), at)
+    return Lockout(str(row.get("epoch", "")), str(row.get("source", "")), str(row.get("reason", "")), at)
 
 
-def _lockout_rows(name: str, lockouts: Iterable[Hold]) -> list[tuple[str, str]]:
+def _lockout_rows(name: str, lockouts: Iterable[Lockout]) -> list[tuple[str, str]]:
     """Return two cells for each lockout: since when, by whom and why; and its epoch, which other commands take."""
     cells: list[tuple[str, str]] = []
     for each in lockouts:
@@ -208,7 +208,7 @@ def _lockout_rows(name: str, lockouts: Iterable[Hold]) -> list[tuple[str, str]]:
     return cells
 
 
-def _fields(lockout: Hold) -> dict[str, Any]:
+def _fields(lockout: Lockout) -> dict[str, Any]:
     return {"epoch": lockout.epoch, "source": lockout.source, "reason": lockout.reason, "since": lockout.at}
 
 

@@ -1,181 +1,167 @@
-"""The lockout of one robot, as a pure state machine: state, event and time in; state and effects out.
+"""The lockout of one robot: its state, and the latch that keeps its motion gate shut.
 
-A robot is locked while it holds at least one *epoch*, the id of the emergency stop that locked it, and each epoch
-is cleared by itself. At most :data:`MAX_EPOCHS` are told apart; stops beyond that share one overflow epoch, which
-no signed resume can name and only an operator at the machine clears.
+A robot is locked while it has at least one *epoch*, the id of the emergency stop that locked it, and each epoch is
+cleared by itself. At most :data:`MAX_EPOCHS` are told apart; stops beyond that share one overflow epoch, which no
+signed resume can name and only an operator at the machine clears.
 """
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.utils import shown
 
 MAX_EPOCHS = 64
-"""Epochs held apart, which bounds what a flood of stops can make a robot remember."""
+"""Epochs told apart, which bounds what a flood of stops can make a robot remember."""
+
+SEEN_MAX = 256
+"""Ids of emergency stops remembered besides those that lock; a forgotten one would halt again, on the safe side."""
 
 OVERFLOW = "overflow"
 """Name of the epoch that stands for every stop beyond the first 64; no 32-hex id equals it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Hold:
-    """One reason why a robot is locked: ``at`` in seconds of wall-clock time, ``source`` as the stop declared it."""
-
-    epoch: str
-    source: str
-    reason: str
-    at: float
-
-
-@dataclass(frozen=True, slots=True)
-class LockoutState:
-    """What a robot holds, oldest first. The empty state is a robot that may move."""
-
-    holds: tuple[Hold, ...] = ()
-    overflow: Hold | None = None
-
-    @property
-    def locked(self) -> bool:
-        """True while any epoch is held."""
-        return bool(self.holds) or self.overflow is not None
-
-    @property
-    def all(self) -> tuple[Hold, ...]:
-        """Every hold, the overflow last."""
-        return (*self.holds, self.overflow) if self.overflow else self.holds
-
-    @property
-    def epochs(self) -> tuple[str, ...]:
-        """The epochs held, oldest first, the overflow last."""
-        return tuple(hold.epoch for hold in self.all)
-
-    @property
-    def resumable(self) -> tuple[str, ...]:
-        """The epochs that a signed resume can clear."""
-        return tuple(hold.epoch for hold in self.holds)
-
-    def holds_epoch(self, epoch: str) -> bool:
-        """True when ``epoch`` is one of those held."""
-        return any(hold.epoch == epoch for hold in self.holds)
-
-
-@dataclass(frozen=True, slots=True)
-class Engage:
-    """An emergency stop arrived."""
+class Lockout:
+    """One epoch that locks a robot: ``at`` in seconds of wall-clock time, ``source`` as the stop declared it."""
 
     epoch: str
     source: str = ""
     reason: str = ""
+    at: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
-class Resume:
-    """A resume that was verified names ``epoch``."""
+class LockoutState:
+    """The lockouts of a robot, oldest first. The empty state is a robot that may move."""
 
-    epoch: str
+    lockouts: tuple[Lockout, ...] = ()
+    overflow: Lockout | None = None
 
+    @property
+    def locked(self) -> bool:
+        """True while there is any lockout."""
+        return bool(self.lockouts) or self.overflow is not None
 
-@dataclass(frozen=True, slots=True)
-class ClearLocal:
-    """An operator at the robot's own machine clears every epoch, the overflow included."""
+    @property
+    def all(self) -> tuple[Lockout, ...]:
+        """Every lockout, the overflow last."""
+        return (*self.lockouts, self.overflow) if self.overflow else self.lockouts
 
-    who: str
+    @property
+    def epochs(self) -> tuple[str, ...]:
+        """The epochs that lock the robot, oldest first, the overflow last."""
+        return tuple(each.epoch for each in self.all)
 
+    @property
+    def resumable(self) -> tuple[str, ...]:
+        """The epochs that a signed resume can clear."""
+        return tuple(each.epoch for each in self.lockouts)
 
-Event = Engage | Resume | ClearLocal
+    def engage(self, lockout: Lockout) -> LockoutState:
+        """Return the state after an emergency stop; the same where its epoch locks the robot already."""
+        if lockout.epoch in self.resumable:
+            return self
+        if lockout.epoch != OVERFLOW and len(self.lockouts) < MAX_EPOCHS:
+            return replace(self, lockouts=(*self.lockouts, lockout))
+        return self if self.overflow is not None else replace(self, overflow=replace(lockout, epoch=OVERFLOW))
 
-
-@dataclass(frozen=True, slots=True)
-class Engaged:
-    """``hold`` is held now. ``first``: the robot was free before."""
-
-    hold: Hold
-    first: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Duplicate:
-    """The epoch was held already; nothing changed."""
-
-    epoch: str
-
-
-@dataclass(frozen=True, slots=True)
-class Cleared:
-    """``holds`` are gone. ``free``: nothing is held any more."""
-
-    holds: tuple[Hold, ...]
-    free: bool
-
-
-@dataclass(frozen=True, slots=True)
-class NotHeld:
-    """There was nothing to clear."""
-
-    epoch: str
+    def resume(self, epoch: str) -> LockoutState:
+        """Return the state after a verified resume of ``epoch``; the same where that does not lock the robot."""
+        return replace(self, lockouts=tuple(each for each in self.lockouts if each.epoch != epoch))
 
 
-Effect = Engaged | Duplicate | Cleared | NotHeld
+class LockoutLatch:
+    """Lockout of one robot in a running process, with the emergency stops it has seen; a :class:`~.gate.Latch`.
 
+    Readers take no lock: the state is one reference that is replaced whole. Writers share a lock that no I/O and
+    no robot call is ever made under.
+    """
 
-def step(state: LockoutState, event: Event, now: float) -> tuple[LockoutState, Effect]:
-    """The state after ``event`` at wall-clock time ``now``, and what that did."""
-    if isinstance(event, Engage):
-        return _engage(state, event, now)
-    if isinstance(event, Resume):
-        return _resume(state, event.epoch)
-    if not state.locked:
-        return state, NotHeld("")
-    return LockoutState(), Cleared(state.all, free=True)
+    def __init__(
+        self,
+        robot_id: str,
+        state: LockoutState | None = None,
+        seen: Iterable[str] = (),
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self.robot_id = robot_id
+        self._state = state or LockoutState()
+        self._seen: dict[str, None] = dict.fromkeys([*seen, *self._state.resumable])
+        self._clock = clock
+        self._writing = threading.Lock()
 
+    @property
+    def state(self) -> LockoutState:
+        """The lockouts now."""
+        return self._state
 
-def _engage(state: LockoutState, event: Engage, now: float) -> tuple[LockoutState, Effect]:
-    if state.holds_epoch(event.epoch):
-        return state, Duplicate(event.epoch)
-    hold = Hold(event.epoch, event.source, event.reason, now)
-    effect = Engaged(hold, first=not state.locked)
-    if event.epoch != OVERFLOW and len(state.holds) < MAX_EPOCHS:
-        return replace(state, holds=(*state.holds, hold)), effect
-    if state.overflow is not None:
-        return state, Duplicate(OVERFLOW)
-    hold = replace(hold, epoch=OVERFLOW)
-    return replace(state, overflow=hold), Engaged(hold, first=effect.first)
+    @property
+    def seen(self) -> tuple[str, ...]:
+        """Ids that no longer engage, oldest first."""
+        with self._writing:
+            return tuple(self._seen)
 
+    def refusal(self, verb: str) -> Envelope | None:
+        """Return the refusal of ``verb`` while locked, or None while free."""
+        return refusal(self._state, self.robot_id, verb)
 
-def _resume(state: LockoutState, epoch: str) -> tuple[LockoutState, Effect]:
-    if not state.holds_epoch(epoch):
-        return state, NotHeld(epoch)
-    gone = tuple(hold for hold in state.holds if hold.epoch == epoch)
-    rest = replace(state, holds=tuple(hold for hold in state.holds if hold.epoch != epoch))
-    return rest, Cleared(gone, free=not rest.locked)
+    def engage(self, epoch: str, source: str, reason: str) -> bool:
+        """Lock under ``epoch``; False when this id was seen before, which changes nothing."""
+        with self._writing:
+            if epoch in self._seen:
+                return False
+            self._seen[epoch] = None
+            self._state = self._state.engage(Lockout(epoch, source, reason, self._clock()))
+            self._forget()
+            return True
+
+    def resume(self, epoch: str) -> None:
+        """Clear ``epoch`` after its resume was verified."""
+        with self._writing:
+            self._state = self._state.resume(epoch)
+
+    def clear(self) -> tuple[Lockout, ...]:
+        """Clear every lockout, the overflow included, for an operator at this machine; return what was cleared."""
+        with self._writing:
+            cleared, self._state = self._state.all, LockoutState()
+            return cleared
+
+    def _forget(self) -> None:
+        if len(self._seen) <= SEEN_MAX + MAX_EPOCHS:
+            return
+        active = set(self._state.resumable)
+        oldest = next(epoch for epoch in self._seen if epoch not in active)
+        del self._seen[oldest]
 
 
 def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
-    """The answer to ``verb`` of a locked robot: which epoch, who stopped it, how to resume; None while free."""
+    """Return a locked robot's answer to ``verb``: the epoch, its source and how to resume; None while free."""
     if not state.locked:
         return None
-    hold = state.all[0]
-    why = f" ({shown(hold.reason)})" if hold.reason else ""
+    first = state.all[0]
+    why = f" ({shown(first.reason)})" if first.reason else ""
     more = len(state.all) - 1
     others = f" and {more} more stop{'s' if more > 1 else ''}" if more else ""
     return error(
-        f"{verb} is refused: {robot_id} is locked by the emergency stop of {hold.source or 'an unnamed source'}{why}, "
-        f"epoch {hold.epoch}{others}, since {utc(hold.at)}. To resume: {how_to_resume(state, robot_id)}.",
+        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}{why}, "
+        f"epoch {first.epoch}{others}, since {utc(first.at)}. To resume: {how_to_resume(state, robot_id)}.",
         locked=True,
         robot=robot_id,
         refused=verb,
         epochs=list(state.epochs),
-        stopped_by=hold.source,
-        stop_reason=hold.reason,
-        since=hold.at,
+        stopped_by=first.source,
+        stop_reason=first.reason,
+        since=first.at,
     )
 
 
 def how_to_resume(state: LockoutState, robot_id: str) -> str:
-    """The commands that free this robot, in words for an operator."""
+    """Return the commands that free this robot, for an operator."""
     local = "`strands-robots resume --local` at its own machine"
     if state.overflow is not None:
         return local
@@ -183,7 +169,7 @@ def how_to_resume(state: LockoutState, robot_id: str) -> str:
 
 
 def utc(at: float) -> str:
-    """Wall-clock seconds as ISO 8601 UTC; a time that no calendar holds is shown as its number."""
+    """Return wall-clock seconds as ISO 8601 UTC; a time beyond the calendar as its number."""
     try:
         return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(at))
     except (OverflowError, ValueError, OSError):

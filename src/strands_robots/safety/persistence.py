@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots.safety.approval import state_dir
-from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Hold, LockoutState
+from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.resume import is_epoch
 
 logger = logging.getLogger(__name__)
@@ -30,8 +30,8 @@ FILE_MAX_BYTES = 16 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """What a robot comes up with: its holds, the ids of stops it has seen, and the name it had on its network."""
+class StoredLockout:
+    """The state a robot starts with: its lockouts, the ids of stops it has seen, and its name on its network."""
 
     state: LockoutState = field(default_factory=LockoutState)
     seen: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ class LockoutStore:
     def _aside(self) -> Path:
         return self.path.with_suffix(".unreadable")
 
-    def load(self, key: str) -> Kept:
+    def load(self, key: str) -> StoredLockout:
         """What was kept under ``key``; nothing when there is no record, locked when it cannot be read.
 
         A robot without a record is locked as well while a file that could not be read lies aside.
@@ -72,18 +72,18 @@ class LockoutStore:
             return self._found(key)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as exc:
             logger.critical("%s cannot be read (%s): %s comes up locked.", self.path, exc, key)
-            hold = Hold(OVERFLOW, "this machine", "the lockout file is unreadable", time.time())
-            return Kept(LockoutState(overflow=hold))
+            unreadable = Lockout(OVERFLOW, "this machine", "the lockout file is unreadable", time.time())
+            return StoredLockout(LockoutState(overflow=unreadable))
 
-    def _found(self, key: str) -> Kept:
+    def _found(self, key: str) -> StoredLockout:
         record = self._read().get(key)
         if record is not None:
             return _kept(record)
         if self._aside.exists():
             raise ValueError(f"what was kept of this robot may stand in {self._aside.name}")
-        return Kept()
+        return StoredLockout()
 
-    def load_all(self) -> dict[str, Kept]:
+    def load_all(self) -> dict[str, StoredLockout]:
         """Every record, by key.
 
         Raises:
@@ -94,7 +94,7 @@ class LockoutStore:
         except (KeyError, TypeError, AttributeError) as exc:
             raise ValueError(f"{self.path} holds no record of lockouts: {exc!r}") from exc
 
-    def save(self, kept: Mapping[str, Kept]) -> None:
+    def save(self, kept: Mapping[str, StoredLockout]) -> None:
         """Put these records on the disk beside those of other processes; returns when they are there.
 
         Raises:
@@ -125,29 +125,29 @@ class LockoutStore:
         return robots
 
 
-def _record(kept: Kept) -> dict[str, Any]:
+def _record(kept: StoredLockout) -> dict[str, Any]:
     return {
         "name": kept.name,
-        "holds": [asdict(hold) for hold in kept.state.holds],
+        "holds": [asdict(each) for each in kept.state.lockouts],
         "overflow": asdict(kept.state.overflow) if kept.state.overflow else None,
         "seen": list(kept.seen),
     }
 
 
-def _kept(record: Mapping[str, Any]) -> Kept:
-    holds = tuple(_hold(each) for each in record["holds"])
-    overflow = _hold(record["overflow"]) if record["overflow"] is not None else None
-    if len(holds) > MAX_EPOCHS or len({hold.epoch for hold in holds}) != len(holds):
-        raise ValueError("more epochs than a robot holds, or one of them twice")
+def _kept(record: Mapping[str, Any]) -> StoredLockout:
+    lockouts = tuple(_lockout(each) for each in record["holds"])
+    overflow = _lockout(record["overflow"]) if record["overflow"] is not None else None
+    if len(lockouts) > MAX_EPOCHS or len({each.epoch for each in lockouts}) != len(lockouts):
+        raise ValueError("more epochs than a robot tells apart, or one of them twice")
     seen = tuple(each for each in record["seen"] if is_epoch(each))
-    return Kept(LockoutState(holds, overflow), seen, str(record.get("name", "")))
+    return StoredLockout(LockoutState(lockouts, overflow), seen, str(record.get("name", "")))
 
 
-def _hold(data: Mapping[str, Any]) -> Hold:
-    hold = Hold(data["epoch"], data["source"], data["reason"], float(data["at"]))
-    if not all(isinstance(part, str) for part in (hold.epoch, hold.source, hold.reason)):
-        raise ValueError("a hold whose fields are not text")
-    return hold
+def _lockout(data: Mapping[str, Any]) -> Lockout:
+    lockout = Lockout(data["epoch"], data["source"], data["reason"], float(data["at"]))
+    if not all(isinstance(part, str) for part in (lockout.epoch, lockout.source, lockout.reason)):
+        raise ValueError("a lockout whose fields are not text")
+    return lockout
 
 
 def _replace(path: Path, data: dict[str, Any]) -> None:

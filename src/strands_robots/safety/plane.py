@@ -18,10 +18,9 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceDesk
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.latch import LockoutLatch
-from strands_robots.safety.lockout import Cleared, Hold, LockoutState
+from strands_robots.safety.lockout import Lockout, LockoutLatch, LockoutState
 from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
-from strands_robots.safety.persistence import Kept, LockoutStore
+from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.reporting import OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
 from strands_robots.safety.stop_executor import DirectTarget, StopExecutor, stop_executor
@@ -45,7 +44,7 @@ class Registered:
     """One robot in the plane. ``close`` takes it out; the lockout on disk stays."""
 
     def __init__(
-        self, plane: SafetyPlane, robot_id: str, robot: Stoppable, *, key: str | None, kept: Kept, wire_id: str
+        self, plane: SafetyPlane, robot_id: str, robot: Stoppable, *, key: str | None, kept: StoredLockout, wire_id: str
     ) -> None:
         self.robot_id = robot_id
         self.wire_id = wire_id
@@ -83,15 +82,15 @@ class Registered:
         """Take the robot out of the plane."""
         self._plane.unregister(self)
 
-    def adopt(self, key: str, kept: Kept) -> None:
+    def adopt(self, key: str, kept: StoredLockout) -> None:
         """Keep this robot under ``key`` from now on, and hold what was kept there."""
         self.key = key
         self.inherit(kept.state)
 
     def inherit(self, state: LockoutState) -> None:
         """Hold what was held elsewhere, except what was resumed here since."""
-        for hold in state.all:
-            self.latch.engage(hold.epoch, hold.source, hold.reason)
+        for each in state.all:
+            self.latch.engage(each.epoch, each.source, each.reason)
 
     def come_up_locked(self) -> None:
         """Halt what moved before anybody knew that it is locked. Returns at once."""
@@ -198,7 +197,7 @@ class SafetyPlane:
                         known.come_up_locked()
                         self._kept([known])
                 return known
-            kept = self.store.load(key) if key else Kept()
+            kept = self.store.load(key) if key else StoredLockout()
             entry = Registered(self, robot_id, robot, key=key, kept=kept, wire_id=wire_id or robot_id)
             robot.gate.attach(entry.latch)
             self._inherit(entry)
@@ -255,7 +254,7 @@ class SafetyPlane:
         robots = [each for each in self._robots.values() if not (order.remote and each.wire_id == order.source)]
         fresh: list[Registered] = []
         for entry in robots:
-            if entry.latch.engage(order.epoch, order.source, order.reason) is not None:
+            if entry.latch.engage(order.epoch, order.source, order.reason):
                 if isinstance(entry.robot, DirectTarget):
                     entry.robot.halt_ordered()
                 for gate in entry.gates:
@@ -341,24 +340,24 @@ class SafetyPlane:
             epochs=list(entry.epochs),
         )
 
-    def clear_local(self, who: str, robot_ids: Iterable[str] | None = None) -> dict[str, tuple[Hold, ...]]:
+    def clear_local(self, who: str, robot_ids: Iterable[str] | None = None) -> dict[str, tuple[Lockout, ...]]:
         """Clear everything that these robots hold (all by default) at the word of ``who``, at this machine."""
         robots = self._robots
-        cleared: dict[str, tuple[Hold, ...]] = {}
+        cleared: dict[str, tuple[Lockout, ...]] = {}
         for name in robots.keys() & set(robots if robot_ids is None else robot_ids):
             entry = robots[name]
-            effect = entry.latch.clear_local(who)
-            if not isinstance(effect, Cleared):
+            gone = entry.latch.clear()
+            if not gone:
                 continue
-            cleared[name] = effect.holds
+            cleared[name] = gone
             persisted = self._kept([entry])
-            epochs = [hold.epoch for hold in effect.holds]
+            epochs = [each.epoch for each in gone]
             log_safety_event("resume_local", name, {"who": who, "epochs": epochs, "persisted": persisted})
             logger.warning("%s was cleared at this machine by %s.", name, who)
         self._freed()
         return cleared
 
-    def lockouts(self) -> dict[str, tuple[Hold, ...]]:
+    def lockouts(self) -> dict[str, tuple[Lockout, ...]]:
         """Who is locked now, and by what."""
         return {name: entry.latch.state.all for name, entry in self._robots.items() if entry.locked}
 
@@ -381,7 +380,7 @@ class SafetyPlane:
         # One at a time, so that no older state is written over a newer one.
         with self._keeping:
             due = [each for each in entries if each.key and each.latch.state is not each.on_disk]
-            kept = {each: Kept(each.latch.state, each.latch.seen, each.wire_id) for each in due}
+            kept = {each: StoredLockout(each.latch.state, each.latch.seen, each.wire_id) for each in due}
             if kept:
                 self.store.save({entry.key: record for entry, record in kept.items() if entry.key})
             for entry, record in kept.items():
