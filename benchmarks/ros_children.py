@@ -19,7 +19,7 @@ TWIST_TOPIC = "rt/bench/cmd_vel"
 SHAPE = (240, 320, 3)
 
 
-def told(value: Any) -> None:
+def answer_line(value: Any) -> None:
     print(json.dumps(value), flush=True)
 
 
@@ -80,9 +80,9 @@ def echo(domain: str) -> None:
     threads = [threading.Thread(target=answer), threading.Thread(target=note)]
     for thread in threads:
         thread.start()
-    told("ready")
+    answer_line("ready")
     for _ in sys.stdin:
-        told(arrivals)
+        answer_line(arrivals)
     ended.set()
     for thread in threads:
         thread.join()
@@ -106,9 +106,9 @@ def bridge(domain: str) -> None:
 
     robot = _Timed()
     made = HardwareRtpsBridge(robot, domain_id=int(domain))
-    told("ready")
+    answer_line("ready")
     for _ in sys.stdin:
-        told(robot.commands)
+        answer_line(robot.commands)
     made.shutdown()
 
 
@@ -132,14 +132,14 @@ def images(domain: str, ours: str) -> None:
             writer.write(Image(height=height, width=width, encoding="rgb8", step=width * depth, data=picture.tobytes()))
 
     publish()
-    told("ready")
+    answer_line("ready")
     for line in sys.stdin:
         began, spent, sent = time.monotonic(), time.process_time(), 0
         while time.monotonic() - began < float(line):
             publish()
             sent += 1
             time.sleep(max(0.0, began + sent / 30 - time.monotonic()))
-        told([(time.process_time() - spent) / (time.monotonic() - began), sent])
+        answer_line([(time.process_time() - spent) / (time.monotonic() - began), sent])
     if made is not None:
         made.shutdown()
 
@@ -151,9 +151,9 @@ def rosbridge() -> None:
     server = RosbridgeServer()
     server.on_publish = server.tell
     server.start()
-    told(server.port)
+    answer_line(server.port)
     for _ in sys.stdin:
-        told("on")
+        answer_line("on")
     server.stop()
 
 

@@ -26,7 +26,7 @@ JOINT = "shoulder_pan"
 
 
 def drive(world: Any, bridge: RosTelemetryBase, controller: DdsLink, to: float) -> None:
-    """Command one joint over the graph, and tell the graph where it went."""
+    """Command one joint over the graph, and publish where it went."""
     command = {"name": [JOINT], "position": [to]}
 
     def arrived() -> bool:
@@ -34,18 +34,18 @@ def drive(world: Any, bridge: RosTelemetryBase, controller: DdsLink, to: float) 
         return bool(abs(world.get_observation("arm")[JOINT] - to) < 0.05)
 
     eventually(arrived, within=20.0)
-    told: list[Any] = []
-    unwatch = controller.watch("/arm/joint_states", JOINT_STATE, told.append)
+    states: list[Any] = []
+    unwatch = controller.watch("/arm/joint_states", JOINT_STATE, states.append)
 
-    def heard() -> bool:
+    def published() -> bool:
         # A bridge of a real robot does this by itself after bridge.start(20.0).
         joints = world.get_observation("arm")
         bridge.publish_joint_states("arm", list(joints), list(joints.values()))
-        return bool(told)
+        return bool(states)
 
-    eventually(heard)
+    eventually(published)
     unwatch()
-    place = dict(zip(told[-1]["name"], told[-1]["position"], strict=True))[JOINT]
+    place = dict(zip(states[-1]["name"], states[-1]["position"], strict=True))[JOINT]
     print(f"{type(bridge).__name__}: commanded {to:g} rad, {place:.2f} rad told on /arm/joint_states")
 
 
@@ -54,7 +54,7 @@ def main() -> None:
     world.add_robot("arm", "so100")
     controller = DdsLink(DOMAIN, match_s=5.0)
     limits = {JOINT: (-1.0, 1.0)}
-    heard: list[Any] = []
+    pictures: list[Any] = []
     try:
         over_dds = HardwareRtpsBridge(world, domain_id=DOMAIN, joint_limits=limits)
         drive(world, over_dds, controller, 0.5)
@@ -62,12 +62,14 @@ def main() -> None:
         over_rclpy = HardwareRosBridge(world, domain_id=DOMAIN, joint_limits=limits)
         drive(world, over_rclpy, controller, -0.5)
         over_rclpy.shutdown()
-        telling = SimRosBridge(world, domain_id=DOMAIN)
-        controller.watch("/bench/overview/image_raw", "sensor_msgs/msg/Image", heard.append)
-        telling.start(10.0, ["overview"])
-        eventually(lambda: heard, within=20.0)
-        print(f"SimRosBridge: a picture of {heard[0]['width']} x {heard[0]['height']} on /bench/overview/image_raw")
-        telling.shutdown()
+        publisher = SimRosBridge(world, domain_id=DOMAIN)
+        controller.watch("/bench/overview/image_raw", "sensor_msgs/msg/Image", pictures.append)
+        publisher.start(10.0, ["overview"])
+        eventually(lambda: pictures, within=20.0)
+        print(
+            f"SimRosBridge: a picture of {pictures[0]['width']} x {pictures[0]['height']} on /bench/overview/image_raw"
+        )
+        publisher.shutdown()
     finally:
         controller.close()
         world.cleanup()

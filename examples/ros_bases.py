@@ -3,7 +3,7 @@
     .venv/bin/python -m examples.ros_bases
 
 A rover behind a rosbridge server, a car behind the same server, and a base in a process of its own on loopback DDS.
-The far ends are this project's stand-ins; with a real robot, only the addresses differ.
+The servers are this project's stand-ins; with a real robot, only the addresses differ.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from strands_robots.ros.rosbridge import RosbridgeLink
 DOMAIN = 92
 
 
-def show(robot: MobileBaseRobot, linear: float, angular: float) -> None:
+def drive_and_stop(robot: MobileBaseRobot, linear: float, angular: float) -> None:
     """Drive for half a second, begin a long drive, and stop it."""
     print(f"{robot.node_name}: {text_of(robot.drive(linear, angular, duration=0.5))}")
     print(f"{robot.node_name}: {text_of(robot.start_drive(linear, angular, 10.0))}")
@@ -38,9 +38,9 @@ def over_rosbridge() -> None:
     server.on_publish = lambda topic, m: server.tell("/odom", {"twist": {"twist": m}}) if topic == "/cmd_vel" else None
     server.start()
     try:
-        show(RosbridgeRobot("rover", "/cmd_vel", "/odom", host="127.0.0.1", port=server.port), 0.4, 0.2)
+        drive_and_stop(RosbridgeRobot("rover", "/cmd_vel", "/odom", host="127.0.0.1", port=server.port), 0.4, 0.2)
         link = RosbridgeLink("127.0.0.1", server.port)
-        show(AckermannRosRobot.from_deepracer("racer", link=link, max_duration=20.0), 0.4, 0.5)
+        drive_and_stop(AckermannRosRobot.from_deepracer("racer", link=link, max_duration=20.0), 0.4, 0.5)
     finally:
         server.stop()
 
@@ -48,7 +48,7 @@ def over_rosbridge() -> None:
 def over_dds() -> None:
     """The base on loopback DDS."""
     with base_process(DOMAIN):
-        show(RtpsRobot("base", "/cmd_vel", odom_topic="/odom", domain_id=DOMAIN), 0.3, 0.0)
+        drive_and_stop(RtpsRobot("base", "/cmd_vel", odom_topic="/odom", domain_id=DOMAIN), 0.3, 0.0)
 
 
 if __name__ == "__main__":

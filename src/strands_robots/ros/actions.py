@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.dds import DdsLink
@@ -36,35 +36,20 @@ TIMEOUT_MAX_S = 600.0
 RATE_MIN_HZ = 1 / TIMEOUT_MAX_S
 
 
-@runtime_checkable
-class Browsable(Protocol):
-    """A link that can list its graph."""
+GraphLink = RclpyLink | DdsLink | RosbridgeLink
 
-    def topics(self) -> list[dict[str, Any]]:
-        """Return ``topic`` and ``type`` of each topic, and what else is known."""
-
-    def nodes(self) -> list[str]:
-        """Return the names of the nodes."""
-
-    def services(self) -> list[str]:
-        """Return the names of the services."""
-
-    def actions(self) -> list[str]:
-        """Return the names of the actions."""
-
-
-_links: dict[tuple[Any, ...], RosLink] = {}
+_links: dict[tuple[Any, ...], GraphLink] = {}
 _links_lock = threading.Lock()
 
 
-def link_for(backend: str, host: str, port: int, domain_id: int | None) -> RosLink:
+def link_for(backend: str, host: str, port: int, domain_id: int | None) -> GraphLink:
     """Return the process's link to a graph; ``auto`` asks :func:`ros2_backend`.
 
     Raises:
         ValidationError: an address or a domain outside its domain.
         RosError: ``auto``, and neither a ROS 2 nor bare DDS is there.
     """
-    makers: dict[str, Callable[[], RosLink]] = {
+    makers: dict[str, Callable[[], GraphLink]] = {
         "rclpy": lambda: RclpyLink(domain_id),
         "dds": lambda: DdsLink(domain_id),
         "rosbridge": lambda: RosbridgeLink(host, port),
@@ -125,7 +110,7 @@ def ros_action(
         seconds = number("timeout", timeout, above=0, high=TIMEOUT_MAX_S)
         link = link_for(chosen, host, port, domain_id)
         if wanted in ("status", *_LISTS):
-            return _listing(_browsable(link), wanted)
+            return _listing(link, wanted)
         target = graph_name("name", name)
         kind = None if type is None and wanted in ("info", "echo") else interface("type", type)
         messages = whole("count", count, low=1, high=COUNT_MAX)
@@ -148,7 +133,7 @@ def ros_action(
         return error(str(exc))
 
 
-_LISTS: dict[str, Callable[[Browsable], Sequence[Any]]] = {
+_LISTS: dict[str, Callable[[GraphLink], Sequence[Any]]] = {
     "list_topics": lambda graph: graph.topics(),
     "list_nodes": lambda graph: graph.nodes(),
     "list_services": lambda graph: graph.services(),
@@ -156,7 +141,7 @@ _LISTS: dict[str, Callable[[Browsable], Sequence[Any]]] = {
 }
 
 
-def _listing(graph: Browsable, action: str) -> Envelope:
+def _listing(graph: GraphLink, action: str) -> Envelope:
     if action == "status":
         count = len(graph.topics())
         return success(f"{count} topics can be seen.", backend=type(graph).__name__, topics=count)
@@ -166,9 +151,9 @@ def _listing(graph: Browsable, action: str) -> Envelope:
     return success("\n".join(lines) or f"No {what}.", **{what: rows})
 
 
-def _info(link: RosLink, topic: str) -> Envelope:
+def _info(link: GraphLink, topic: str) -> Envelope:
     wanted = absolute(topic)
-    row = next((each for each in _browsable(link).topics() if each["topic"] == wanted), None)
+    row = next((each for each in link.topics() if each["topic"] == wanted), None)
     if row is None:
         return error(f"{wanted} is not on the graph.", topic=wanted)
     return success(f"{wanted} carries {row['type']}.", **row)
@@ -196,12 +181,6 @@ def _goal(link: RosLink, action: str, kind: str, goal: Message, within_s: float)
     if report.state != "succeeded":
         return error(f"{action}: {report.sentence()}", **fields)
     return success(f"{action} succeeded.", **fields)
-
-
-def _browsable(link: RosLink) -> Browsable:
-    if not isinstance(link, Browsable):
-        raise RosError(f"A {type(link).__name__} cannot tell what is on its graph.")
-    return link
 
 
 def _jsonable(value: Any) -> Any:

@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any, get_args, get_type_hints
 
 from strands_robots import settings
-from strands_robots.ros.dds_security import checked_credentials, policies, presenting
+from strands_robots.ros.dds_security import checked_credentials, presenting
 from strands_robots.ros.link import Message, OnMessage, RosError, Unwatch, next_message
 from strands_robots.ros.names import absolute, bare_kind, domain
 from strands_robots.utils import missing_extra, number, shown
@@ -63,7 +63,7 @@ class DdsLink:
         self.domain_id = domain(domain_id)
         self._match_s = number("match_s", match_s, low=0, high=60)
         self._credentials = checked_credentials(dds_security_config)
-        self._security = [] if self._credentials is None else policies(_dds("qos"), self._credentials)
+        self._security = [] if self._credentials is None else self._credentials.policies(_dds("qos"))
         self._lock = threading.RLock()
         self._participant: Any = None
         self._writers: dict[tuple[str, str], Any] = {}

@@ -54,8 +54,8 @@ class DdsCredentials:
         uri = self.uris[name]
         return uri.removeprefix(_DATA).encode() if uri.startswith(_DATA) else Path(uri.removeprefix(_FILE)).read_bytes()
 
-    def properties(self) -> dict[str, str]:
-        """Return the properties of a participant that presents them.
+    def policies(self, qos: Any) -> list[Any]:
+        """Return property policies of a participant, made with the given ``cyclonedds.qos``.
 
         Raises:
             ValidationError: the loaded Cyclone DDS has no DDS Security.
@@ -65,7 +65,7 @@ class DdsCredentials:
         for role, file, called in _PLUGINS:
             loaded = {"path": str(folder / file), "init": f"init_{called}", "finalize": f"finalize_{called}"}
             found |= {".".join(("dds.sec", role, "library", part)): value for part, value in loaded.items()}
-        return found
+        return [qos.Policy.Property(key, value) for key, value in found.items()]
 
 
 def checked_credentials(config: object) -> DdsCredentials | None:
@@ -134,11 +134,6 @@ def _check_key(credentials: DdsCredentials) -> None:
                 "dds_security_config['private_key'] must be the PEM key of dds_security_config['certificate'], without "
                 "a passphrase; it is not."
             ) from exc
-
-
-def policies(qos: Any, credentials: DdsCredentials) -> list[Any]:
-    """Return property policies, made with the given ``cyclonedds.qos`` module."""
-    return [qos.Policy.Property(key, value) for key, value in credentials.properties().items()]
 
 
 def _uri(name: str, value: object) -> str:

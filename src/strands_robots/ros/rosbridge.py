@@ -44,6 +44,15 @@ class _Request:
     answer: dict[str, Any] | None = None
     problem: str = ""
 
+    def end(self, answer: Message) -> None:
+        if self.answer is None:
+            self.answer = dict(answer)
+            self.done.set()
+
+    def fail(self, problem: str) -> None:
+        self.problem = problem
+        self.done.set()
+
 
 @dataclass(slots=True)
 class _Subscription:
@@ -120,17 +129,7 @@ class RosbridgeLink:
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
         request = _Request()
-
-        def keep(message: Message) -> None:
-            if request.answer is None:
-                request.answer = dict(message)
-                request.done.set()
-
-        def fail(problem: str) -> None:
-            request.problem = problem
-            request.done.set()
-
-        unwatch = self._watch(topic, kind, keep, fail)
+        unwatch = self._watch(topic, kind, request.end, request.fail)
         try:
             return self._awaited(request, f"Nothing arrived on {topic}", within_s)
         finally:
@@ -277,8 +276,7 @@ class RosbridgeLink:
 
     def _lost(self, why: str) -> None:
         for request in list(self._requests.values()):
-            request.problem = f"The connection to rosbridge at {self.url} was lost: {why}."
-            request.done.set()
+            request.fail(f"The connection to rosbridge at {self.url} was lost: {why}.")
         while self._goals:
             _, (goal, _) = self._goals.popitem()
             goal.fail(f"the connection to rosbridge at {self.url} was lost: {why}")
@@ -302,8 +300,7 @@ class RosbridgeLink:
         elif op == "service_response":
             request = self._requests.get(key) if isinstance(key, str) else None
             if request is not None:
-                request.answer = message
-                request.done.set()
+                request.end(message)
         elif op == "status":
             self._status(message)
 
@@ -345,8 +342,7 @@ class RosbridgeLink:
         key = str(message.get("id") or "")
         request = self._requests.get(key)
         if request is not None:
-            request.problem = said
-            request.done.set()
+            request.fail(said)
             return
         if key in self._goals:
             self._goals.pop(key)[0].fail(said)

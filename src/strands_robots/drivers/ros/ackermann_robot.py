@@ -39,10 +39,8 @@ class AckermannRosRobot(MobileBaseRobot):
         link: the link to the graph; a handshake needs one that carries services. By default rclpy, where a ROS 2 is
             sourced; bare DDS carries neither services nor servo messages, so without a ROS 2 use a
             ``RosbridgeLink``.
-        command_gate: asks the operator; that of the settings by default.
 
-    Raises:
-        ValidationError: an argument outside its domain.
+    The other arguments are those of :class:`~strands_robots.drivers.ros.mobile_base.MobileBaseRobot`.
     """
 
     def __init__(

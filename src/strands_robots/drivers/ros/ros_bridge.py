@@ -35,16 +35,12 @@ class RosBridgedRobot(PosedBaseRobot):
         cmd_vel_topic: the velocity topic, of ``cmd_vel_type`` (a Twist or a TwistStamped).
         odom_topic: odometry or pose; with it a stop waits to see the base still. The graph is asked for the types of
             this topic and of ``scan_topic`` where they are not given.
-        publish_rate: Hz of a timed or repeated drive, above 0.
-        max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds.
         nav_action: the action of a navigation stack, such as /navigate_to_pose. ``nav_action_type``: its interface,
             whose goal is that of ``NavigateToPose``.
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
         link: a link to use in place of a :class:`Ros2Link`.
-        command_gate: asks the operator; that of the settings by default.
 
-    Raises:
-        ValidationError: an argument outside its domain.
+    The other arguments are those of :class:`MobileBaseRobot`.
     """
 
     def __init__(

@@ -28,12 +28,9 @@ class RosbridgeRobot(PosedBaseRobot):
         host: bare hostname or IP address of the server. ``port``: 1 to 65535.
         max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds. All three
             are above 0 and required: this class has no unlimited drive.
-        publish_rate: Hz of a timed or repeated drive.
         link: a link to use in place of the connection to ``host`` and ``port``.
-        command_gate: asks the operator; that of the settings by default.
 
-    Raises:
-        ValidationError: an argument outside its domain.
+    The other arguments are those of :class:`~strands_robots.drivers.ros.mobile_base.MobileBaseRobot`.
     """
 
     def __init__(

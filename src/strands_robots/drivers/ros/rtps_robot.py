@@ -18,13 +18,12 @@ class RtpsRobot(PosedBaseRobot):
     Args:
         node_name: name of the robot and of its tools.
         cmd_vel_topic: the velocity topic, of ``cmd_vel_type`` (a Twist or a TwistStamped).
-        publish_rate: Hz of a timed or repeated drive.
-        max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds.
         odom_topic: a ``nav_msgs/Odometry``; with it a stop waits to see the base still.
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
-        command_gate: asks the operator; that of the settings by default.
         dds_security_config: credentials for a secured graph, as those of
             :class:`~strands_robots.hardware_rtps_bridge.HardwareRtpsBridge`; without, the participant has none.
+
+    The other arguments are those of :class:`~strands_robots.drivers.ros.mobile_base.MobileBaseRobot`.
 
     Raises:
         ValidationError: an argument outside its domain, or credentials that the installed library cannot honour.
