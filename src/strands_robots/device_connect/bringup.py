@@ -108,7 +108,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
     driver = driver_for(robot, peer_type)
     announceable(driver)
-    said = _listen_to_the_framework(name)
+    warnings = _framework_warnings(name)
     registration = asyncio.create_task(
         called(
             _REGISTRATIONS,
@@ -139,7 +139,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         await asyncio.shield(_put_down(runtime, task))
         if isinstance(exc, TimeoutError):
             where = ", ".join(reach.connect) or "the network"
-            why = (runtime.problem or said.last).rstrip(".") + "."
+            why = (runtime.problem or warnings.last).rstrip(".") + "."
             raise TimeoutError(f"{name} was not up on {where} within {bringup_timeout:g} s: {why}") from exc
         raise
     _hosts[runtime] = Host(asyncio.get_running_loop(), task)
@@ -409,7 +409,7 @@ class _LastWarning(logging.Handler):
         self.last = record.getMessage().strip()
 
 
-def _listen_to_the_framework(name: str) -> _LastWarning:
+def _framework_warnings(name: str) -> _LastWarning:
     """Attach a handler to the runtime's logger, which would else write to stderr."""
     framework = logging.getLogger(f"device_connect_edge.device.{name}")
     for handler in framework.handlers:

@@ -102,9 +102,9 @@ class ZenohStopLink:
         """The Zenoh ids of the sessions it is linked to."""
         return {zid for each in self._sessions for zid in tuple(each.remotes)}
 
-    def open(self, events: Collection[str], hear: OnEvent, on_state: OnState) -> None:
+    def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._state = _State(on_state)
-        self._subscribed = (events, hear)
+        self._subscribed = (events, on_event)
         with self._starting:
             self._start(self._open)
         _OPEN.add(self)
@@ -171,7 +171,7 @@ class ZenohStopLink:
             "congestion_control": zenoh.CongestionControl.DROP,
             "express": True,
         }
-        events, hear = self._subscribed
+        events, on_event = self._subscribed
         session = None
         while session is None:
             if self._closing.is_set():
@@ -185,7 +185,7 @@ class ZenohStopLink:
         def on_sample(sample: Any) -> None:
             parts = str(sample.key_expr).split("/")
             if len(parts) == 5:
-                hear(parts[4], parts[2], sample.payload.to_bytes())
+                on_event(parts[4], parts[2], sample.payload.to_bytes())
 
         for event in events:
             session.subscribe(f"{self._root}/*/event/{event}", on_sample)
@@ -227,9 +227,9 @@ class NatsStopLink:
     def up(self) -> bool:
         return self._state.up
 
-    def open(self, events: Collection[str], hear: OnEvent, on_state: OnState) -> None:
+    def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._state = _State(on_state)
-        self._thread = threading.Thread(target=self._run, args=(events, hear), name="stop-link", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(events, on_event), name="stop-link", daemon=True)
         self._thread.start()
         self._started.wait()
         _OPEN.add(self)
@@ -250,23 +250,23 @@ class NatsStopLink:
         thread.join(CLOSE_S)
         _OPEN.discard(self)
 
-    def _run(self, events: Collection[str], hear: OnEvent) -> None:
+    def _run(self, events: Collection[str], on_event: OnEvent) -> None:
         try:
             with asyncio.Runner() as runner:
                 self._loop, self._end = runner.get_loop(), asyncio.Event()
                 self._started.set()
-                runner.run(self._serve(events, hear, self._end))
+                runner.run(self._serve(events, on_event, self._end))
         except Exception:
             logger.critical("The e-stop listener's NATS link ended.", exc_info=True)
         finally:
             self._started.set()
             self._state.set(False)
 
-    async def _serve(self, events: Collection[str], hear: OnEvent, end: asyncio.Event) -> None:
+    async def _serve(self, events: Collection[str], on_event: OnEvent, end: asyncio.Event) -> None:
         async def on_message(data: bytes, subject: str, reply: str | None) -> None:
             parts = subject.split(".")
             if len(parts) == 5:
-                hear(parts[4], parts[2], data)
+                on_event(parts[4], parts[2], data)
 
         while not end.is_set():
             client = backend_for(self._link)
