@@ -6,7 +6,6 @@ told to stop. Locking and resuming are its parent's. What concerns the whole wor
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections.abc import Callable, Mapping
@@ -21,7 +20,7 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
-from strands_robots.mesh.transport import Declaration, TransportError
+from strands_robots.mesh.transport import Declaration, TransportError, undeclare
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import TELEOP_VERBS, RobotStop
@@ -245,7 +244,5 @@ class Children:
         with child.leaving:
             child.gone = True
         child.pipeline.close()
-        for each in child.handles:
-            with contextlib.suppress(TransportError):  # the session may be gone already, and the subscriber with it
-                each.undeclare()
+        undeclare(child.handles)
         child.context.audit.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import socket
 import threading
@@ -12,7 +11,8 @@ from typing import Any
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.transport import Declaration, Sample, TransportError
+from strands_robots.mesh.throttle import TroubleLog
+from strands_robots.mesh.transport import Declaration, Sample, TransportError, undeclare
 from strands_robots.mesh.wire_identity import IdentityError
 
 logger = logging.getLogger(__name__)
@@ -41,12 +41,12 @@ class PresencePublisher:
         self._type = peer_type
         self._describe = describe
         self._facts: dict[str, Any] = {}
-        self._trouble = ""
+        self._troubles = TroubleLog(logger)
         self.described = threading.Event()
         self._leaving: dict[tuple[str, str], float] = {}
         self._judged_later = self._token_declared = False
         self._anchored_at: float | None = None
-        self._handles: list[Declaration] = []
+        self._declared: list[Declaration] = []
         self._host = socket.gethostname()
 
     def start(self) -> None:
@@ -54,7 +54,7 @@ class PresencePublisher:
         transport = self._context.transport
         if transport is None:
             raise TransportError("the mesh is not running.")
-        self._handles.append(transport.declare_subscriber(topics.presence("*"), self.on_presence))
+        self._declared.append(transport.declare_subscriber(topics.presence("*"), self.on_presence))
         self._declare_token()
 
     def _declare_token(self) -> None:
@@ -63,16 +63,14 @@ class PresencePublisher:
         if self._token_declared or session is None or transport is None:
             return
         self._token_declared = True
-        self._handles.append(transport.declare_token(topics.token(self._context.peer_id, session)))
+        self._declared.append(transport.declare_token(topics.token(self._context.peer_id, session)))
         # Where a link can be lost, its loss and that of the tokens come in any order.
         self._judged_later = transport.lost_link_at() is not None
-        self._handles.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
+        self._declared.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
 
     def stop(self) -> None:
-        handles, self._handles = self._handles, []
-        for each in handles:
-            with contextlib.suppress(TransportError):  # the session may be gone already, and the subscriber with it
-                each.undeclare()
+        declared, self._declared = self._declared, []
+        undeclare(declared)
 
     def refresh(self) -> None:
         """Read the description anew; a robot that fails is announced by name alone."""
@@ -80,9 +78,7 @@ class PresencePublisher:
             self._facts, trouble = dict(self._describe()), ""
         except Exception as exc:  # noqa: BLE001 - a robot that cannot be read is announced all the same
             self._facts, trouble = {}, f"{type(exc).__name__}: {exc}"
-        if trouble and trouble != self._trouble:
-            logger.warning("%s cannot be described: %s", self._context.peer_id, trouble)
-        self._trouble = trouble
+        self._troubles.note("", trouble, "%s cannot be described: %s", self._context.peer_id, trouble)
         self.described.set()
 
     def announce(self) -> None:
@@ -138,13 +134,13 @@ class PresencePublisher:
         ):
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
 
-    def on_token(self, key: str, there: bool) -> None:
+    def on_token(self, key: str, alive: bool) -> None:
         """Note a token that came or went, for :meth:`judge_tokens`."""
         parts = key.split("/")
         if len(parts) != 4 or parts[1] == self._context.peer_id:
             return
         mark = (parts[1], parts[3])
-        if there:
+        if alive:
             self._leaving.pop(mark, None)
         elif len(self._leaving) < LEAVING_MAX:
             self._leaving[mark] = time.monotonic()

@@ -54,6 +54,7 @@ class _Shared:
         self.references = 0
 
     def acquire(self) -> Transport | None:
+        """Take a reference to the shared transport; None, logged, where there is none."""
         if mesh_env_request() is False:
             return None
         with self.lock:
@@ -69,6 +70,7 @@ class _Shared:
             return self.transport
 
     def release(self) -> None:
+        """Release one reference; the last one closes the session."""
         with self.lock:
             if self.transport is None:
                 return
@@ -94,19 +96,13 @@ _shared = _Shared()
 atexit.register(_shared.close)
 
 
-def acquire() -> Transport | None:
-    """Take a reference to the shared transport; None, logged, where there is none."""
-    return _shared.acquire()
+acquire = _shared.acquire
+release_session = _shared.release
 
 
 def get_session() -> Any | None:
     """Take a reference to the shared session, a ``zenoh.Session`` by default."""
     return _session_of(acquire())
-
-
-def release_session() -> None:
-    """Release one reference; the last one closes the session."""
-    _shared.release()
 
 
 def current_session() -> Any | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections import deque
@@ -11,7 +10,7 @@ from typing import Any
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.executor import BoundedExecutor
-from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError
+from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 
 logger = logging.getLogger(__name__)
 
@@ -67,8 +66,7 @@ class Subscriptions:
             self.inbox.pop(name, None)
         if declared is None:
             return False
-        with contextlib.suppress(TransportError):  # the session may be gone, and the subscriber with it
-            declared.undeclare()
+        undeclare([declared])
         return True
 
     def clear(self) -> int:

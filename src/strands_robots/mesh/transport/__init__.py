@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -26,6 +27,7 @@ __all__ = [
     "Transport",
     "TransportError",
     "ZenohTransport",
+    "undeclare",
 ]
 
 _MODULES = {
@@ -76,6 +78,13 @@ class Declaration(Protocol):
 
     def undeclare(self) -> None:
         """Withdraw it: no callback starts after this returns; twice is once."""
+
+
+def undeclare(declared: Iterable[Declaration]) -> None:
+    """Withdraw what was declared; a session that is gone took it along."""
+    for each in declared:
+        with contextlib.suppress(TransportError):
+            each.undeclare()
 
 
 class NoToken:
