@@ -41,6 +41,19 @@ def test_every_link_leads_to_a_file_and_a_section_of_it(page: Path) -> None:
             assert not anchor or anchor in sections(linked), f"{page.name} links to {target}"
 
 
+def test_every_term_of_the_glossary_is_linked_from_another_page() -> None:
+    glossary = ROOT / "docs" / "glossary.md"
+    linked = {
+        anchor
+        for page in PAGES
+        if page != glossary
+        for anchor in re.findall(r"glossary\.md#([\w-]+)", page.read_text(encoding="utf-8"))
+    }
+    terms = re.findall(r"^### (.+)$", glossary.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert terms
+    assert not [term for term in terms if term.lower().replace(" ", "-") not in linked]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_make_target_that_a_page_names_exists(page: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE))
