@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from fixtures.leaders import write_csv
 from tests.cli.conftest import Run
-
-from strands_robots.teleoperators.recorded import write_csv
 
 
 def test_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from fixtures.bodies import ScriptedPolicy
 from fixtures.devices import BlindDevice, FailingDevice, RecordingDevice, WedgingDevice
+from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots import policies
@@ -18,7 +19,6 @@ from strands_robots.contract import RolloutEvent, TaskRobot
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware import robot as robots
-from strands_robots.teleoperators.leader import ScriptedLeader
 from strands_robots.utils import ValidationError
 
 WAVES = {"pan.pos": (0.0, 50.0, 1.0), "lift.pos": (0.0, 50.0, 1.0), "grip.pos": (50.0, 40.0, 1.0)}

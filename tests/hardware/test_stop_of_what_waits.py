@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 from fixtures.bodies import ScriptedPolicy
 from fixtures.devices import RecordingDevice
+from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware import robot as hardware_robot
 from strands_robots.safety.gate import Permit
-from strands_robots.teleoperators.leader import ScriptedLeader
 
 WAVES = {"pan.pos": (0.0, 50.0, 1.0)}
 

@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 from fixtures.devices import RecordingDevice
+from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.teleoperators.leader import LeaderPolicy, ScriptedLeader
+from strands_robots.teleoperators.leader import LeaderPolicy
 
 WAVES = {"pan.pos": (20.0, 50.0, 1.0), "lift.pos": (20.0, 50.0, 1.0)}
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixtures.devices import RecordingDevice
+from fixtures.leaders import ScriptedLeader
 from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
@@ -22,7 +23,6 @@ from strands_robots.mesh import safety
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputPublisher, InputReceiver, MeshInputSink
 from strands_robots.mesh.security import ValidationError
-from strands_robots.teleoperators.leader import ScriptedLeader
 
 
 class Leader:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixtures.devices import RecordingDevice
+from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.envelope import Envelope, error
@@ -27,7 +28,6 @@ from strands_robots.recording.file import (
 )
 from strands_robots.recording.sampling import RobotRecording
 from strands_robots.simulation import Simulation
-from strands_robots.teleoperators.leader import ScriptedLeader
 from strands_robots.utils import ValidationError
 
 pytest.importorskip("mcap")

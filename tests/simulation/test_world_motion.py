@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from fixtures.bodies import ScriptedPolicy
+from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
@@ -17,7 +18,6 @@ from strands_robots.safety.gate import Permit
 from strands_robots.safety.stopping import Outcome, StopVerdict, grade, halt_each
 from strands_robots.simulation import Simulation
 from strands_robots.simulation import world as world_module
-from strands_robots.teleoperators.leader import ScriptedLeader
 
 pytestmark = pytest.mark.usefixtures("patient_halts")
 

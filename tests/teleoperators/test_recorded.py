@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 from fixtures.devices import RecordingDevice
+from fixtures.leaders import write_csv
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
 from strands_robots.teleoperators.leader import LeaderFinished
-from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames, write_csv
+from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames
 from strands_robots.utils import ValidationError
 
 NAMES = ["pan.pos", "grip.pos"]
@@ -39,7 +40,6 @@ def test_recording_is_played_at_its_own_times_and_ends() -> None:
     watch.seconds += 0.01
     with pytest.raises(LeaderFinished):
         leader.get_action()
-    assert (leader.duration, leader.position, leader.keys) == (3.0, 3.0, ("a", "b"))
 
 
 def test_recording_can_be_played_faster() -> None:
@@ -48,7 +48,6 @@ def test_recording_can_be_played_faster() -> None:
     leader.get_action()
     watch.seconds += 0.5
     assert leader.get_action() == {"a": 5.0}
-    assert leader.duration == 1.0
 
 
 def test_frames_survive_a_csv_file(tmp_path: Path) -> None:

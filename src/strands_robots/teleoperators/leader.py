@@ -1,4 +1,4 @@
-"""Leaders as policies, and a scripted leader for machines without hardware.
+"""Leaders as policies, and leaders kept inside a follower's bounds.
 
 A leader is any object with ``get_action() -> dict`` of targets by action key (a LeRobot teleoperator, a gamepad). It
 may have ``is_connected`` and ``get_teleop_events()``, and raises :class:`LeaderFinished` at its end.
@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.policies.base import Action, Ranges, SpeedLimit, checked_action, numbers
-from strands_robots.utils import ValidationError, mapping, number
+from strands_robots.utils import ValidationError, mapping
 
 logger = logging.getLogger(__name__)
 
@@ -51,33 +51,6 @@ def teleop_events(leader: Any) -> dict[str, Any] | None:
     return None if events is None else {str(getattr(key, "value", key)): value for key, value in dict(events).items()}
 
 
-class ScriptedLeader:
-    """A leader without hardware: every key follows a sine around a centre.
-
-    Args:
-        waves: by action key, centre and amplitude in the key's unit and frequency in Hz.
-        now: monotonic seconds.
-    """
-
-    def __init__(
-        self, waves: Mapping[str, tuple[float, float, float]], now: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._waves = {key: tuple(number(f"waves[{key!r}]", part) for part in wave) for key, wave in waves.items()}
-        self._now = now
-        self._started_at: float | None = None
-        self.is_connected = True
-
-    def get_action(self) -> Action:
-        """Return the present targets; the first call gives every key its centre."""
-        if self._started_at is None:
-            self._started_at = self._now()
-        seconds = self._now() - self._started_at
-        return {
-            key: centre + amplitude * math.sin(math.tau * hz * seconds)
-            for key, (centre, amplitude, hz) in self._waves.items()
-        }
-
-
 class LeaderPolicy:
     """A leader as a policy: checked, renamed, clamped and bounded in speed.
 
@@ -110,7 +83,6 @@ class LeaderPolicy:
     ) -> None:
         self.frames = 0
         self.errors = 0
-        self.sink_errors = 0
         self.event_errors = 0
         """Frames that went to the sink without events because reading those failed."""
         self.last_error = ""
@@ -120,6 +92,7 @@ class LeaderPolicy:
         self._max_speed = max_speed
         self._period = period
         self._sink = sink
+        self._sink_failed = False
         self._now = now
         self._ranges: Ranges = {}
         self._limit: SpeedLimit | None = None
@@ -173,9 +146,9 @@ class LeaderPolicy:
         try:
             self._sink.publish(self._device, self._method, numbers(frame), self._readable_events())
         except Exception:
-            self.sink_errors += 1
-            if self.sink_errors == 1:
+            if not self._sink_failed:
                 logger.exception("The frames of %s do not reach the network; the follower goes on.", self._device)
+            self._sink_failed = True
 
     def events(self) -> dict[str, Any] | None:
         """Return the leader's events, or None; raises the leader's exceptions."""

@@ -14,7 +14,7 @@ import bisect
 import csv
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,21 +54,6 @@ class RecordedLeader:
         self._started_at: float | None = None
         self.is_connected = True
 
-    @property
-    def duration(self) -> float:
-        """Length in seconds, at the chosen speed."""
-        return self._times[-1] / self._speed
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Action keys of the recording."""
-        return tuple(self._actions[-1])
-
-    @property
-    def position(self) -> float:
-        """Seconds played so far."""
-        return 0.0 if self._started_at is None else min(self._now() - self._started_at, self.duration)
-
     def get_action(self) -> Action:
         """Return the present targets.
 
@@ -106,16 +91,6 @@ def read_frames(path: Path) -> list[Frame]:
             return [_frame(names, row, f"line {line} of {path.name}") for line, row in enumerate(rows, start=2) if row]
     except OSError as exc:
         raise ValidationError(f"the recording {shown(str(path))} cannot be read: {exc.strerror}.") from exc
-
-
-def write_csv(path: Path, frames: Iterable[Frame]) -> None:
-    """Write frames as ``.csv``; the columns are the keys of all of them."""
-    rows = list(frames)
-    names = list(dict.fromkeys(key for _, action in rows for key in action))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([_TIME, *names])
-        writer.writerows([f"{seconds:.6f}", *(action.get(name, "") for name in names)] for seconds, action in rows)
 
 
 def _frame(names: list[str], row: list[str], place: str) -> Frame:

@@ -25,7 +25,9 @@ from strands_robots.utils import ValidationError
 pytestmark = pytest.mark.system
 
 
-def test_a_follower_goes_where_the_leader_is_moved(bus: FeetechBus, calibration: Path, tmp_path: Path) -> None:
+def test_follower_reaches_the_position_of_a_leader_moved_by_hand(
+    bus: FeetechBus, calibration: Path, tmp_path: Path
+) -> None:
     with FeetechBus(arm_servos(), link=tmp_path / "leader") as leader:
         pan = leader.servos[1]
         start = pan.shaft
@@ -43,11 +45,11 @@ def test_a_follower_goes_where_the_leader_is_moved(bus: FeetechBus, calibration:
         result = CliRunner().invoke(build(), line)
         by_hand.join()
         assert result.exit_code == 0, result.output
-        told = json.loads(result.stdout)
-        assert told["state"] == "completed"
-        assert told["stopped"] is True
-        assert told["errors"] == 0
-        assert told["frames"] > 20
+        report = json.loads(result.stdout)
+        assert report["state"] == "completed"
+        assert report["stopped"] is True
+        assert report["errors"] == 0
+        assert report["frames"] > 20
         assert abs(bus.shafts()[1] - pan.shaft) < 20
         assert not any(servo.torque for servo in leader.servos.values()), "a leader is moved by hand"
         goals = [int.from_bytes(each.data, "little") for each in bus.writes if each.servo == 1 and each.address == 42]
@@ -55,7 +57,7 @@ def test_a_follower_goes_where_the_leader_is_moved(bus: FeetechBus, calibration:
         assert max(steps) <= 2 * 2500 * 2.0 * 0.02, "the speed bound, of at most two periods"
 
 
-def test_a_follower_whose_port_is_missing_is_one_sentence(calibration: Path) -> None:
+def test_follower_with_a_missing_port_is_refused_in_one_sentence(calibration: Path) -> None:
     line = ["teleop", "keyboard", "so101@/dev/no-such-port", "--calibration", str(calibration), "--json"]
     result = CliRunner().invoke(build(), line)
     assert result.exit_code == 1

@@ -1,4 +1,4 @@
-"""A real arm is recorded where it is served: at rest, in motion, and when its cable comes out."""
+"""Recording of a served real arm: at rest, in motion, and while its cable is out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from strands_robots.recording.sampling import RobotRecording
 pytestmark = pytest.mark.system
 
 
-def test_an_arm_is_recorded_at_rest_in_motion_and_without_its_cable(
+def test_arm_is_recorded_at_rest_in_motion_and_after_its_cable_was_out(
     arm: Callable[..., Any], bus: FeetechBus, tmp_path: Path
 ) -> None:
     robot, path = arm(), tmp_path / "run.mcap"
@@ -35,6 +35,6 @@ def test_an_arm_is_recorded_at_rest_in_motion_and_without_its_cable(
     assert recorder.lost == 0
     items = list(read_items(path))
     assert {len(item.joints) for item in items if isinstance(item, RecordedJoints)} == {6}
-    ended = next(item for item in items if isinstance(item, RecordedEvent) and item.event == "taskComplete")
-    assert ended.payload["state"] == "stopped"
+    completion = next(item for item in items if isinstance(item, RecordedEvent) and item.event == "taskComplete")
+    assert completion.payload["state"] == "stopped"
     assert len(recorded_actions(path)) >= 20

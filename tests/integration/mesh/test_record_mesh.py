@@ -28,12 +28,12 @@ def settings(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
 
 
-def seen(run: Path) -> set[str]:
-    """The cameras whose frames are in the recording so far."""
+def recorded_cameras(run: Path) -> set[str]:
+    """Return the cameras whose frames are in the recording so far."""
     return {item.camera for item in read_items(run) if isinstance(item, RecordedPicture)}
 
 
-def started(*arguments: str) -> Any:
+def start_process(*arguments: str) -> Any:
     return subprocess.Popen([*COMMAND, *arguments, "--json"], stdout=subprocess.PIPE, text=True)
 
 
@@ -43,13 +43,13 @@ def test_states_pictures_and_stops_of_a_served_world_are_recorded(
 ) -> None:
     run = tmp_path / "run.mcap"
     console = join("console-1", "none")
-    serving = started("serve", "so100", "--mesh", "--peer-id", "arm-1")
+    serving = start_process("serve", "so100", "--mesh", "--peer-id", "arm-1")
     try:
         assert json.loads(serving.stdout.readline())["peer_id"] == "arm-1"
         console.sees("arm-1")
-        recording = started("record", "arm-1", "--out", str(run), "--mesh")
+        recording = start_process("record", "arm-1", "--out", str(run), "--mesh")
         try:
-            eventually(lambda: run.exists() and run.stat().st_size > 20_000 and seen(run) >= CAMERAS)
+            eventually(lambda: run.exists() and run.stat().st_size > 20_000 and recorded_cameras(run) >= CAMERAS)
             console.ask("estop")
             eventually(
                 lambda: "emergencyStop" in {item.event for item in read_items(run) if isinstance(item, RecordedEvent)}
@@ -69,6 +69,6 @@ def test_states_pictures_and_stops_of_a_served_world_are_recorded(
     assert joints.device == "arm-1"
     assert "shoulder_pan" in joints.joints
     pictures = [item for item in items if isinstance(item, RecordedPicture)]
-    assert seen(run) == CAMERAS
+    assert recorded_cameras(run) == CAMERAS
     assert all(item.jpeg[:2] == b"\xff\xd8" for item in pictures)
     assert "emergencyStop" in {item.event for item in items if isinstance(item, RecordedEvent)}

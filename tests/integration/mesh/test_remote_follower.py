@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.leaders import write_csv
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
-
-from strands_robots.teleoperators.recorded import write_csv
 
 Join = Callable[..., MeshPeer]
 

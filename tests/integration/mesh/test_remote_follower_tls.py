@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.leaders import write_csv
 from fixtures.waiting import free_port
 
 from strands_robots.mesh import keys
-from strands_robots.teleoperators.recorded import write_csv
 
 pytest.importorskip("cryptography")
 

@@ -176,7 +176,6 @@ class MotionController:
         self._body_yaw_sent_on = 0
         self.observers = RolloutObservers()
         self.frames_sent = 0
-        self.last_write = 0.0
 
     @property
     def current(self) -> ReachyMotion | None:
@@ -383,7 +382,6 @@ class MotionController:
             with self._write:
                 motion.check()
                 self._connection.link().send_target(target)
-                self.last_write = time.monotonic()
         except (DaemonUnreachableError, MotionRefused) as exc:
             self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
             raise
