@@ -1,13 +1,11 @@
-"""What every test of a graph gets: DDS that stays on this machine."""
+"""Fixtures of all graph tests: DDS that stays on this machine."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.drivers.ros.mobile_base import PosedBaseRobot
 
 
 @pytest.fixture(autouse=True)
@@ -17,17 +15,22 @@ def confined(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A far end that is starved of its processor brakes and speaks later than a second after a stop."""
+    """Allow for a base that is starved of its processor and answers a stop late."""
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "4")
 
 
-def obeyed(robot: MobileBaseRobot, x_of: Callable[[], float]) -> None:
-    """Return once the base has moved on a drive and stands: what is sent before its reader knows us reaches nobody."""
-    began = x_of()
+def x_of(robot: PosedBaseRobot) -> float:
+    """Return the base's x position in metres."""
+    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
+
+
+def obeyed(robot: PosedBaseRobot) -> None:
+    """Return once the base has moved on a drive and is still: a message before its reader knows us is lost."""
+    began = x_of(robot)
 
     def moved() -> bool:
         robot.drive(0.2, 0.0, duration=0.1)
-        return x_of() > began
+        return x_of(robot) > began
 
     eventually(moved)
     eventually(lambda: robot.stop()["stopped"])

@@ -10,16 +10,15 @@ from typing import Any
 
 import pytest
 from fixtures.base_process import BaseProcess, base_process
+from fixtures.ros_bases import OPEN
 from fixtures.waiting import eventually
-from tests.integration.ros.conftest import obeyed
+from tests.integration.ros.conftest import obeyed, x_of
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError
 from strands_robots.utils import ValidationError
 
-OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 DOMAIN = 91
 ROOT = Path(__file__).resolve().parents[3]
 TWIST = "geometry_msgs/msg/Twist"
@@ -38,14 +37,9 @@ def rover() -> Iterator[RtpsRobot]:
     robot.disconnect()
 
 
-def x_of(robot: RtpsRobot) -> float:
-    message = robot.get_pose(20.0)["message"]
-    return float(message["pose"]["pose"]["position"]["x"])
-
-
 @pytest.mark.usefixtures("patient")
 def test_a_base_in_another_process_is_driven_and_stopped(base: None, rover: RtpsRobot) -> None:
-    obeyed(rover, lambda: x_of(rover))
+    obeyed(rover)
     began, called = x_of(rover), time.monotonic()
     answer = rover.drive(0.3, 0.0, duration=1.0)
     took_s = time.monotonic() - called
@@ -58,7 +52,7 @@ def test_a_base_in_another_process_is_driven_and_stopped(base: None, rover: Rtps
 @pytest.mark.usefixtures("patient")
 def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: None, rover: RtpsRobot) -> None:
     assert rover.advertise()["status"] == "success"
-    obeyed(rover, lambda: x_of(rover))
+    obeyed(rover)
     began = x_of(rover)
     assert rover.start_drive(1.0, 0.0, 30.0)["status"] == "success"
     eventually(lambda: x_of(rover) > began + 0.1)
@@ -71,7 +65,7 @@ def test_a_stop_ends_a_drive_of_a_base_in_another_process(base: None, rover: Rtp
 
 @pytest.mark.usefixtures("patient")
 def test_drive_of_a_base_that_died_is_an_error_and_did_not_stop(base: BaseProcess, rover: RtpsRobot) -> None:
-    obeyed(rover, lambda: x_of(rover))
+    obeyed(rover)
     began = x_of(rover)
     assert rover.start_drive(0.5, 0.0, 30.0)["status"] == "success"
     eventually(lambda: x_of(rover) > began + 0.05)

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import pytest
 from fixtures.base_process import base_process
+from fixtures.ros_bases import OPEN
 from fixtures.waiting import eventually
-from tests.integration.ros.conftest import obeyed
+from tests.integration.ros.conftest import obeyed, x_of
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
-from strands_robots.ros.gate import CommandGate
 
-OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 DOMAIN = 82
 ROOT = Path(__file__).resolve().parents[3]
 DRIVER = f"""
@@ -42,17 +41,13 @@ def driver() -> Iterator[RtpsRobot]:
     made.disconnect()
 
 
-def x_of(robot: RtpsRobot) -> float:
-    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
-
-
 def speed_of(robot: RtpsRobot) -> float:
     return float(robot.get_pose(20.0)["message"]["twist"]["twist"]["linear"]["x"])
 
 
 @pytest.mark.usefixtures("patient")
 def test_base_drives_the_commanded_distance(world: None, driver: RtpsRobot) -> None:
-    obeyed(driver, lambda: x_of(driver))
+    obeyed(driver)
     began = x_of(driver)
     called = time.monotonic()
     answer = driver.drive(0.3, 0.0, duration=2.0)

@@ -14,13 +14,13 @@ import pytest
 from fixtures.certificates import Authority
 from fixtures.child import Child
 from fixtures.dds_pki import DdsPki, governance
+from fixtures.ros_bases import OPEN
 from fixtures.taking_arm import TakingArm
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
 from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError
 from strands_robots.utils import ValidationError
 
@@ -36,7 +36,6 @@ CMD, ODOM, ARM = "/cmd_vel", "/odom_of_ours", "/my_arm/joint_command"
 TWIST, ODOMETRY, JOINTS = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState"
 SPEED = {"linear": {"x": 0.25}}
 SECRET = "base_footprint_of_ours"
-OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 
 Peer = Callable[[dict[str, str] | None], Child]
 

@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 from fixtures.dds_peer import CYCLONE_C, FAST_DDS, DdsPeer, Vendor
+from fixtures.ros_bases import OPEN
 from fixtures.waiting import eventually
+from tests.integration.ros.conftest import x_of
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
 from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.gate import CommandGate
 
 pytestmark = pytest.mark.system
 
-OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 DOMAIN = 81
 PICTURE = bytes(at % 251 for at in range(320 * 240 * 3))
 
@@ -139,10 +139,6 @@ def test_pictures_pass_both_ways_without_a_crash(peer: DdsPeer, link: DdsLink) -
     eventually(seen)
     assert (received[0]["width"], received[0]["encoding"], received[0]["data"]) == (320, "rgb8", PICTURE)
     assert peer.alive
-
-
-def x_of(robot: RtpsRobot) -> float:
-    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
 def test_fast_dds_base_is_driven_and_stopped(built: Built) -> None:

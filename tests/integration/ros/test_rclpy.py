@@ -18,6 +18,7 @@ from fixtures.base_process import base_process, nav2
 from fixtures.dds_nav2 import RELIABLE, Service
 from fixtures.rclpy_stand_in.idl import SERVICES, ServoCtrlMsg
 from fixtures.waiting import eventually
+from tests.integration.ros.conftest import x_of
 
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
@@ -66,10 +67,6 @@ def rover(sourced: None) -> Iterator[Rover]:
     yield make
     for each in robots:
         each.disconnect()
-
-
-def x_of(robot: RosBridgedRobot) -> float:
-    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
 @pytest.mark.usefixtures("patient")

@@ -9,19 +9,18 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
+from fixtures.ros_bases import OPEN
 from fixtures.rosbridge_server import RosbridgeServer
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.drivers.ros import velocity_publisher
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
-from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, run_goal
 from strands_robots.ros.rosbridge import RosbridgeLink
 from strands_robots.safety.orders import StopOrder
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.utils import ValidationError
 
-OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 TWIST = "geometry_msgs/Twist"
 
 

@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 from fixtures.ros1_graph import Ros1Graph, missing
+from fixtures.ros_bases import OPEN
 from fixtures.waiting import eventually
+from tests.integration.ros.conftest import x_of
 
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
-from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError
 from strands_robots.ros.rosbridge import RosbridgeLink
 
 pytestmark = pytest.mark.system
 
-OPEN = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 ODOMETRY = "nav_msgs/Odometry"
 
 
@@ -52,10 +52,6 @@ def link(graph: Ros1Graph) -> Iterator[RosbridgeLink]:
     made = RosbridgeLink("127.0.0.1", graph.port)
     yield made
     made.close()
-
-
-def x_of(robot: RosbridgeRobot) -> float:
-    return float(robot.get_pose(20.0)["message"]["pose"]["pose"]["position"]["x"])
 
 
 def test_rospy_base_is_driven_and_stands_afterwards(base: RosbridgeRobot) -> None:
