@@ -10,15 +10,20 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from enum import Enum
+from pathlib import Path
 from typing import Any, ClassVar
 
 import psutil
 import pytest
 from device_connect_edge.drivers import DeviceDriver, rpc
+from fixtures.certificates import Authority, Identity
+from fixtures.nats_credentials import NatsAccounts, Token
 from fixtures.nats_server import NatsServer
 from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import eventually, free_port
+from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots import device_connect
 from strands_robots.device_connect import (
@@ -341,3 +346,74 @@ def test_two_tenants_do_not_see_each_other(world: ToyWorld) -> None:
 
 def test_public_constant_is_the_join_timeout() -> None:
     assert device_connect._LOOP_JOIN_TIMEOUT_S == 5.0
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path)
+
+
+def authenticated_link(identity: Identity, **where: object) -> LinkConfig:
+    return replace(LinkConfig(ca=str(identity.ca), cert=str(identity.cert), key=str(identity.key)), **where)  # type: ignore[arg-type]
+
+
+def finds_moves_and_stops(link: LinkConfig) -> None:
+    with FleetClient(link, "operator") as fleet:
+        assert [peer.id for peer in fleet.peers(20)] == ["arm-1"]
+        assert fleet.call("arm-1", "execute", {"instruction": "wave"})["status"] == "success"
+        assert fleet.stop("arm-1")["stopped"] == ["left"]
+
+
+def test_device_behind_a_router_with_mutual_tls_needs_no_opt_in(authority: Authority, world: ToyWorld) -> None:
+    with ZenohRouter(authority.issue("router")) as router:
+        where = {"connect": (router.endpoint,)}
+        runtime = init_device_connect_sync(
+            world, peer_id="arm-1", link=authenticated_link(authority.issue("arm-1"), **where)
+        )
+        finds_moves_and_stops(authenticated_link(authority.issue("operator"), **where))
+        stop_device_connect(runtime)
+
+
+def test_certificates_of_the_environment_need_no_opt_in(
+    authority: Authority, world: ToyWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = authority.issue("arm-1")
+    with ZenohRouter(authority.issue("router")) as router:
+        monkeypatch.setenv("ZENOH_CONNECT", router.endpoint)
+        for part in ("ca", "cert", "key"):
+            monkeypatch.setenv(f"MESSAGING_TLS_{part.upper()}_FILE", str(getattr(robot, part)))
+        runtime = init_device_connect_sync(world, peer_id="arm-1")
+        finds_moves_and_stops(authenticated_link(authority.issue("operator"), connect=(router.endpoint,)))
+        stop_device_connect(runtime)
+
+
+def test_peers_with_mutual_tls_admit_no_stranger(authority: Authority, world: ToyWorld) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    runtime = init_device_connect_sync(
+        world, peer_id="arm-1", link=authenticated_link(authority.issue("arm-1"), mode="peer", listen=(endpoint,))
+    )
+    finds_moves_and_stops(authenticated_link(authority.issue("operator"), mode="peer", connect=(endpoint,)))
+    with FleetClient(LinkConfig(mode="peer", connect=(endpoint.replace("tls/", "tcp/"),), multicast=False)) as stranger:
+        assert stranger.peers(0.6) == []
+    stop_device_connect(runtime)
+
+
+def test_device_on_nats_with_tls_and_tokens_needs_no_opt_in(
+    authority: Authority, world: ToyWorld, caplog: pytest.LogCaptureFixture
+) -> None:
+    accounts = NatsAccounts()
+    with NatsServer(authority.issue("server"), accounts.server_lines) as server:
+
+        def link(token: Token) -> LinkConfig:
+            return LinkConfig(
+                transport="nats",
+                connect=(server.url,),
+                ca=str(authority.ca),
+                jwt=token.jwt,
+                nkey_seed=token.nkey_seed,
+            )
+
+        runtime = init_device_connect_sync(world, peer_id="arm-1", link=link(accounts.device("arm-1")))
+        finds_moves_and_stops(link(accounts.operator()))
+        stop_device_connect(runtime)
+    assert "does not answer" not in caplog.text
