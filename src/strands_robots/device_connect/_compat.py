@@ -300,6 +300,12 @@ def _traced() -> bool:
     )
 
 
+def observed(driver: Any) -> bool:
+    """Return True while the framework's log lines of a call, its spans or its metrics reach somebody."""
+    integration = callable(getattr(driver, "log_integration", None))
+    return integration or decorators.logger.isEnabledFor(logging.INFO) or _traced()
+
+
 def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
     """Return an ``@rpc`` method that logs, traces and counts only when recorded.
 

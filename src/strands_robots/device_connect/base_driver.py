@@ -7,6 +7,7 @@ answer into an envelope that JSON can carry. Robot calls run on threads, never o
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import inspect
 import logging
 from collections.abc import Callable, Mapping
@@ -22,7 +23,7 @@ from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
-from strands_robots.device_connect._compat import Labels, emit, on, rpc
+from strands_robots.device_connect._compat import Labels, emit, observed, on, rpc
 from strands_robots.device_connect.safety_registration import SafetyRegistration
 from strands_robots.device_connect.telemetry import RolloutPump, paced
 from strands_robots.envelope import Envelope, error, jsonable, success
@@ -30,9 +31,9 @@ from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result
+from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
-from strands_robots.serving.workers import awaited, called
+from strands_robots.serving.workers import ShareFullError, called
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -60,24 +61,8 @@ def rpc_method(verb: Verb) -> Callable[..., Any]:
     """Make the RPC method of a verb; its signature, docstring and schema are the verb's description."""
 
     async def method(self: RobotDriver, *values: object, **named: object) -> dict[str, Any]:
-        if verb.kind is Kind.STOP:
-            return await self.stop_answer(verb.name)
         arguments = {**dict(zip(verb.by_name, values, strict=False)), **named}
-        moves = verb.kind is Kind.MOTION
-        asked = self.pipeline.pending.arrive() if moves else None
-        command = Command(verb, arguments, get_rpc_source_device(), asked)
-        within = START_DEADLINE_S if moves else READ_DEADLINE_S
-        try:
-            answer: Result = await awaited(partial(self.pipeline.submit, command), within)
-        except TimeoutError:
-            # This command alone: to revoke the gate without a halt would leave what moves with its last command.
-            if asked is not None:
-                asked.give_up()
-            return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
-        if moves and answer.refusal is None:
-            logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(command.caller))
-            self.changed.set()
-        return enveloped(verb.name, answer.result)
+        return await self.answer(verb, arguments, get_rpc_source_device())
 
     empty = inspect.Parameter.empty
     method.__name__ = verb.name
@@ -96,6 +81,16 @@ def rpc_method(verb: Verb) -> Callable[..., Any]:
     itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     vars(method)["__signature__"] = inspect.Signature([itself, *parameters], return_annotation=dict[str, Any])
     return rpc(labels=_labels(verb))(method)
+
+
+def _hand_over(loop: asyncio.AbstractEventLoop, answered: asyncio.Future[Result], result: Result) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop closed while the robot was still busy
+        loop.call_soon_threadsafe(_settle, answered, result)
+
+
+def _settle(answered: asyncio.Future[Result], result: Result) -> None:
+    if not answered.done():
+        answered.set_result(result)
 
 
 def enveloped(verb: str, answer: object) -> Envelope:
@@ -156,10 +151,37 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
     # Commands.
 
     async def invoke(self, function_name: str, /, **params: Any) -> Any:
-        """Call an RPC by name; parameters that it does not have, or lacks, are refused by name."""
+        """Call an RPC by name; the framework's spans and log lines are left out while nothing takes them."""
         verb = self.verbs.get(function_name)
-        problem = verb and verb.unfit(params.keys() - {"source_device"})
-        return error(problem) if problem else await super().invoke(function_name, **params)
+        if verb is None or observed(self):
+            problem = verb and verb.unfit(params.keys() - {"source_device"})
+            return error(problem) if problem else await super().invoke(function_name, **params)
+        return await self.answer(verb, params, params.pop("source_device", None))
+
+    async def answer(self, verb: Verb, arguments: Mapping[str, Any], caller: object) -> Envelope:
+        """Serve one call of a verb. Never raises for what the caller or the robot did."""
+        if verb.kind is Kind.STOP:
+            return await self.stop_answer(verb.name)
+        moves = verb.kind is Kind.MOTION
+        command = Command(verb, arguments, caller, self.pipeline.pending.arrive() if moves else None)
+        loop = asyncio.get_running_loop()
+        answered: asyncio.Future[Result] = loop.create_future()
+        try:
+            self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, partial(_hand_over, loop, answered)))
+            # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
+            async with asyncio.timeout(START_DEADLINE_S if moves else READ_DEADLINE_S):
+                result = await answered
+        except ShareFullError:
+            result = busy(command)
+        except TimeoutError:
+            # This command alone: to revoke the gate without a halt would leave what moves with its last command.
+            if command.asked is not None:
+                command.asked.give_up()
+            return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
+        if moves and result.refusal is None:
+            logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))
+            self.changed.set()
+        return enveloped(verb.name, result.result)
 
     def authorize(self, command: Command, arguments: Arguments) -> None:
         """Refuse a motion of a caller that may not move the robot, and a policy that callers may not ask for."""
@@ -177,8 +199,8 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     def _status(self, arguments: Arguments) -> object:
         """The robot's status with its lockouts and the dead-man check-in."""
-        run = self.verbs["getStatus"].run
-        answer = run(self.robot, arguments) if run is not None else None
+        verb = self.verbs["getStatus"]
+        answer = verb.run(self.robot, arguments) if verb.run is not None else getattr(self.robot, verb.method)()
         if self.registration is None or not isinstance(answer, dict):
             return answer
         return {**answer, **self.registration.facts()}

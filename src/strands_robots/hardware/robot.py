@@ -14,7 +14,7 @@ from typing import Any, cast
 from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.identity import kind, stable_id
 from strands_robots.hardware.motors import joint_units, tells_temperature, temperatures
@@ -22,7 +22,16 @@ from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
 from strands_robots.recording.cameras import LazyFrames
-from strands_robots.safety.gate import MotionGate, MotionRefused, Permit, PermitVoidError, Waiting, answered
+from strands_robots.safety.gate import (
+    REFUSALS,
+    MotionGate,
+    MotionRefused,
+    Permit,
+    PermitVoidError,
+    Waiting,
+    answered,
+    refusal_envelope,
+)
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, halt_each
@@ -209,7 +218,6 @@ class HardwareRobot(TeleopMixin):
         """Tell ``observer`` of every task event until the returned callable is called."""
         return self.observers.subscribe(observer)
 
-    @answered
     def start_task(
         self,
         instruction: str,
@@ -223,12 +231,32 @@ class HardwareRobot(TeleopMixin):
         Args:
             instruction: what it shall do, 1 to 2000 characters.
             policy_provider: a registered policy, such as mock, remote or lerobot_local.
-            duration: seconds, above 0 up to a day.
+            duration: seconds, above 0 up to an hour.
             policy_port: port of the policy's server; 0 for the provider's own.
             policy: what that policy's constructor takes besides, ``control_frequency`` (Hz, at most the robot's rate)
                 and ``n_steps`` (actions after which it ends).
         """
-        task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+        try:
+            options = {"policy_port": policy_port, **policy}
+            chosen = rollout_options(instruction, duration, options, self.control_hz)
+            name = resolve_provider(policy_provider)
+            # Before the wait for the robot: a stop that comes while this waits, connects or loads is newer.
+            permit = self.gate.permit("start_task")
+            with self._waiting.until_begun(permit), self.starting:
+                permit.check()
+                self._stand_by()
+                self._free()
+                self._reconnect()
+                if not self._body.is_connected:
+                    raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
+                loaded = create_policy(name, **options)
+                permit.check()
+                task = self._task = Rollout(
+                    self._body, loaded, permit=permit, policy_name=name, observers=self.observers, **chosen
+                )
+                task.start()
+        except REFUSALS as refused:
+            return refusal_envelope("start_task", refused)
         return success(
             f"{self.tool_name_str} started: {task.instruction}",
             task_status="running",
@@ -247,7 +275,11 @@ class HardwareRobot(TeleopMixin):
         **policy: Any,
     ) -> Envelope:
         """The same, but wait for the end; an error when the policy failed or did not end in its time."""
-        task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+        with self.gate.asked_at(self.gate.asked()), self.starting:
+            started = self.start_task(instruction, policy_provider, duration, policy_port, **policy)
+            task = self._task
+        if is_error(started) or task is None:
+            return started
         if not task.join((task.duration or 0.0) + WIND_DOWN_S):
             task.request_stop()
             return error(f"The task was still running {WIND_DOWN_S:g} s after its time.", **self._task_fields())
@@ -358,32 +390,6 @@ class HardwareRobot(TeleopMixin):
             task.request_stop()
             ends["task"] = partial(task.ended_by, deadline)
         return ends | self.teleop_stops(deadline)
-
-    def _start(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
-        chosen = rollout_options(instruction, duration, options, self.control_hz)
-        name = resolve_provider(provider)
-        # Before the line for the robot: a stop that comes while this waits, connects or loads is newer.
-        permit = self.gate.permit("start_task")
-        with self._waiting.until_begun(permit), self.starting:
-            permit.check()
-            self._stand_by()
-            self._free()
-            self._reconnect()
-            if not self._body.is_connected:
-                raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
-            policy = create_policy(name, **options)
-            permit.check()
-            rollout = Rollout(
-                self._body,
-                policy,
-                permit=permit,
-                policy_name=name,
-                observers=self.observers,
-                **chosen,
-            )
-            self._task = rollout
-            rollout.start()
-            return rollout
 
     def _reconnect(self) -> None:
         """Whoever asks for a motion after the cable was out gets the robot back, if the port is."""

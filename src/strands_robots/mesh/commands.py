@@ -17,11 +17,12 @@ from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
-from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result
+from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.robot_verbs import PEER_VERBS, RobotStop, peer_stop_answer, run_to_end
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
+from strands_robots.serving.workers import ShareFullError
 from strands_robots.utils import ValidationError, shown
 
 logger = logging.getLogger(__name__)
@@ -147,9 +148,15 @@ class CommandReceiver:
         named = request.command.get("robot_name")
         asked = self._pipeline.pending.arrive(named if isinstance(named, str) else "")
         command = Command(verb, request.command, request.sender_id, asked, (request, sample))
-        # A ping reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
-        serve = self._pipeline.serve if verb.name == "ping" else self._pipeline.submit
-        serve(command, partial(self._answer, request, verb))
+        answered = partial(self._answer, request, verb)
+        if verb.name == "ping":
+            # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
+            self._pipeline.serve(command, answered)
+            return
+        try:
+            self._pipeline.share(verb).submit(partial(self._pipeline.serve, command, answered))
+        except ShareFullError:
+            answered(busy(command))
 
     def _verb_of(self, request: wire.Request) -> Verb | None:
         if not isinstance(request.command, dict):

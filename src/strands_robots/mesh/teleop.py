@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.serving.verbs import Arguments
-from strands_robots.serving.workers import POOL
+from strands_robots.serving.workers import UNBOUNDED
 
 STREAMS_MAX = 8
 JOIN_S = 2.0
@@ -73,7 +73,7 @@ class TeleopReceivers:
         with self._lock:
             ended = self._end(lambda key, each: not each.running)
         if ended:
-            POOL.submit(lambda: _joined(ended))
+            UNBOUNDED.submit(lambda: _joined(ended))
 
     def _end(self, chosen: Callable[[Key, InputReceiver], bool]) -> list[InputReceiver]:
         ended = [self._receivers.pop(key) for key, each in list(self._receivers.items()) if chosen(key, each)]

@@ -20,13 +20,11 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.base import Action, Policy, PolicyError, Ranges, checked_action, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.utils import ValidationError, number, text, whole
+from strands_robots.utils import duration as checked_duration
 
 logger = logging.getLogger(__name__)
 
 State = Literal["idle", "running", "completed", "stopped", "error"]
-
-DURATION_MAX_S = 86_400.0
-"""Longest rollout: a day."""
 
 STEPS_MAX = 10_000_000
 """Most actions of one rollout."""
@@ -49,7 +47,7 @@ def rollout_options(instruction: object, duration: object, policy: dict[str, Any
 
     Args:
         instruction: the task, 1 to 2000 characters.
-        duration: seconds, above 0 up to :data:`DURATION_MAX_S`.
+        duration: seconds, above 0 up to :data:`~strands_robots.utils.DURATION_MAX_S`.
         policy: options of the policy. Those of the loop itself are taken out: ``control_frequency``, 0.1 to ``hz``,
             and ``n_steps``, 1 to 10,000,000.
         hz: the robot's own rate.
@@ -58,7 +56,7 @@ def rollout_options(instruction: object, duration: object, policy: dict[str, Any
         ValidationError: a value outside its domain.
     """
     task = text("instruction", instruction)
-    seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
+    seconds = checked_duration("duration", duration)
     whole("policy_port", policy.get("policy_port", 0), low=0, high=65535)
     rate = number("control_frequency", policy.pop("control_frequency", hz), low=min(0.1, hz), high=hz)
     steps = policy.pop("n_steps", None)
@@ -191,6 +189,8 @@ class Rollout:
         self._started_at: float | None = None
         self._ended_at: float | None = None
         self._thread = threading.Thread(target=self.run, name=f"rollout-{body.name}", daemon=True)
+        self.start = self._thread.start
+        """Run on the rollout's own thread; returns at once."""
 
     @property
     def robot(self) -> str:
@@ -218,11 +218,6 @@ class Rollout:
             "step": self.step_count,
             "elapsed_s": round(self.elapsed_s, 3),
         }
-
-    def start(self) -> None:
-        """Run on the rollout's own thread; returns at once."""
-        self.state = "running"
-        self._thread.start()
 
     def join(self, timeout: float | None = None) -> bool:
         """Wait for the end and return True when the loop has ended."""

@@ -40,6 +40,19 @@ class PermitVoidError(RuntimeError):
     """The permit was void when the write came: the motion was stopped in between, and nothing was written."""
 
 
+REFUSALS = (MotionRefused, PermitVoidError, ValidationError, MissingExtraError)
+"""The exceptions by which a robot refuses a verb."""
+
+
+def refusal_envelope(verb: str, refused: Exception) -> Envelope:
+    """Return the answer to a verb that raised one of :data:`REFUSALS`."""
+    if isinstance(refused, MotionRefused):
+        return refused.envelope
+    return error(
+        f"{verb} was overtaken by a stop: {refused}." if isinstance(refused, PermitVoidError) else str(refused)
+    )
+
+
 def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
     """Answer a refusal that ``verb`` raises with its envelope."""
 
@@ -47,12 +60,8 @@ def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
     def answering(*args: P.args, **kwargs: P.kwargs) -> Envelope:
         try:
             return verb(*args, **kwargs)
-        except MotionRefused as refused:
-            return refused.envelope
-        except PermitVoidError as void:
-            return error(f"{verb.__name__} was overtaken by a stop: {void}.")
-        except (ValidationError, MissingExtraError) as refused:
-            return error(str(refused))
+        except REFUSALS as refused:
+            return refusal_envelope(verb.__name__, refused)
 
     return answering
 

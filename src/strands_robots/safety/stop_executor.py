@@ -367,12 +367,19 @@ class StopExecutor:
             self._watcher = watcher
 
     def _refill(self) -> None:
-        while self._idle < RESERVE:
-            name = f"halt-reserve-{next(self._numbers)}"
-            thread = threading.Thread(target=self._work_in_reserve, name=name, daemon=True)
-            self._start_thread(thread)
+        while True:
+            # Counted first: a thread that has served a target meanwhile must not stay as one too many.
             with self._counting:
+                if self._idle >= RESERVE:
+                    return
                 self._idle += 1
+            name = f"halt-reserve-{next(self._numbers)}"
+            try:
+                self._start_thread(threading.Thread(target=self._work_in_reserve, name=name, daemon=True))
+            except BaseException:
+                with self._counting:
+                    self._idle -= 1
+                raise
 
     def _watch(self) -> None:
         """Answer for every halt that misses its deadline, and keep the reserve full. Never on a stop's way."""

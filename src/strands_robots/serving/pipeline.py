@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -23,7 +22,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
 from strands_robots.serving.verbs import Arguments, Kind, Verb
-from strands_robots.serving.workers import Share, ShareFullError, Shares, shares_of
+from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
@@ -80,6 +79,13 @@ class Result:
 
     result: Any
     refusal: Refused | None = None
+
+
+def busy(command: Command) -> Result:
+    """Return the answer to a command for which no thread of the robot is left."""
+    text = f"{command.verb.name} refused: the robot has not yet answered earlier calls; try again later."
+    refused = Refused(RefusalReason.BUSY, text, reason="busy")
+    return Result(refused.envelope, refused)
 
 
 Authorize = Callable[[Command, Arguments], None]
@@ -168,17 +174,11 @@ class Pipeline:
         parts.setdefault("shares", Shares() if robot is None else shares_of(robot))
         return cls(robot, peer_id, **parts)
 
-    def submit(self, command: Command, answered: Answered) -> None:
-        """Serve ``command`` on a thread of the robot; returns at once.
-
-        Where as many commands of its kind as may wait are waiting, it is answered as busy on this thread.
-        """
-        try:
-            self._share(command.verb).submit(partial(self.serve, command, answered))
-        except ShareFullError:
-            text = f"{command.verb.name} refused: the robot has not yet answered earlier calls; try again later."
-            refused = Refused(RefusalReason.BUSY, text, reason="busy")
-            answered(Result(refused.envelope, refused))
+    def share(self, verb: Verb) -> Share:
+        """Return the threads for a verb. A motion may keep its thread while it lasts; nothing else waits for that."""
+        if verb.kind is Kind.RESUME:
+            return self.shares.resume
+        return self.shares.motion if verb.kind is Kind.MOTION else self.shares.read
 
     def serve(self, command: Command, answered: Answered) -> None:
         """Carry ``command`` out on this thread and hand its answer to ``answered``."""
@@ -193,7 +193,14 @@ class Pipeline:
             with self.pending.serving(command.asked):
                 if verb.kind is Kind.MOTION:
                     claim = self._claim(verb)
-                result = self._carry_out(verb)(arguments)
+                if verb.name in self.own:
+                    result = self.own[verb.name](arguments)
+                elif self.robot is None:
+                    result = error(f"{verb.name}: no robot is registered on this peer.")
+                elif verb.run is not None:
+                    result = verb.run(self.robot, arguments)
+                else:
+                    result = getattr(self.robot, verb.method)(**arguments)
         except Refused as refused:
             refusal, result = refused, refused.envelope
         except (ValidationError, MotionRefused) as exc:
@@ -225,12 +232,6 @@ class Pipeline:
             self._changed.wait_for(lambda: not self._serving, timeout)
             return list(self._serving)
 
-    def _share(self, verb: Verb) -> Share:
-        """A motion may hold its thread while it lasts; no read and no resume ever waits for that."""
-        if verb.kind is Kind.RESUME:
-            return self.shares.resume
-        return self.shares.motion if verb.kind is Kind.MOTION else self.shares.read
-
     def _checked(self, command: Command) -> dict[str, Any]:
         if self._closed:
             raise Refused(
@@ -256,13 +257,3 @@ class Pipeline:
             text = Approval.refusal(verb.name, self.peer_id())
             raise Refused(RefusalReason.APPROVAL, text, reason="the operator has not approved it")
         return claim
-
-    def _carry_out(self, verb: Verb) -> Own:
-        own = self.own.get(verb.name)
-        if own is not None:
-            return own
-        if self.robot is None:
-            return lambda arguments: error(f"{verb.name}: no robot is registered on this peer.")
-        if verb.run is None:
-            raise Refused(RefusalReason.FAILED, f"{verb.name} is not served here.")
-        return partial(verb.run, self.robot)

@@ -31,7 +31,6 @@ from strands_robots.serving.verbs import (
     Parameter,
     Verb,
     between,
-    calls,
     table,
 )
 from strands_robots.utils import ValidationError, identifier, number, port, shown
@@ -265,14 +264,14 @@ GET_FEATURES = Verb(
     Kind.READ,
     "Read what the robot senses and what it can be told: its observation and action features.",
     returns="observation_features, action_features",
-    run=calls("get_features"),
+    method="get_features",
 )
 GET_STATE = Verb(
     "getState",
     Kind.READ,
     "Read joint positions by name, in the robot's own units, and the task.",
     returns="joints, joints_age_s, task",
-    run=calls("get_state"),
+    method="get_state",
 )
 ARM_VERBS = table(
     [
@@ -282,7 +281,7 @@ ARM_VERBS = table(
             "Start a task on the robot and return at once; follow it with getStatus or the taskComplete event.",
             (INSTRUCTION, POLICY_PROVIDER, DURATION, POLICY_PORT),
             returns="task_status",
-            run=calls("start_task"),
+            method="start_task",
         ),
         Verb(
             "stop",
@@ -296,7 +295,7 @@ ARM_VERBS = table(
             Kind.READ,
             "Read what the robot is doing: task state, instruction and steps so far.",
             returns="task_status, instruction, step_count, duration, locked, lockout, check_in",
-            run=calls("get_task_status"),
+            method="get_task_status",
         ),
         GET_FEATURES,
         GET_STATE,
@@ -324,9 +323,9 @@ WORLD_VERBS = table(
             Kind.READ,
             "Read simulated time, physics steps, joints of every robot and the policies that run.",
             returns="sim_time, step_count, robots, running_policies, locked, lockout, check_in",
-            run=calls("get_state"),
+            method="get_state",
         ),
-        Verb("getFeatures", Kind.READ, "Read joints, actuators and cameras by robot.", run=calls("get_features")),
+        Verb("getFeatures", Kind.READ, "Read joints, actuators and cameras by robot.", method="get_features"),
         Verb(
             "step",
             Kind.MOTION,
@@ -376,16 +375,16 @@ _PEER_ASSERTION = _optional("assertion", dict, ASSERTION.meaning, ASSERTION.chec
 _DEVICE = _optional("device_name", str, "The leader's device; leader where left out", identifier)
 
 
-def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter, ...] = (), run: Any = None) -> Verb:
-    return Verb(name, kind, summary, parameters, run=run, drops_unknown=True)
+def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter, ...] = (), **carried_out: Any) -> Verb:
+    return Verb(name, kind, summary, parameters, drops_unknown=True, **carried_out)
 
 
 PEER_VERBS = table(
     [
         _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", run=_status),
         _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
-        _peer_verb("features", Kind.READ, GET_FEATURES.summary, run=calls("get_features")),
-        _peer_verb("state", Kind.READ, GET_STATE.summary, run=calls("get_state")),
+        _peer_verb("features", Kind.READ, GET_FEATURES.summary, method="get_features"),
+        _peer_verb("state", Kind.READ, GET_STATE.summary, method="get_state"),
         _peer_verb("execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY),
         _peer_verb("start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start),
         _peer_verb(

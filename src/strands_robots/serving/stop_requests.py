@@ -16,7 +16,7 @@ from functools import partial
 from strands_robots.contract import Haltable
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.workers import POOL
+from strands_robots.serving.workers import UNBOUNDED
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ class StopRequests:
             self._verdicts.append((halted.result(), request))
             begin, self._answering = not self._answering, True
         if begin:
-            POOL.submit(self._answer_all)
+            UNBOUNDED.submit(self._answer_all)
 
     def _answer_all(self) -> None:
         while True:

@@ -64,7 +64,8 @@ class Verb:
 
     Attributes:
         summary: one sentence for callers; with ``returns`` it is the description that agents read.
-        run: the robot method; None for a verb that the network's peer answers itself.
+        method: the robot's method that carries the verb out, with the verb's arguments as its own.
+        run: a function in place of it, where the arguments differ. A verb with neither is the network peer's own.
         critical: False for a motion that no bystander has to fear.
         drops_unknown: arguments that it does not have, or that are None, are left out instead of refused, and an
             optional one that was not given stays out: the mesh's wire has it so.
@@ -75,6 +76,7 @@ class Verb:
     summary: str
     parameters: tuple[Parameter, ...] = ()
     returns: str = ""
+    method: str = ""
     run: Run | None = None
     critical: bool = True
     drops_unknown: bool = False
@@ -109,15 +111,6 @@ class Verb:
             for each in self.parameters
         }
         return {name: value for name, value in arguments.items() if value is not None or not self.drops_unknown}
-
-
-def calls(method: str) -> Run:
-    """Carry a verb out by the robot's method of this name, with the checked arguments as its own."""
-
-    def run(robot: Any, arguments: Arguments) -> object:
-        return getattr(robot, method)(**arguments)
-
-    return run
 
 
 def table(verbs: Sequence[Verb]) -> dict[str, Verb]:

@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import logging
 import queue
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -39,48 +40,43 @@ class ShareFullError(StrandsRobotsError, RuntimeError):
 
 
 class WorkerPool:
-    """Daemon threads that appear when no idle one is left and end after ``idle_s`` without work."""
+    """Daemon threads that appear when no idle one is left and end after ``idle_s`` without work.
+
+    Work comes to them by a :class:`Share`.
+    """
 
     def __init__(self, idle_s: float = 2.0) -> None:
         self._idle_s = idle_s
-        self._jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[Job, Share]] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._free = 0
+        self._idle = 0
 
     @property
     def idle(self) -> int:
         """Threads without work."""
-        return self._free
+        return self._idle
 
-    def submit(self, job: Job) -> None:
-        """Run ``job``, which may not raise, at once on some thread."""
-        with self._lock:
-            if self._free:
-                self._free -= 1
-                self._jobs.put(job)
-                return
-        thread = threading.Thread(target=self._work, args=(job,), name="robot-call", daemon=True)
-        try:
-            thread.start()
-        except RuntimeError:
-            # The interpreter is ending and starts no more threads.
-            job()
-
-    def _work(self, job: Job) -> None:
+    def _work(self, job: Job, share: Share) -> None:
         while True:
-            job()
+            due: Job | None = job
+            while due is not None:
+                try:
+                    due()
+                except Exception:
+                    logger.exception("A robot call failed outside its verb.")
+                due = share._next()
             del job
             with self._lock:
-                self._free += 1
+                self._idle += 1
             try:
-                job = self._jobs.get(timeout=self._idle_s)
+                job, share = self._jobs.get(timeout=self._idle_s)
             except queue.Empty:
                 with self._lock:
                     # A job that was put between the timeout and here counted on this thread.
-                    if self._free:
-                        self._free -= 1
+                    if self._idle:
+                        self._idle -= 1
                         return
-                job = self._jobs.get()
+                job, share = self._jobs.get()
 
 
 POOL = WorkerPool()
@@ -115,7 +111,18 @@ class Share:
                 self._waiting.append(job)
                 return
             self._running += 1
-        self._pool.submit(partial(self._work, job))
+        pool = self._pool
+        with pool._lock:
+            if pool._idle:
+                pool._idle -= 1
+                pool._jobs.put((job, self))
+                return
+        thread = threading.Thread(target=pool._work, args=(job, self), name="robot-call", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:
+            # The interpreter is ending and starts no more threads.
+            job()
 
     def call(self, call: Callable[[], T]) -> Future[T]:
         """Run ``call`` likewise; the future has what it returns or raises.
@@ -127,17 +134,17 @@ class Share:
         self.submit(partial(_settle, done, call))
         return done
 
-    def _work(self, job: Job) -> None:
-        while True:
-            try:
-                job()
-            except Exception:
-                logger.exception("A robot call failed outside its verb.")
-            with self._lock:
-                if not self._waiting:
-                    self._running -= 1
-                    return
-                job = self._waiting.popleft()
+    def _next(self) -> Job | None:
+        """Return the call whose turn it is on the calling thread, which has ended one; None gives the turn back."""
+        with self._lock:
+            if self._waiting:
+                return self._waiting.popleft()
+            self._running -= 1
+            return None
+
+
+UNBOUNDED = Share(sys.maxsize)
+"""Work of the process itself, which belongs to no robot."""
 
 
 class Shares:

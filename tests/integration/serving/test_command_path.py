@@ -1,0 +1,24 @@
+"""The way of ``execute`` to the device of a real arm, hop by hop, is the one in docs/architecture.md."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from fixtures.call_path import documented
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_execute_takes_the_documented_way_of_at_most_twelve_hops() -> None:
+    may = {"DEVICE_CONNECT_RPC_ALLOW": "*", "BYPASS_TOOL_CONSENT": "true"}
+    traced = [sys.executable, "-m", "fixtures.traced_execute"]
+    told = subprocess.run(
+        traced, cwd=ROOT, env={**os.environ, **may}, capture_output=True, text=True, timeout=100, check=False
+    )
+    assert told.returncode == 0, told.stderr
+    way = told.stdout.split()
+    assert way == documented(ROOT / "docs" / "architecture.md", "command-path")
+    assert len(way) <= 12
