@@ -62,7 +62,7 @@ _declare(
         "list",
         "",
         "Callers that may move a robot: globs; '*' any named caller; 'anonymous' the unnamed. "
-        "Unset: anyone may move a simulation, nobody may move real hardware.",
+        "Unset: anyone may move a simulation, no one may move real hardware.",
     ),
     Setting(
         "DEVICE_CONNECT_ESTOP_ALLOW",
