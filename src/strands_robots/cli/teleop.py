@@ -35,7 +35,7 @@ from strands_robots.utils import ValidationError, identifier
 
 if TYPE_CHECKING:
     from strands_robots.hardware import LeaderArm
-    from strands_robots.hardware.calibrating import Reach
+    from strands_robots.hardware.calibration import JointReach
 
 _NAME = "leader"
 _MANUAL = ("keyboard", "gamepad")
@@ -116,11 +116,11 @@ def calibrate(
     leader: Annotated[bool, typer.Option("--leader", help="It is a leader arm.")] = False,
 ) -> None:
     """Measure an arm's middle and the ends of its joints, moved by hand. Its torque goes off: hold it."""
-    from strands_robots.hardware.calibrating import Calibrating  # noqa: PLC0415 - real arms only
+    from strands_robots.hardware.calibration import Calibrator  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
 
     made = make_device(arm, _arm_options(port, device, None), "leader" if leader else "follower", calibrated=False)
-    steps = Calibrating(made)
+    steps = Calibrator(made)
     try:
         steps.begin()
         screen.say("The torque is off. Move every joint to the middle of its motion, then press Enter.")
@@ -316,7 +316,7 @@ def _enter_pressed() -> threading.Event:
     return pressed
 
 
-def _draw_reaches(screen: Screen, reaches: dict[str, Reach]) -> None:
+def _draw_reaches(screen: Screen, reaches: dict[str, JointReach]) -> None:
     if screen.live:
         rows = [(motor, each.low, each.present, each.high) for motor, each in reaches.items()]
         screen.out.control(Control.move(0, -(len(rows) + 3)) if rows else Control())

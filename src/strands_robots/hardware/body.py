@@ -12,7 +12,7 @@ from typing import Any, Literal
 from strands_robots.bus_access import action_ranges, bus_lock, read_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
-from strands_robots.hardware.ports import require_port
+from strands_robots.hardware.device_facts import require_port
 from strands_robots.policies.base import Action, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.utils import ValidationError, number, shown

@@ -1,4 +1,4 @@
-"""The calibration of an arm of bus servos: given, or read from LeRobot's file, never asked for at a prompt.
+"""The calibration of an arm of bus servos: read from a file, written into the servos, or made by hand.
 
 A servo counts 4096 steps a turn. Its homing offset puts the middle of the joint's motion at 2047, and its range is
 where the joint ends. LeRobot keeps both in a file by the arm's id, the servos keep them in their own memory, and
@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from strands_robots.hardware._compat import lerobot_module
+from strands_robots.hardware._compat import forget_input, lerobot_module
 from strands_robots.utils import ValidationError, mapping, shown, whole
 
 logger = logging.getLogger(__name__)
@@ -56,7 +57,7 @@ def calibrate_from(device: Any, given: object, *, name: str, role: str) -> None:
 
 
 def checked_calibration(content: object, motors: Mapping[str, int]) -> dict[str, dict[str, int]]:
-    """``content`` as LeRobot writes it, checked against the ``motors`` (servo id by name) it is for.
+    """Return ``content`` as LeRobot writes it, checked against the ``motors`` (servo id by name) it is for.
 
     Raises:
         ValidationError: another arm's motors, or a number outside its domain.
@@ -114,3 +115,112 @@ def _content(given: object) -> object:
         raise ValidationError(f"calibration {shown(str(given))} cannot be read: {exc.strerror}.") from exc
     except ValueError as exc:
         raise ValidationError(f"calibration {shown(str(given))} is no JSON: {exc}.") from exc
+
+
+FULL_TURN = ("wrist_roll",)
+"""Joints without ends: their range is the whole turn."""
+
+_POSITION_MODE = 0
+
+
+@dataclass(frozen=True, slots=True)
+class JointReach:
+    """Range over which one joint was moved so far, in encoder counts."""
+
+    low: int
+    present: int
+    high: int
+
+
+LOOK_TRIES = 5
+"""How often joints are asked for before the calibration is given up; LeRobot waits 50 ms for each answer."""
+
+
+class Calibrator:
+    """One calibration of a LeRobot device with one motor bus, a step at a time.
+
+    Args:
+        device: a follower or leader, not connected. Its torque goes off: an arm falls.
+
+    Raises:
+        ValidationError: a device without a motor bus.
+    """
+
+    def __init__(self, device: Any) -> None:
+        bus: Any = getattr(device, "bus", None)
+        if not callable(getattr(bus, "set_half_turn_homings", None)):
+            raise ValidationError(f"{device} has no motor bus that is calibrated.")
+        self._device, self._bus = device, bus
+        self._offsets: dict[str, int] = {}
+        self._reaches: dict[str, JointReach] = {}
+
+    def begin(self) -> None:
+        """Connect and let go of the joints. Raises what the bus raises."""
+        self._bus.connect()
+        self._bus.disable_torque()
+        for motor in self._bus.motors:
+            self._bus.write("Operating_Mode", motor, _POSITION_MODE)
+
+    def centre(self) -> None:
+        """Take the present position of every joint as the middle of its motion."""
+        self._offsets = {motor: int(offset) for motor, offset in self._bus.set_half_turn_homings().items()}
+        self._reaches = {}
+
+    def look(self) -> dict[str, JointReach]:
+        """Read the joints once; return the reach of each since :meth:`centre`. Raises what the bus raises."""
+        for motor, position in self._positions().items():
+            at = int(position)
+            known = self._reaches.get(motor, JointReach(at, at, at))
+            self._reaches[motor] = JointReach(min(known.low, at), at, max(known.high, at))
+        return dict(self._reaches)
+
+    def watch(self, done: Callable[[], bool], report: Callable[[dict[str, JointReach]], None]) -> None:
+        """Report :meth:`look` until ``done``."""
+        while not done():
+            report(self.look())
+
+    def finish(self) -> Path:
+        """Write the calibration into the servos and into LeRobot's file of the device's id, and disconnect.
+
+        Returns:
+            The file.
+
+        Raises:
+            ValidationError: joints that were not moved, by name.
+        """
+        still = [motor for motor, reach in self._reaches.items() if reach.low >= reach.high]
+        if still or not self._reaches:
+            raise ValidationError(f"these joints were not moved: {', '.join(still) or 'none was'}.")
+        content = {motor: self._entry(motor, each.id) for motor, each in self._bus.motors.items()}
+        calibrate_from(self._device, content, name=str(self._device), role="")
+        self._bus.write_calibration(self._device.calibration)
+        path = Path(self._device.calibration_fpath)
+        path.write_text(json.dumps(content, indent=4), encoding="utf-8")
+        return path
+
+    def close(self) -> None:
+        """Disconnect; the torque stays off."""
+        if self._bus.is_connected:
+            self._bus.disconnect(disable_torque=False)
+
+    def _positions(self) -> dict[str, Any]:
+        """Read the positions again after a lost answer, which must not throw away a calibration by hand."""
+        motors = [motor for motor in self._bus.motors if motor not in FULL_TURN]
+        for left in reversed(range(LOOK_TRIES)):
+            forget_input(self._device)
+            try:
+                return dict(self._bus.sync_read("Present_Position", motors, normalize=False))
+            except ConnectionError:
+                if not left:
+                    raise
+        raise AssertionError  # the last try returns or raises
+
+    def _entry(self, motor: str, number: int) -> dict[str, int]:
+        reach = JointReach(0, 0, COUNTS - 1) if motor in FULL_TURN else self._reaches[motor]
+        return {
+            "id": number,
+            "drive_mode": 0,
+            "homing_offset": self._offsets[motor],
+            "range_min": reach.low,
+            "range_max": reach.high,
+        }

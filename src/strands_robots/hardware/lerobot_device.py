@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from strands_robots.hardware._compat import lerobot_module, light
 from strands_robots.hardware.calibration import calibrate_from
-from strands_robots.hardware.ports import check_port
+from strands_robots.hardware.device_facts import check_port
 from strands_robots.utils import ValidationError, mapping, missing_extra, shown
 
 logger = logging.getLogger(__name__)

@@ -16,8 +16,7 @@ from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
-from strands_robots.hardware.identity import kind, stable_id
-from strands_robots.hardware.motors import joint_units, tells_temperature, temperatures
+from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
 from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
@@ -159,7 +158,7 @@ class HardwareRobot(TeleopMixin):
 
     def get_health(self) -> Envelope:
         """``temps``, degrees Celsius by motor, where the motors tell; the read waits for the bus a control period."""
-        if not self._body.is_connected or self._body.lost or not tells_temperature(self.device):
+        if not self._body.is_connected or self._body.lost or not has_temperatures(self.device):
             return success("Nothing is known of its motors' health.")
         if not self._body.lock.acquire(timeout=1 / self.control_hz):
             return error("The bus was busy; the motors' temperatures are not known now.")

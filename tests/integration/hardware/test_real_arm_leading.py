@@ -18,7 +18,7 @@ from fixtures.waiting import eventually
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
-from strands_robots.hardware.calibrating import Calibrating, Reach
+from strands_robots.hardware.calibration import Calibrator, JointReach
 from strands_robots.hardware.lerobot_device import make_device
 from strands_robots.utils import ValidationError
 
@@ -76,13 +76,13 @@ def follower(fresh: FeetechBus, tmp_path: Path) -> Any:
 
 
 def test_an_arm_is_calibrated_by_moving_it(fresh: FeetechBus, tmp_path: Path) -> None:
-    steps = Calibrating(follower(fresh, tmp_path))
+    steps = Calibrator(follower(fresh, tmp_path))
     steps.begin()
     assert not any(servo.torque for servo in fresh.servos.values())
     for number, servo in fresh.servos.items():
         servo.shaft = 2000.0 + 10 * number
     steps.centre()
-    seen: dict[str, Reach] = {}
+    seen: dict[str, JointReach] = {}
     for move in (-900, 800):
         for servo in fresh.servos.values():
             servo.shaft += move
@@ -110,7 +110,7 @@ def test_an_arm_is_calibrated_by_moving_it(fresh: FeetechBus, tmp_path: Path) ->
 
 
 def test_joints_that_were_not_moved_are_named_and_nothing_is_kept(fresh: FeetechBus, tmp_path: Path) -> None:
-    steps = Calibrating(follower(fresh, tmp_path))
+    steps = Calibrator(follower(fresh, tmp_path))
     steps.begin()
     steps.centre()
     fresh.servos[1].shaft += 5

@@ -1,15 +1,96 @@
-"""What a real robot tells of its motors: units and temperatures where they are known, nothing where they are not."""
+"""Ports, identity, joint units and temperatures of a real robot."""
 
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
+from strands_robots.hardware.device_facts import check_port, require_port, serial_ports, stable_id
+from strands_robots.utils import ValidationError
+
+
+def test_ports_with_names_of_their_own_are_given_by_these(tmp_path: Path) -> None:
+    assert serial_ports(tmp_path) == []
+    for name in ("ttyACM1", "ttyACM0", "ttyUSB0", "ttyS0"):
+        (tmp_path / name).touch()
+    assert serial_ports(tmp_path) == [str(tmp_path / "ttyACM0"), str(tmp_path / "ttyACM1")]
+    named = tmp_path / "serial" / "by-id" / "usb-1a86_58FD-if00"
+    named.parent.mkdir(parents=True)
+    named.touch()
+    assert serial_ports(tmp_path) == [str(named)]
+
+
+def test_a_port_is_needed_only_where_the_robot_says_so() -> None:
+    check_port("so101", "/dev/ttyACM0", needed=True)
+    check_port("so101", None, needed=False)
+    for port in (None, "", "  ", 5, True):
+        with pytest.raises(ValidationError, match="so101 needs port"):
+            check_port("so101", port, needed=True)
+
+
+def test_a_path_with_nothing_there_is_named(tmp_path: Path) -> None:
+    (tmp_path / "arm").touch()
+    for fine in (str(tmp_path / "arm"), "COM3", 50065, None):
+        require_port(SimpleNamespace(config=SimpleNamespace(port=fine)))
+    require_port(object())
+    with pytest.raises(ConnectionError, match=r"the port .*/leg is not there"):
+        require_port(SimpleNamespace(config=SimpleNamespace(port=str(tmp_path / "leg"))))
+
+
+def device(**config: Any) -> Any:
+    return SimpleNamespace(id=config.get("id"), config=SimpleNamespace(**config))
+
+
+@pytest.fixture
+def by_id(tmp_path: Path) -> Path:
+    folder = tmp_path / "by-id"
+    folder.mkdir()
+    (tmp_path / "ttyACM0").touch()
+    (folder / "usb-1a86_5A46083062-if00").symlink_to(tmp_path / "ttyACM0")
+    return folder
+
+
+def test_a_serial_adapter_is_known_wherever_it_is_plugged_in(by_id: Path) -> None:
+    adapter = "usb-1a86_5A46083062-if00"
+    assert stable_id(device(port=str(by_id.parent / "ttyACM0"), id="left"), by_id) == adapter
+    assert stable_id(device(port=str(by_id / adapter)), by_id) == adapter
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        ({"remote_ip": "10.0.0.7", "id": "base"}, "10.0.0.7"),
+        ({"port": "/dev/ttyS9", "id": "left"}, "left@/dev/ttyS9"),
+        ({"port": "/dev/ttyS9"}, "/dev/ttyS9"),
+        ({"id": "left"}, "left"),
+        ({}, None),
+        ({"id": " ", "port": 3}, None),
+    ],
+)
+def test_else_it_is_the_host_or_the_calibration_id(by_id: Path, config: dict[str, Any], expected: str | None) -> None:
+    assert stable_id(device(**config), by_id) == expected
+
+
+def test_a_machine_without_serial_ports_is_no_error(tmp_path: Path) -> None:
+    assert stable_id(device(port="/dev/ttyS9", id="left"), tmp_path / "nowhere") == "left@/dev/ttyS9"
+
+
+def test_a_robot_has_the_key_of_its_hardware_whatever_it_is_called() -> None:
+    keys = set()
+    for name in ("arm-1", "arm-2"):
+        arm = RecordingDevice()
+        arm.config = SimpleNamespace(id="left", port="/dev/ttyS9")  # type: ignore[attr-defined]  # as LeRobot has it
+        keys.add(HardwareRobot(arm, name).safety_key)
+    assert keys == {"hardware:recorder:left@/dev/ttyS9"}
+    assert not HardwareRobot(RecordingDevice(), "arm").safety_key
+
 
 MODES = {"pan": "RANGE_M100_100", "lift": "DEGREES", "grip": "RANGE_0_100"}
 

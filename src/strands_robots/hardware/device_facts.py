@@ -1,0 +1,153 @@
+"""Port, identity, joint units and temperatures of a LeRobot device."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from strands_robots.bus_access import joint_read_source
+from strands_robots.hardware._compat import forget_input
+from strands_robots.utils import ValidationError, shown
+
+_PATTERNS = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "tty.usbmodem*", "tty.usbserial*")
+"""Paths of USB serial adapters on Linux, by their own names first, and on macOS."""
+
+_PORTS_SHOWN = 8
+
+
+def serial_ports(dev: Path = Path("/dev")) -> list[str]:
+    """Return the USB serial ports of this machine, by their own names where they have any."""
+    for pattern in _PATTERNS:
+        found = sorted(str(path) for path in dev.glob(pattern))
+        if found:
+            return found
+    return []
+
+
+def check_port(name: str, port: object, *, needed: bool) -> None:
+    """Check that an option is a serial port.
+
+    Raises:
+        ValidationError: no text, or nothing where the robot needs a port.
+    """
+    if port is None and not needed:
+        return
+    if not isinstance(port, str) or not port.strip():
+        given = "" if port is None else f", not {shown(port)}"
+        raise ValidationError(f"{name} needs port, its serial port, such as /dev/ttyACM0{given}; {_here()}.")
+
+
+def require_port(device: Any) -> None:
+    """Check that the port of a device is on this machine.
+
+    Raises:
+        ConnectionError: its ``config.port`` is a path with nothing there.
+    """
+    port = getattr(getattr(device, "config", None), "port", None)
+    if isinstance(port, str) and port.startswith("/") and not Path(port).exists():
+        raise ConnectionError(f"the port {port} is not there; {_here()}")
+
+
+def _here() -> str:
+    found = serial_ports()
+    return f"connected here: {', '.join(found[:_PORTS_SHOWN])}" if found else "no USB serial port is connected here"
+
+
+BY_ID = Path("/dev/serial/by-id")
+"""Where Linux names serial ports by the make and serial number of their adapter."""
+
+_HOSTS = ("remote_ip", "robot_ip", "ip_address", "host", "ip")
+
+
+def stable_id(device: Any, by_id: Path = BY_ID) -> str | None:
+    """Return the serial adapter's own id, else the device's host, else its calibration id; None where it has none.
+
+    A calibration id goes with its port: two arms of one type may share it. A port without an id of its own keeps its
+    name until it is plugged in elsewhere.
+    """
+    config = getattr(device, "config", None)
+    port = _word(config, "port")
+    if port:
+        named = _adapter(port, by_id)
+        if named:
+            return named
+    host = next((word for word in (_word(config, name) for name in _HOSTS) if word), "")
+    if host:
+        return host
+    parts = [_word(device, "id") or _word(config, "id"), port]
+    return "@".join(part for part in parts if part) or None
+
+
+def kind(device: Any) -> str:
+    """Return the device's type: LeRobot's name of it, else that of its class."""
+    return _word(device, "name") or type(device).__name__
+
+
+def _adapter(port: str, by_id: Path) -> str:
+    if Path(port).parent == by_id:
+        return Path(port).name
+    target = os.path.realpath(port)
+    # Without such a folder, or with one that is not to be read, no adapter has a name.
+    with contextlib.suppress(OSError):
+        for link in sorted(by_id.iterdir()):
+            if os.path.realpath(link) == target:
+                return link.name
+    return ""
+
+
+def _word(owner: Any, name: str) -> str:
+    value = getattr(owner, name, None)
+    return value.strip() if isinstance(value, str) else ""
+
+
+UNITS = {"RANGE_M100_100": "normalized", "RANGE_0_100": "percent", "DEGREES": "degrees"}
+"""Our name for each of LeRobot's ``MotorNormMode``: from -100 to 100, from 0 to 100, and degrees."""
+
+TEMPERATURE = "Present_Temperature"
+"""LeRobot's name of the register, degrees Celsius in Feetech's and Dynamixel's tables."""
+
+
+def joint_units(device: Any) -> dict[str, str]:
+    """Return the unit by action key: that of the device's own ``joint_units``, else that of its motor."""
+    own = getattr(device, "joint_units", None)
+    stated: Mapping[str, Any] = own if isinstance(own, Mapping) else {}
+    motors = _motors(device)
+    units: dict[str, str] = {}
+    for key in device.action_features:
+        motor = motors.get(str(key).removesuffix(".pos"))
+        mode = str(getattr(getattr(motor, "norm_mode", None), "name", ""))
+        unit = stated.get(key) or UNITS.get(mode)
+        if unit:
+            units[str(key)] = str(unit)
+    return units
+
+
+def has_temperatures(device: Any) -> bool:
+    """Return True when every motor of the device's one bus has the temperature register."""
+    bus = _bus(device)
+    tables = getattr(bus, "model_ctrl_table", None)
+    motors = _motors(device)
+    if not motors or not isinstance(tables, Mapping) or not callable(getattr(bus, "sync_read", None)):
+        return False
+    return all(TEMPERATURE in tables.get(getattr(motor, "model", None), ()) for motor in motors.values())
+
+
+def temperatures(device: Any) -> dict[str, float]:
+    """Read degrees Celsius by motor, in one exchange; the caller holds the bus. Raises what the device raises."""
+    # A late answer to an earlier read would be taken for this one's.
+    forget_input(device)
+    read = _bus(device).sync_read(TEMPERATURE, normalize=False)
+    return {str(motor): float(value) for motor, value in read.items()}
+
+
+def _bus(device: Any) -> Any:
+    source = joint_read_source(device)
+    return getattr(device if source is None else source, "bus", None)
+
+
+def _motors(device: Any) -> Mapping[str, Any]:
+    motors = getattr(_bus(device), "motors", None)
+    return motors if isinstance(motors, Mapping) else {}
