@@ -316,7 +316,7 @@ class ReachyDriver:
         """Send one frame, at most 0.3 rad and 10 mm from the last, and return it.
 
         Raises:
-            ValidationError: a key or value outside the envelope.
+            ValidationError: an unknown key, or a value outside its bounds.
             MotionRefused: halted, locked, not connected, or held by an application.
         """
         target = self.checked(from_action(action, self.motions.present()))

@@ -151,7 +151,7 @@ class RestClient:
             raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
 
     def close(self) -> None:
-        """Close the connections, each when its requests end; a later request opens new ones."""
+        """Close the connections, each after its requests; a request opens new ones."""
         pool = self._pool
         if pool is not None:
             self._retire(pool)
