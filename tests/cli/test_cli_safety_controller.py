@@ -20,6 +20,9 @@ from strands_robots.safety.lockout import Lockout
 class FakeController:
     """Records each stop and answers when the test allows it."""
 
+    controller_id = "safety-1"
+    link_up = True
+
     def __init__(self) -> None:
         self.ids: list[str] = []
         self.expected: list[Collection[str]] = []
@@ -108,13 +111,6 @@ def test_stop_is_repeated_until_no_robot_is_silent(controller: FakeController) -
     assert button.report.silent == ()
 
 
-class LinkedController:
-    """The part of a controller that the screen reads."""
-
-    controller_id = "safety-1"
-    link_up = True
-
-
 def drawn(fleet: FleetScreen, button: StopButton) -> str:
     out = Console(file=io.StringIO(), width=160, height=40)
     out.print(fleet.draw(button, ["ERROR something"]))
@@ -123,7 +119,7 @@ def drawn(fleet: FleetScreen, button: StopButton) -> str:
 
 
 def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake: Any = LinkedController()
+    fake: Any = FakeController()
     fleet, button = FleetScreen(fake, loopback_config(), 0.5), StopButton(fake, lambda: (), "")
     hold = Lockout("e" * 32, "desk-1", "a hand", 0.0)
     checked = {"check_in": {"required": True, "timeout_s": 2.0, "time_left_s": 1.25}}

@@ -27,11 +27,10 @@ def report(*answers: Answer, silent: tuple[str, ...] = (), link: bool = True) ->
 
 
 class FakeController:
-    controller_id = "safety-1"
-    link_up = True
+    """Answers every stop with one report."""
 
-    def __init__(self, ends: StopReport) -> None:
-        self.ends = ends
+    def __init__(self, stop_report: StopReport) -> None:
+        self.report = stop_report
         self.calls: list[tuple[Collection[str], str]] = []
 
     def wait_link(self, timeout: float) -> bool:
@@ -39,14 +38,14 @@ class FakeController:
 
     def stop(self, expected: Collection[str], reason: str, **more: Any) -> StopReport:
         self.calls.append((expected, reason))
-        return self.ends
+        return self.report
 
     def close(self) -> None:
         pass
 
 
 @pytest.mark.parametrize(
-    ("ends", "code", "printed"),
+    ("stop_report", "code", "printed"),
     [
         (report(answer("a")), 0, "stopped"),
         (report(answer("a"), answer("b", False, why="bus: no answer in 1 s")), 1, "DID NOT STOP"),
@@ -58,16 +57,16 @@ class FakeController:
     ],
 )
 def test_estop_names_each_robot_and_exits_with_the_worst(
-    run: Run, monkeypatch: pytest.MonkeyPatch, ends: StopReport, code: int, printed: str
+    run: Run, monkeypatch: pytest.MonkeyPatch, stop_report: StopReport, code: int, printed: str
 ) -> None:
-    fake = FakeController(ends)
+    fake = FakeController(stop_report)
     monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: fake)
     result = run("estop", "a", "b", "--reason", "a hand")
     assert result.exit_code == code
     assert printed in result.stdout
     assert fake.calls == [(["a", "b"], "a hand")]
     facts = json.loads(run("estop", "a", "--json").stdout)
-    assert facts["silent"] == list(ends.silent)
+    assert facts["silent"] == list(stop_report.silent)
     assert (facts["status"] == "success") is (code == 0)
 
 

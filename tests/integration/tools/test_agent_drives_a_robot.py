@@ -31,9 +31,9 @@ def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, patient_halts: None) 
         stop_device_connect(runtime)
 
 
-def results(*asked: dict[str, Any]) -> list[dict[str, Any]]:
-    """What the tool answered to each of an agent's uses of it, a turn each."""
-    model = ScriptedModel([*(("robot_mesh", each) for each in asked), "That is all."])
+def results(*calls: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the tool's answer to each call of an agent, one call a turn."""
+    model = ScriptedModel([*(("robot_mesh", each) for each in calls), "That is all."])
     agent = Agent(model=model, tools=[robot_mesh], callback_handler=None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -41,48 +41,48 @@ def results(*asked: dict[str, Any]) -> list[dict[str, Any]]:
     return [block["toolResult"] for message in agent.messages for block in message["content"] if "toolResult" in block]
 
 
-def test_an_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
-    told = results(
+def test_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
+    answers = results(
         {"action": "peers"},
         {"action": "tell", "target": "toys", "instruction": "wave", "duration": 300},
         {"action": "status", "target": "toys"},
         {"action": "stop", "target": "toys"},
     )
-    assert [each["status"] for each in told] == ["success"] * 4
-    assert "toys" in str(told[0]["content"])
-    assert "wave" in str(told[2]["content"])
+    assert [each["status"] for each in answers] == ["success"] * 4
+    assert "toys" in str(answers[0]["content"])
+    assert "wave" in str(answers[2]["content"])
     assert world.list_policies_running() == []
     assert world.writes
 
 
-def test_an_emergency_stop_halts_and_locks_every_robot_and_names_it(world: ToyWorld) -> None:
+def test_emergency_stop_halts_and_locks_every_robot_by_name(world: ToyWorld) -> None:
     wave = {"action": "tell", "target": "toys", "instruction": "wave", "duration": 300}
-    told = results(wave, {"action": "emergency_stop", "instruction": "smoke"}, wave)
-    assert told[1]["status"] == "success"
-    assert "toys" in str(told[1]["content"])
+    answers = results(wave, {"action": "emergency_stop", "instruction": "smoke"}, wave)
+    assert answers[1]["status"] == "success"
+    assert "toys" in str(answers[1]["content"])
     eventually(lambda: not world.list_policies_running(), what="the toy world stands still")
-    assert told[2]["status"] == "error"
-    assert "lock" in str(told[2]["content"])
+    assert answers[2]["status"] == "error"
+    assert "lock" in str(answers[2]["content"])
 
 
-def test_a_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None:
+def test_robot_that_does_not_stop_is_an_error_by_name(world: ToyWorld) -> None:
     world.start_policy("left", "wave", duration=300)
     world.stubborn = True
-    (told,) = results({"action": "stop"})
-    assert told["status"] == "error"
-    assert "DID NOT STOP: toys" in str(told["content"])
+    (answer,) = results({"action": "stop"})
+    assert answer["status"] == "error"
+    assert "DID NOT STOP: toys" in str(answer["content"])
 
 
-def test_an_emergency_stop_that_did_not_stop_a_robot_is_an_error_by_name(world: ToyWorld) -> None:
+def test_emergency_stop_that_fails_on_a_robot_is_an_error_by_name(world: ToyWorld) -> None:
     world.start_policy("left", "wave", duration=300)
     world.stubborn = True
-    (told,) = results({"action": "emergency_stop"})
-    assert told["status"] == "error"
-    assert "toys did not stop" in str(told["content"])
+    (answer,) = results({"action": "emergency_stop"})
+    assert answer["status"] == "error"
+    assert "toys did not stop" in str(answer["content"])
 
 
-def test_silence_is_an_error(world: ToyWorld) -> None:
-    asked = [{"action": action, "target": "nobody"} for action in ("stop", "status")]
-    for told in results(*asked):
-        assert told["status"] == "error"
-        assert "nobody" in str(told["content"])
+def test_silent_robot_is_an_error_by_name(world: ToyWorld) -> None:
+    calls = [{"action": action, "target": "no-such-robot"} for action in ("stop", "status")]
+    for answer in results(*calls):
+        assert answer["status"] == "error"
+        assert "no-such-robot" in str(answer["content"])
