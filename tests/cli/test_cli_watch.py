@@ -102,7 +102,6 @@ def test_joint_limits_are_read_from_simulation_and_robot() -> None:
     one = {"joints": {"pan": [-1, 1], "lift": None, "odd": [2, 1], "text": ["a", "b"]}}
     assert joint_limits(one) == {"pan": (-1.0, 1.0)}
     assert joint_limits({"robots": {"arm": one, "other": {}}}) == {"pan": (-1.0, 1.0)}
-    assert joint_limits({"robots": {"arm": one, "other": {"joints": {"x": [0, 2]}}}}, "other") == {"x": (0.0, 2.0)}
     assert joint_limits({"robots": "nonsense"}) == {}
 
 

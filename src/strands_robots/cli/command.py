@@ -19,8 +19,9 @@ from strands_robots.utils import MissingExtraError, ValidationError, shown
 
 Body = TypeVar("Body", bound=Callable[..., None])
 
-WAIT_OPTION = typer.Option("--timeout", help="Seconds to wait for an answer.")
-MESH_OPTION = typer.Option("--mesh", help="On the native mesh instead of Device Connect.")
+Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for an answer.")]
+OnMesh = Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")]
+Seconds = Annotated[float | None, typer.Option("--for", help="End after that many seconds.")]
 
 _JSON = Parameter(
     "machine",

@@ -9,11 +9,10 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from enum import Enum
+from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
 
 import typer
 
@@ -63,7 +62,7 @@ print("rendered with", BACKEND or "the default OpenGL")
 """
 
 
-class Mark(Enum):
+class Mark(StrEnum):
     """Severity of a finding; only ``broken`` is required and does not work."""
 
     OK = "ok"
@@ -81,10 +80,6 @@ class Finding:
     said: str
     remedy: str = ""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the finding for ``--json``."""
-        return {**asdict(self), "mark": self.mark.value}
-
 
 _STYLE = {Mark.OK: "green", Mark.NOTE: "cyan", Mark.WARN: "yellow", Mark.BROKEN: "bold red"}
 
@@ -98,14 +93,14 @@ def doctor(screen: Screen, network: Network) -> None:
     """Check what is installed and what works here; exit 1 when something required is broken."""
     findings = examine(network)
     broken = [finding.name for finding in findings if finding.mark is Mark.BROKEN]
-    rows = ((label(found.mark.value, _STYLE[found.mark]), found.name, found.said) for found in findings)
+    rows = ((label(found.mark, _STYLE[found.mark]), found.name, found.said) for found in findings)
     screen.show(table("", ("", "check", "found"), rows))
     remedies = [finding for finding in findings if finding.remedy]
     if remedies:
         screen.say("Remedies", "bold")
     for finding in remedies:
         screen.say(f"  {finding.name}: {finding.remedy}")
-    checks = [finding.as_dict() for finding in findings]
+    checks = [asdict(finding) for finding in findings]
     if broken:
         raise CliError(f"Required and broken: {', '.join(broken)}.", checks=checks)
     screen.data({"status": "success", "checks": checks})
@@ -115,8 +110,7 @@ def doctor(screen: Screen, network: Network) -> None:
 def examine(network: Network) -> list[Finding]:
     """Run every check, in the order of the report."""
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
-        _python,
-        _distribution,
+        _installation,
         _packages,
         lambda: _network(network),
         lambda: _meeting_port(network),
@@ -129,11 +123,8 @@ def examine(network: Network) -> list[Finding]:
     return [finding for check in checks for finding in check()]
 
 
-def _python() -> Iterator[Finding]:
+def _installation() -> Iterator[Finding]:
     yield Finding("python", Mark.OK, sys.version.split()[0])
-
-
-def _distribution() -> Iterator[Finding]:
     others = other_owners()
     if others:
         said = f"{', '.join(others)} also installs the import package {_IMPORT_PACKAGE}"

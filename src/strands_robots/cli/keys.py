@@ -17,10 +17,12 @@ from strands_robots.safety.ed25519 import keygen, load_signing_key
 
 T = TypeVar("T")
 
-PASSPHRASE_FILE = typer.Option("--passphrase-file", help="Its passphrase, on the first line; else it is asked for.")
+PassphraseFile = Annotated[
+    Path | None, typer.Option("--passphrase-file", help="Its passphrase, on the first line; else it is asked for.")
+]
 DEFAULT_FOLDER = Path("mesh-keys")
-_FILE = typer.Argument(help="Where the key is written, encrypted; never over a file.")
-_FOLDER = typer.Option("--folder", help="Folder of the authority and the certificates.")
+KeyFile = Annotated[Path, typer.Argument(help="Where the key is written, encrypted; never over a file.")]
+Folder = Annotated[Path, typer.Option("--folder", help="Folder of the authority and the certificates.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -38,27 +40,17 @@ def register(app: typer.Typer) -> None:
     app.add_typer(mesh, name="mesh")
 
 
-def resume(
-    screen: Screen,
-    *,
-    file: Annotated[Path, _FILE],
-    passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
-) -> None:
+def resume(screen: Screen, *, file: KeyFile, passphrase_file: PassphraseFile = None) -> None:
     """Make an operator's resume key, and print the setting that robots need for it."""
     _make_key(screen, file, passphrase_file, "STRANDS_MESH_RESUME_PUBLIC_KEY")
 
 
-def estop(
-    screen: Screen,
-    *,
-    file: Annotated[Path, _FILE],
-    passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
-) -> None:
+def estop(screen: Screen, *, file: KeyFile, passphrase_file: PassphraseFile = None) -> None:
     """Make a safety controller's signing key, and print the setting that robots need for it."""
     _make_key(screen, file, passphrase_file, "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS")
 
 
-def init(screen: Screen, folder: Annotated[Path, _FOLDER] = DEFAULT_FOLDER) -> None:
+def init(screen: Screen, folder: Folder = DEFAULT_FOLDER) -> None:
     """Make the fleet's own certificate authority."""
     from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used
 
@@ -72,7 +64,7 @@ def issue(
     *,
     peer_id: Annotated[str, typer.Argument(help="The peer that the certificate is for.")],
     hosts: Annotated[list[str] | None, typer.Argument(help="Names or addresses by which others reach it.")] = None,
-    folder: Annotated[Path, _FOLDER] = DEFAULT_FOLDER,
+    folder: Folder = DEFAULT_FOLDER,
 ) -> None:
     """Make the certificate of one peer, and print its settings."""
     from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli.command import MESH_OPTION, WAIT_OPTION, assignments, command
+from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, first_line, plain, table
 from strands_robots.envelope import is_error, text_of
@@ -30,8 +30,8 @@ def peers(
     screen: Screen,
     network: Network,
     device: Annotated[str | None, typer.Argument(help="List the functions of this one.")] = None,
-    timeout: Annotated[float, WAIT_OPTION] = 2.0,
-    on_mesh: Annotated[bool, MESH_OPTION] = False,
+    timeout: Timeout = 2.0,
+    on_mesh: OnMesh = False,
 ) -> None:
     """List the robots on the network, or what one of them can do."""
     if on_mesh:
@@ -63,7 +63,7 @@ def call(
     device: Annotated[str, typer.Argument(help="The device's id.")],
     function: Annotated[str, typer.Argument(help="Such as getStatus.")],
     arguments: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...")] = None,
-    timeout: Annotated[float, WAIT_OPTION] = 10.0,
+    timeout: Timeout = 10.0,
     source: Annotated[str, typer.Option("--as", help="Name of the caller that goes with the call.")] = SOURCE,
 ) -> None:
     """Call a function of a device. A value is read as JSON where that is possible, else as text."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli.command import command
+from strands_robots.cli.command import Seconds, command
 from strands_robots.cli.network import Network, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, progress_bar, table
 from strands_robots.recording.cameras import chosen_frames
@@ -40,7 +40,7 @@ def record(
     *,
     devices: Annotated[list[str], typer.Argument(metavar="DEVICE...", help="Ids of the devices, or '*' for all.")],
     out: Annotated[Path, typer.Option("--out", help="A new .mcap file.")],
-    seconds: Annotated[float | None, typer.Option("--for", help="End after that many seconds.")] = None,
+    seconds: Seconds = None,
     on_mesh: Annotated[
         bool, typer.Option("--mesh", help="Peers of the native mesh instead: states, steps, pictures, stops.")
     ] = False,

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli.command import WAIT_OPTION, command
-from strands_robots.cli.keys import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.command import Timeout, command
+from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network, call_device, describe
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.envelope import text_of
@@ -47,9 +47,9 @@ def resume(
     targets: Annotated[
         list[str] | None, typer.Option("--targets", help="With --key: which (repeat, or commas).")
     ] = None,
-    passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
+    passphrase_file: PassphraseFile = None,
     local: Annotated[bool, typer.Option("--local", help="Robots of this machine, without a key; audited.")] = False,
-    timeout: Annotated[float, WAIT_OPTION] = 5.0,
+    timeout: Timeout = 5.0,
 ) -> None:
     """Free locked robots: by the operator's key over the network, or here by --local. It starts no motion."""
     if local == (key is not None):
@@ -74,7 +74,7 @@ def lockout(
     network: Network,
     *,
     local: Annotated[bool, typer.Option("--local", help="Only this machine's lockout file.")] = False,
-    timeout: Annotated[float, WAIT_OPTION] = 2.0,
+    timeout: Timeout = 2.0,
 ) -> None:
     """List locked robots, since when and by whom: live ones, and those in this machine's lockout file."""
     seconds = number("--timeout", timeout, above=0, high=60)

@@ -19,7 +19,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from strands_robots.cli.command import command
-from strands_robots.cli.keys import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
 from strands_robots.cli.resume import LockoutReport, ask_robots, lockable_robots
@@ -59,7 +59,7 @@ def safety_controller(
         str, typer.Option("--reason", help="Sent to the robots and written to their audit.")
     ] = "space bar",
     key: Annotated[Path | None, typer.Option("--key", help="Sign stops and check-ins with it.")] = None,
-    passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
+    passphrase_file: PassphraseFile = None,
 ) -> None:
     """Stop every robot at once with the SPACE bar; show each robot, its lockout, answers and check-in."""
     if not (screen.live and sys.stdin.isatty()):
@@ -146,7 +146,6 @@ class StopButton:
     def __init__(self, controller: SafetyController, expected: Callable[[], Collection[str]], reason: str) -> None:
         self.progress: Progress | None = None
         self.report: StopReport | None = None
-        self.presses = 0
         self._controller, self._expected, self._reason = controller, expected, reason
         self._guard = threading.Lock()
         self._id, self._running, self._last = "", False, float("-inf")
@@ -161,7 +160,6 @@ class StopButton:
         """Stop everything; returns at once."""
         now = time.monotonic()
         with self._guard:
-            self.presses += 1
             repeated, self._last = now - self._last < KEY_REPEAT_S, now
             if repeated and self._running:
                 return

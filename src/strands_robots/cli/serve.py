@@ -18,7 +18,7 @@ from rich.console import Group
 from rich.panel import Panel
 
 from strands_robots import settings
-from strands_robots.cli.command import MESH_OPTION, assignments, command, parse_ports
+from strands_robots.cli.command import OnMesh, assignments, command, parse_ports
 from strands_robots.cli.network import Network, describe, mesh_peer
 from strands_robots.cli.output import CliError, Screen, first_line, label, plain, table
 from strands_robots.cli.record import record_robot
@@ -81,7 +81,7 @@ def serve(
     record_cameras: Annotated[
         str | None, typer.Option("--record-cameras", help="Which cameras: names with commas, or none.", metavar="LIST")
     ] = None,
-    on_mesh: Annotated[bool, MESH_OPTION] = False,
+    on_mesh: OnMesh = False,
     until_stdin_closes: Annotated[bool, typer.Option("--until-stdin-closes", hidden=True)] = False,
 ) -> None:
     """Put a robot on the network. Ctrl-C or SIGTERM stops the robot first, then departs."""

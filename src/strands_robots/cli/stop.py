@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from strands_robots.cli.command import MESH_OPTION, WAIT_OPTION, command
-from strands_robots.cli.keys import PASSPHRASE_FILE, signing_key
+from strands_robots.cli.command import OnMesh, Timeout, command
+from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import SOURCE, Network, describe
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.envelope import Envelope, text_of
@@ -43,8 +43,8 @@ def stop(
     *,
     device: Annotated[str | None, typer.Argument(help="The device's id.")] = None,
     everything: Annotated[bool, typer.Option("--all", help="Stop every device that answers.")] = False,
-    timeout: Annotated[float, WAIT_OPTION] = 5.0,
-    on_mesh: Annotated[bool, MESH_OPTION] = False,
+    timeout: Timeout = 5.0,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Stop one robot, or all. Exits with 1 when one did not stop, with 3 when one is silent."""
     if (device is None) != everything:
@@ -87,8 +87,8 @@ def estop(
         float, typer.Option("--deadline", help="Seconds until a robot without an answer counts as silent.")
     ] = DEADLINE_S,
     key: Annotated[Path | None, typer.Option("--key", help="Sign it, where robots ask for signed stops.")] = None,
-    passphrase_file: Annotated[Path | None, PASSPHRASE_FILE] = None,
-    on_mesh: Annotated[bool, MESH_OPTION] = False,
+    passphrase_file: PassphraseFile = None,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Stop every robot of the tenant and lock it. Exits with 1 when one did not stop, with 3 when one is silent."""
     if devices and everything:

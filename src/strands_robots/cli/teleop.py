@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.control import Control
 
-from strands_robots.cli.command import command
+from strands_robots.cli.command import Seconds, command
 from strands_robots.cli.network import temporary_mesh_id
 from strands_robots.cli.output import POLL_S, CliError, Screen, table, wait_until
 from strands_robots.cli.record import record_robot
@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 
 _NAME = "leader"
 _MANUAL = ("keyboard", "gamepad")
-_FOLLOWER_ID = typer.Option("--id", help="Calibration id of the follower.")
+FollowerId = Annotated[str | None, typer.Option("--id", help="Calibration id of the follower.")]
+Calibration = Annotated[Path | None, typer.Option("--calibration", help="Calibration file of the follower.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -60,12 +61,12 @@ def teleop(
         str, typer.Argument(help="TYPE@PORT of a real arm, a model in simulation, mesh:PEER, or none to --publish.")
     ],
     leader_id: Annotated[str | None, typer.Option("--leader-id", help="Calibration id of the leader.")] = None,
-    follower_id: Annotated[str | None, _FOLLOWER_ID] = None,
+    follower_id: FollowerId = None,
     leader_calibration: Annotated[
         Path | None, typer.Option("--leader-calibration", help="Calibration file of the leader.")
     ] = None,
     calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file of the follower.")] = None,
-    seconds: Annotated[float | None, typer.Option("--for", help="End after that many seconds.")] = None,
+    seconds: Seconds = None,
     hz: Annotated[float, typer.Option("--hz", help="Frames a second, 1 to 1000.")] = 50.0,
     max_speed: Annotated[
         float, typer.Option("--max-speed", help="Whole joint ranges a second that the follower may cross.")
@@ -97,8 +98,8 @@ def replay(
     file: Annotated[Path, typer.Argument(help="A recording: .mcap, .csv or .parquet.")],
     to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, a model, or mesh:PEER.")],
     device: Annotated[str | None, typer.Option("--device", help="Device in a recording of several.")] = None,
-    follower_id: Annotated[str | None, _FOLLOWER_ID] = None,
-    calibration: Annotated[Path | None, typer.Option("--calibration", help="A calibration file.")] = None,
+    follower_id: FollowerId = None,
+    calibration: Calibration = None,
     speed: Annotated[float, typer.Option("--speed", help="Times as fast, at most 10.")] = 1.0,
 ) -> None:
     """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""

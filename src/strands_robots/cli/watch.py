@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from strands_robots.cli.command import command
+from strands_robots.cli.command import Seconds, command
 from strands_robots.cli.network import Network, call_device
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain
 from strands_robots.utils import number
@@ -47,7 +47,7 @@ def watch(
     screen: Screen,
     network: Network,
     device: Annotated[str, typer.Argument(help="The device's id.")],
-    seconds: Annotated[float | None, typer.Option("--for", help="End after that many seconds.")] = None,
+    seconds: Seconds = None,
 ) -> None:
     """Show a device's joints and task as they change, until Ctrl-C. With --json: one event a line."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=7 * 24 * 3600)
@@ -147,17 +147,12 @@ def print_changes(screen: Screen, events: Iterator[DeviceEvent]) -> None:
             last = task
 
 
-def joint_limits(features: Mapping[str, Any], robot: str = "") -> dict[str, Range]:
-    """Return the joint limits in a device's answer to getFeatures, by joint; empty where it has none.
-
-    Args:
-        features: the answer.
-        robot: which robot of a simulated world; empty for its first one.
-    """
+def joint_limits(features: Mapping[str, Any]) -> dict[str, Range]:
+    """Return the joint limits in a device's answer to getFeatures, by joint; of a world, those of its first robot."""
     robots = features.get("robots")
     chosen: Any = features
     if isinstance(robots, Mapping) and robots:
-        chosen = robots.get(robot) or next(iter(robots.values()))
+        chosen = next(iter(robots.values()))
     found: dict[str, Range] = {}
     for key in ("joints", "ranges"):
         joints = chosen.get(key) if isinstance(chosen, Mapping) else None
@@ -169,14 +164,14 @@ def joint_limits(features: Mapping[str, Any], robot: str = "") -> dict[str, Rang
     return found
 
 
-def joint_bar(value: float, limits: Range = FULL_TURN, width: int = BAR_WIDTH) -> Text:
+def joint_bar(value: float, limits: Range = FULL_TURN) -> Text:
     """Return a line from a joint's lower to its upper limit with a mark at its value."""
     low, high = limits
     share = min(1.0, max(0.0, (value - low) / (high - low)))
-    at = round(share * (width - 1))
+    at = round(share * (BAR_WIDTH - 1))
     line = Text("─" * at, style="bright_black")
     line.append("●", style="bold cyan")
-    line.append("─" * (width - 1 - at), style="bright_black")
+    line.append("─" * (BAR_WIDTH - 1 - at), style="bright_black")
     return line
 
 
