@@ -16,7 +16,7 @@ from typing import Any
 
 from strands_robots.mesh import topics
 from strands_robots.mesh.security import validate_peer_id
-from strands_robots.mesh.transport.zenoh_config import MESSAGES, TlsCredentials
+from strands_robots.mesh.transport.zenoh_config import MESSAGES, TlsCredentials, allow, deny_by_default
 from strands_robots.mesh.wire_identity import cryptography
 from strands_robots.utils import ValidationError, text, whole
 
@@ -105,34 +105,23 @@ def acl(
     prefix = f"{namespace}/{topics.ROOT}" if namespace else topics.ROOT
     receiving = [message for message in MESSAGES if message not in ("put", "delete")]
     rules: list[dict[str, Any]] = [
-        _rule("hear", receiving, ["ingress", "egress"], [f"{prefix}/**"]),
-        _rule("be-told", ["put", "delete"], ["egress"], [f"{prefix}/**"]),
-        _rule("safety", ["put"], ["ingress"], [f"{prefix}/safety/*"]),
-        _rule("relay", ["put", "delete"], ["ingress"], [f"{prefix}/**"]),
-        _rule("command", ["put"], ["ingress"], [f"{prefix}/*/cmd", f"{prefix}/broadcast"]),
+        allow("hear", receiving, ["ingress", "egress"], [f"{prefix}/**"]),
+        allow("be-told", ["put", "delete"], ["egress"], [f"{prefix}/**"]),
+        allow("safety", ["put"], ["ingress"], [f"{prefix}/safety/*"]),
+        allow("relay", ["put", "delete"], ["ingress"], [f"{prefix}/**"]),
+        allow("command", ["put"], ["ingress"], [f"{prefix}/*/cmd", f"{prefix}/broadcast"]),
     ]
     subjects, policies = [], []
     for peer in certified:
         # A certificate speaks for its name, and for what its owner calls NAME__something.
         names = (peer, f"{peer}__$*")
         own = [key for name in names for key in (f"{prefix}/{name}/**", f"{prefix}/*/response/{name}/**")]
-        rules.append(_rule(f"own-{peer}", ["put", "delete", "liveliness_token"], ["ingress"], own))
+        rules.append(allow(f"own-{peer}", ["put", "delete", "liveliness_token"], ["ingress"], own))
         subjects.append({"id": peer, "cert_common_names": [peer]})
         granted = ["hear", "be-told", "safety", f"own-{peer}"]
         granted += [rule for rule, peers in (("command", operators), ("relay", through)) if peer in peers]
         policies.append({"rules": granted, "subjects": [peer]})
-    rules_of = {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
-    return json.dumps(rules_of, indent=2) + "\n"
-
-
-def _rule(name: str, messages: list[str], flows: list[str], keys: list[str]) -> dict[str, Any]:
-    return {"id": name, "permission": "allow", "messages": messages, "flows": flows, "key_exprs": keys}
+    return json.dumps(deny_by_default(rules, subjects, policies), indent=2) + "\n"
 
 
 def _subject(name: str) -> Any:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import logging
 import stat
+from collections.abc import Iterable
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
@@ -232,6 +233,19 @@ def _base(posture: Posture, session: str | None) -> dict[str, Any]:
     return config
 
 
+def allow(name: str, messages: Iterable[str], flows: Iterable[str], keys: Iterable[str]) -> dict[str, Any]:
+    """Return one access rule that allows messages on key expressions."""
+    return {"id": name, "permission": "allow", "messages": [*messages], "flows": [*flows], "key_exprs": [*keys]}
+
+
+def deny_by_default(
+    rules: list[dict[str, Any]], subjects: list[dict[str, Any]], policies: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Return an access control that denies what no rule allows."""
+    parts = {"rules": rules, "subjects": subjects, "policies": policies}
+    return {"enabled": True, "default_permission": "deny", **parts}
+
+
 def _access_control(posture: Posture, prefix: str) -> dict[str, Any]:
     """The operator's rules, or by default every topic for certified peers.
 
@@ -239,21 +253,8 @@ def _access_control(posture: Posture, prefix: str) -> dict[str, Any]:
         TransportError: rules that cannot be read, are switched off, or allow by default without the opt-in.
     """
     if posture.access_control is None:
-        return {
-            "enabled": True,
-            "default_permission": "deny",
-            "rules": [
-                {
-                    "id": "mesh",
-                    "permission": "allow",
-                    "messages": list(MESSAGES),
-                    "flows": ["ingress", "egress"],
-                    "key_exprs": [f"{prefix}{topics.ROOT}/**"],
-                }
-            ],
-            "subjects": [{"id": "certified"}],
-            "policies": [{"rules": ["mesh"], "subjects": ["certified"]}],
-        }
+        rule = allow("mesh", MESSAGES, ["ingress", "egress"], [f"{prefix}{topics.ROOT}/**"])
+        return deny_by_default([rule], [{"id": "certified"}], [{"rules": ["mesh"], "subjects": ["certified"]}])
     rules = _parsed(posture.access_control)
     if rules.get("enabled") is not True:
         raise TransportError("STRANDS_MESH_ACL_FILE: access control must have enabled: true.")
