@@ -88,7 +88,7 @@ class DdsLink:
         subscribed = import_module("strands_robots.ros._compat").subscribed
         while not subscribed(writer):
             if time.monotonic() >= deadline:
-                raise RosError(f"Nobody subscribes to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
+                raise RosError(f"No subscription to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
             time.sleep(0.002)
         _write(writer, message, topic, kind)
 
@@ -237,7 +237,7 @@ class DdsLink:
                 if each["topic"] == wanted and each["role"] == "publisher":
                     return each["type"]
             if time.monotonic() >= deadline:
-                raise RosError(f"Nobody publishes {topic} in domain {self.domain_id}, so its type is not known.")
+                raise RosError(f"No publisher of {topic} in domain {self.domain_id}, so its type is not known.")
             time.sleep(_POLL_S)
 
 

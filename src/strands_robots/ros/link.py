@@ -161,7 +161,7 @@ class GoalReport:
         """Return the report in one sentence."""
         if self.state == "lost":
             after = f"After {self.ended_by}, " if self.ended_by else ""
-            return f"{after}nobody knows whether the goal still goes on: {self.problem}."
+            return f"{after}it is unknown whether the goal still goes on: {self.problem}."
         if self.state == "rejected":
             return self.problem
         after = f" after {self.ended_by} ended it" if self.ended_by else ""
@@ -205,7 +205,7 @@ def run_goal(
     if sent.status is None:
         return GoalReport("lost", False, ended_by, problem=problem or sent.problem, lost_goal=sent)
     if not SUCCEEDED <= sent.status < len(STATUS_NAMES):
-        problem = f"its server told status {sent.status}, which ends nothing"
+        problem = f"its server reported status {sent.status}, which ends nothing"
         return GoalReport("lost", False, ended_by, sent.status, sent.values, problem)
     return GoalReport(STATUS_NAMES[sent.status], True, ended_by, sent.status, sent.values)
 

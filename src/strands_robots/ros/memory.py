@@ -56,7 +56,7 @@ class MemoryLink:
         if cancelled():
             raise RosError(f"{action} was given up before its goal was sent.")
         if action not in self._actions:
-            raise RosError(f"Nobody serves the action {action}.")
+            raise RosError(f"No server for the action {action}.")
         sent = Goal(lambda: sent.end(5, {}))
         self._actions[action](copy.deepcopy(dict(goal)), feedback or (lambda message: None), sent)
         return sent
@@ -83,7 +83,7 @@ class MemoryLink:
     def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
         del kind, within_s
         if service not in self._services:
-            raise RosError(f"Nobody offers the service {service}.")
+            raise RosError(f"No server for the service {service}.")
         self.called.append((service, dict(fields)))
         return self._services[service](fields)
 

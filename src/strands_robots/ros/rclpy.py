@@ -76,7 +76,7 @@ class RclpyLink:
         message = filled(interface_class(kind, "msg")(), fields)
         publisher = self._publisher(topic, kind)
         if not self._wait_for(lambda: bool(publisher.get_subscription_count()), self._match_s):
-            raise RosError(f"Nobody subscribes to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
+            raise RosError(f"No subscription to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
         _send(publisher, message, topic, kind)
 
     def broadcast(self, topic: str, kind: str, fields: Message) -> None:
@@ -114,7 +114,7 @@ class RclpyLink:
         session = self.open()
         client = self._cached("srv", service, kind, lambda: session.node.create_client(struct, absolute(service)))
         if not self._wait_for(client.service_is_ready, within_s):
-            raise RosError(f"Nobody offers the service {service}.")
+            raise RosError(f"No server for the service {service}.")
         answer, futures = Goal(lambda: None), list[Any]()
 
         def request_call() -> None:
@@ -146,7 +146,7 @@ class RclpyLink:
         make = ros2("rclpy.action").ActionClient
         client = self._cached("action", action, kind, lambda: make(session.node, struct, absolute(action)))
         if not self._wait_for(client.server_is_ready, within_s, cancelled):
-            raise RosError(f"Nobody serves the action {action}.")
+            raise RosError(f"No server for the action {action}.")
         sending = _Sending(session, action)
         self._goals.add(sending.goal)
         on_feedback = (
@@ -230,7 +230,7 @@ class RclpyLink:
             return bool(found)
 
         if not self._wait_for(known, self._match_s):
-            raise RosError(f"Nobody publishes {topic} in domain {self.domain_id}, so its type is not known.")
+            raise RosError(f"No publisher of {topic} in domain {self.domain_id}, so its type is not known.")
         return found[0]
 
     def _settled_node(self) -> Any:

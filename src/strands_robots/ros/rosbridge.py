@@ -317,7 +317,7 @@ class RosbridgeLink:
         if isinstance(status, int):
             goal.end(status, values)
         else:
-            goal.fail(f"the server told no status: {shown(values)}")
+            goal.fail(f"the server reported no status: {shown(values)}")
 
     def _published(self, message: dict[str, Any]) -> None:
         topic, body = message.get("topic"), message.get("msg")

@@ -247,7 +247,7 @@ def test_stop_with_silent_odometry_is_no_success_by_any_verb(made: Made, monkeyp
     for stop in (robot.stop, robot.stop_task, tool, lambda: robot.halt("stop").envelope()):
         answer = stop()
         assert (answer["status"], answer["stopped"]) == ("error", None)
-        assert "/odom says nothing" in answer["reason"]
+        assert "/odom is silent" in answer["reason"]
         assert grade(answer) is Outcome.UNKNOWN
 
 

@@ -130,11 +130,11 @@ def test_goal_that_ignores_its_cancel_is_lost_and_every_stop_cancels_it_again(
     robot, stack.obeys = made(), False
     answer = robot.navigate_to(1.0, 2.0, timeout=0.05)
     assert (answer["status"], answer["goal_state"]) == ("error", "lost")
-    assert "nobody knows whether the goal still goes on" in answer["reason"]
+    assert "it is unknown whether the goal still goes on" in answer["reason"]
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
     verdict = robot.halt("test")
     assert verdict.stopped is False
-    assert "nobody knows" in verdict.not_stopped["navigation"]
+    assert "it is unknown" in verdict.not_stopped["navigation"]
     eventually(lambda: stack.cancels == 2)
     stack.obeys = True
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
@@ -242,7 +242,7 @@ def test_goal_needs_a_stack_an_approval_and_no_lockout(made: Made, stack: Stack)
     assert "locked" in locked.navigate_to(1.0, 2.0)["reason"]
     alone = made(link=MemoryLink())
     answer = alone.navigate_to(1.0, 2.0)
-    assert (answer["goal_state"], "Nobody serves" in answer["reason"]) == ("not sent", True)
+    assert (answer["goal_state"], "No server for" in answer["reason"]) == ("not sent", True)
     assert stack.requests == []
 
 

@@ -73,7 +73,7 @@ def test_drive_of_a_base_that_died_is_an_error_and_did_not_stop(base: BaseProces
     eventually(lambda: rover.get_task_status()["task_status"] == "error")
     verdict = rover.halt()
     assert verdict.stopped is False
-    assert "Nobody subscribes to /cmd_vel" in verdict.not_stopped["velocity"]
+    assert "No subscription to /cmd_vel" in verdict.not_stopped["velocity"]
 
 
 def test_omitted_type_is_looked_up_on_the_graph(base: None) -> None:
@@ -91,7 +91,7 @@ def test_omitted_type_is_looked_up_on_the_graph(base: None) -> None:
 def test_drive_and_stop_without_a_subscription_are_errors() -> None:
     robot = RtpsRobot.from_rtps("alone", "/alone/cmd_vel", domain_id=DOMAIN, command_gate=OPEN)
     try:
-        assert "Nobody subscribes to /alone/cmd_vel" in robot.drive(0.1)["reason"]
+        assert "No subscription to /alone/cmd_vel" in robot.drive(0.1)["reason"]
         assert robot.halt().stopped is False
     finally:
         robot.disconnect()

@@ -23,7 +23,7 @@ from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.ros.gate import CommandGate
 gate = CommandGate(lambda _: ("cmd_vel",), lambda: False)
 lost = RtpsRobot("lost", "/cmd_vel", domain_id={DOMAIN}, publish_rate=20, command_gate=gate)
-while "Nobody subscribes" in str(lost.drive(0.4, 0.0, duration=60.0)):
+while "No subscription" in str(lost.drive(0.4, 0.0, duration=60.0)):
     pass
 """
 

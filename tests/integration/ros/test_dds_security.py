@@ -122,7 +122,7 @@ def test_a_stranger_can_neither_publish_nor_read(
     listener.ask("watch", CMD, TWIST)
     publish_until_received(speaker, listener, SPEED)
     # It waits for a subscription, several times as long as the members took.
-    with pytest.raises(RuntimeError, match="Nobody subscribes to /cmd_vel"):
+    with pytest.raises(RuntimeError, match="No subscription to /cmd_vel"):
         stranger.ask("publish", CMD, TWIST, {"linear": {"x": 9.0}})
     for _ in range(20):
         stranger.ask("broadcast", CMD, TWIST, {"linear": {"x": 9.0}})
@@ -238,7 +238,7 @@ def test_an_arm_on_a_secured_graph_takes_commands_from_members_only(
     command = {"name": ["a.pos"], "position": [0.5]}
     bridge = HardwareRtpsBridge(arm, domain_id=DOMAIN, poll_period=0.005, dds_security_config=us)
     try:
-        with pytest.raises(RuntimeError, match="Nobody subscribes"):
+        with pytest.raises(RuntimeError, match="No subscription"):
             peer(None).ask("publish", ARM, JOINTS, {"name": ["a.pos"], "position": [9.0]})
         member = peer(alice)
         eventually(lambda: member.ask("publish", ARM, JOINTS, command) or arm.taken)

@@ -131,7 +131,7 @@ def test_a_closed_link_opens_anew_when_it_is_used(ends: tuple[RosLink, RosLink])
 
 def test_service_answers_and_a_missing_one_is_named(stacked: RosLink) -> None:
     assert stacked.call("/arm", ARM_KIND, {"data": True}, 20.0) == {"success": True, "message": "armed"}
-    with pytest.raises(RosError, match="Nobody offers the service /disarm"):
+    with pytest.raises(RosError, match="No server for the service /disarm"):
         stacked.call("/disarm", ARM_KIND, {"data": True}, 0.1)
 
 
@@ -151,7 +151,7 @@ def test_goal_is_cancelled_after_its_time_or_on_request(stacked: RosLink) -> Non
 
 
 def test_goal_without_a_server_or_cancelled_before_never_begins(stacked: RosLink) -> None:
-    with pytest.raises(RosError, match="Nobody serves the action /elsewhere"):
+    with pytest.raises(RosError, match="No server for the action /elsewhere"):
         run_goal(stacked, "/elsewhere", NAV_KIND, place(0.0), 0.1)
-    with pytest.raises(RosError, match=r"given up before|Nobody serves"):
+    with pytest.raises(RosError, match=r"given up before|No server for"):
         run_goal(stacked, NAV, NAV_KIND, place(0.0), 5.0, cancelled=lambda: True)

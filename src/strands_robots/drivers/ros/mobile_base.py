@@ -417,10 +417,10 @@ class MobileBaseRobot:
             while not self._odometry.still and time.monotonic() < deadline:
                 time.sleep(0.005)
             if self._odometry.still is None:
-                return StopVerdict(unknown={source: f"zeros are sent, but {self._odometry.topic} says nothing"})
+                return StopVerdict(unknown={source: f"zeros are sent, but {self._odometry.topic} is silent"})
             if not self._odometry.still:
                 linear, angular = self._odometry.last_speeds or (0.0, 0.0)
-                why = f"zeros are sent, but odometry still tells {linear:.2f} m/s and {angular:.2f} rad/s"
+                why = f"zeros are sent, but odometry still reports {linear:.2f} m/s and {angular:.2f} rad/s"
                 return StopVerdict(not_stopped={source: why})
         return StopVerdict(halted=("drive",) if driven else ())
 

@@ -72,10 +72,10 @@ class Navigation(BaseMotion):
     def doubt(self) -> str | None:
         """Return why the robot may still be on its way, or None: it is known not to be."""
         if not self.ended.is_set():
-            return "the goal is being cancelled, and its server has not told its end"
+            return "the goal is being cancelled, and its server has not reported its end"
         report, lost = self.report, self._lost_goal
         if report is None and self.answer is None:
-            return "the goal was interrupted, and nobody knows whether it still goes on"
+            return "the goal was interrupted, and it is unknown whether it still goes on"
         if report is None or report.over or (lost is not None and lost.status is not None):
             return None
         return report.sentence()
