@@ -14,12 +14,11 @@ from typing import Any
 
 from strands_robots.agent_tool import tool
 from strands_robots.envelope import error
+from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.tools import networks
-from strands_robots.utils import ValidationError, choice, device_id, number, text
+from strands_robots.utils import ValidationError, choice, device_id, text
 
 ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop")
-
-DURATION_MAX_S = 3600.0
 
 
 @tool
@@ -38,17 +37,17 @@ def robot_mesh(
         action: peers lists the robots; tell gives one an instruction and returns once the motion has started; status
             returns what one is doing; stop stops one, or all without a target; emergency_stop stops and locks all.
         target: The robot's id, as peers lists it. Needed by tell and status.
-        instruction: The motion in plain language, 1 to 2000 characters. For emergency_stop: the reason.
-        policy_provider: Policy that decides the robot's actions, such as mock, remote or lerobot_local.
+        instruction: What to do, in plain language, 1 to 2000 characters. For emergency_stop: the reason.
+        policy_provider: Policy that decides the actions, such as mock, remote or lerobot_local.
         duration: Longest time the motion may take, in seconds, above 0 and at most 3600.
     """
     try:
         verb = choice("action", action, ACTIONS)
         robot = device_id("target", target) if target or verb in ("tell", "status") else ""
         if verb == "tell":
-            what, provider = text("instruction", instruction), text("policy_provider", policy_provider, longest=100)
-            seconds = number("duration", duration, above=0, high=DURATION_MAX_S)
-            return networks.network().tell(robot, what, provider, seconds)
+            given = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
+            task = ARM_VERBS["execute"].checked(given)
+            return networks.network().tell(robot, task["instruction"], task["policy_provider"], task["duration"])
         if verb == "emergency_stop":
             return networks.network().emergency_stop(text("instruction", instruction, empty=True))
     except ValidationError as refused:

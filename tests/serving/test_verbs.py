@@ -1,0 +1,108 @@
+"""One description of a verb holds its RPC, its schema, the mesh's validation and the agent tool."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any
+
+import pytest
+
+from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver, NavigatingBaseDeviceDriver
+from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
+from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.mesh.security import validate_command
+from strands_robots.serving.robot_verbs import ARM_VERBS, PEER_VERBS
+from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
+from strands_robots.tools.robot_mesh import robot_mesh
+from strands_robots.utils import ValidationError, whole
+
+DRIVERS = (
+    RobotDeviceDriver,
+    SimulationDeviceDriver,
+    ReachyMiniDriver,
+    MobileBaseDeviceDriver,
+    NavigatingBaseDeviceDriver,
+)
+
+
+@pytest.mark.parametrize("driver", DRIVERS, ids=lambda driver: driver.__name__)
+def test_every_described_verb_is_an_rpc_with_the_described_signature(driver: Any) -> None:
+    for name, verb in driver.verbs.items():
+        _, *parameters = inspect.signature(getattr(driver, name)).parameters.values()
+        assert [each.name for each in parameters] == list(verb.by_name), name
+        for parameter, described in zip(parameters, verb.parameters, strict=True):
+            wanted = inspect.Parameter.empty if described.default is REQUIRED else described.default
+            assert parameter.default == wanted, (name, described.name)
+            assert parameter.annotation is described.type, (name, described.name)
+
+
+@pytest.mark.parametrize("driver", DRIVERS, ids=lambda driver: driver.__name__)
+def test_every_rpc_of_a_driver_is_a_described_verb(driver: Any) -> None:
+    rpcs = {name for name in dir(driver) if getattr(getattr(driver, name, None), "_is_device_function", False)}
+    assert rpcs == set(driver.verbs)
+
+
+@pytest.mark.parametrize("verb", [v for driver in DRIVERS for v in driver.verbs.values()], ids=lambda verb: verb.name)
+def test_a_default_is_inside_the_domain_of_its_parameter(verb: Verb) -> None:
+    for each in verb.parameters:
+        if each.default is not REQUIRED:
+            each.check(each.name, each.default)
+
+
+def test_the_agent_tool_describes_a_task_as_execute_does() -> None:
+    page = inspect.getdoc(inspect.unwrap(getattr(robot_mesh, "_tool_func", robot_mesh)))
+    assert page is not None
+    for name in ("instruction", "policy_provider", "duration"):
+        described = " ".join(ARM_VERBS["execute"].by_name[name].meaning.split())
+        assert described.lower() in " ".join(page.split()).lower(), name
+
+
+def test_the_mesh_knows_the_documented_actions() -> None:
+    assert set(PEER_VERBS) == {
+        *("status", "stop", "features", "state", "execute", "start", "step", "reset"),
+        *("teleop_status", "teleop_receive", "teleop_stop", "resume", "ping"),
+    }
+    moving = {name for name, verb in PEER_VERBS.items() if verb.kind is Kind.MOTION}
+    assert moving == {"execute", "start", "step", "reset", "teleop_receive"}
+
+
+def test_the_mesh_fills_in_defaults_and_drops_what_an_action_does_not_have() -> None:
+    command = {"action": "start", "policy_provider": "mock", "speed": 3, "robot_name": None}
+    assert validate_command(command) == {
+        "action": "start",
+        "policy_provider": "mock",
+        "duration": 30.0,
+        "policy_host": "localhost",
+    }
+
+
+GO = Verb(
+    "go",
+    Kind.MOTION,
+    "Go.",
+    (
+        Parameter("steps", int, "Steps", lambda name, value: whole(name, value, low=1, high=9)),
+        Parameter("turns", int, "Turns", lambda name, value: whole(name, value, low=0, high=9), default=2),
+    ),
+)
+
+
+def test_checked_arguments_have_their_defaults() -> None:
+    assert GO.checked({"steps": 3}) == {"steps": 3, "turns": 2}
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [({}, "steps is missing"), ({"steps": 1, "speed": 1}, "it has no speed"), ({"steps": 10}, "steps must be")],
+)
+def test_arguments_that_do_not_fit_are_refused_by_name(given: dict[str, Any], names: str) -> None:
+    with pytest.raises(ValidationError, match=names):
+        GO.checked(given)
+
+
+@pytest.mark.parametrize("value", [True, 1.0, math.nan, "1", None])
+def test_booleans_and_floats_are_no_whole_numbers(value: Any) -> None:
+    with pytest.raises(ValidationError, match="steps must be"):
+        GO.checked({"steps": value})
