@@ -1,6 +1,6 @@
 """A robot of your own: give it LeRobot's five verbs, and agents find it, drive it and stop it.
 
-It counts as real hardware, which moves for nobody until you say for whom, and only with your approval::
+It counts as real hardware: it moves only for callers that you allow, and only with your approval::
 
     DEVICE_CONNECT_RPC_ALLOW=strands-robots STRANDS_ROBOT_COMMAND_ALLOW=execute .venv/bin/python examples/own_driver.py
     strands-robots call pan-tilt execute instruction="look around" duration=5      # in another terminal
