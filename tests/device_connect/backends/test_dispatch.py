@@ -27,8 +27,8 @@ class Server:
         self.served = []
         self.replied = set()
         self.replies = dispatch.PendingReplies()
-        serve = dispatch.relaying(self._handle, self.replies)
-        self.server = dispatch.CommandServer("arm-1.cmd", serve, lambda message: message, self._answer, call_soon)
+        self.serve = dispatch.relaying(self._handle, self.replies)
+        self.server = dispatch.CommandServer("arm-1.cmd", self.serve, lambda message: message, self._answer, call_soon)
 
     def receive(self, data, reply):
         self.server.receive((data, reply))
@@ -83,7 +83,7 @@ async def test_full_server_answers_busy_and_still_takes_stops_and_reads(server):
     await until(lambda: "again" in server.replied)
 
 
-async def test_commands_that_arrive_while_the_loop_is_held_up_are_bounded(server, monkeypatch):
+async def test_commands_that_arrive_while_the_loop_is_held_up_are_bounded(server):
     for number in range(dispatch.MAX_ARRIVED):
         server.receive(command("getStatus", number), f"waiting-{number}")
     assert server.answers == {}
@@ -150,6 +150,18 @@ async def test_ten_thousand_bad_messages_cost_one_log_line(server, caplog):
         await until(lambda: len(server.answers) == 10_000)
     lines = [each for each in caplog.records if each.name == dispatch.logger.name]
     assert 1 <= len(lines) <= 1 + (time.monotonic() - began), "one line a second"
+
+
+async def test_answer_that_cannot_be_sent_does_not_hold_up_the_next_command(server, caplog):
+    def unsendable(_reply, _data):
+        raise OSError("the link is gone")
+
+    refusing = dispatch.CommandServer("arm-1.cmd", server.serve, lambda message: message, unsendable, call_soon)
+    refusing.receive((b"no json", "a"))
+    refusing.receive((command("getStatus"), "b"))
+    await until(lambda: server.served == ["getStatus"])
+    await refusing.close()
+    assert "arm-1.cmd was lost" in caplog.text
 
 
 async def test_close_cancels_running_commands(server):

@@ -180,15 +180,19 @@ class CommandServer:
             if arrived is None or self._closed:
                 return
             data, reply = arrived
-            command = self._admitted(data)
-            if isinstance(command, jsonrpc.Refusal):
-                self._log.warning("refused a message on %s: %d %s", self._subject, command.code, command.reason)
-                if reply is not None:
-                    self._send(reply, command.encoded())
-                continue
-            task = start_now(self._serve(command, None if reply is None else partial(self._answer, reply)))
-            self._running.add(task)
-            task.add_done_callback(partial(self._finished, command, reply))
+            try:
+                command = self._admitted(data)
+                if isinstance(command, jsonrpc.Refusal):
+                    self._log.warning("refused a message on %s: %d %s", self._subject, command.code, command.reason)
+                    if reply is not None:
+                        self._send(reply, command.encoded())
+                    continue
+                task = start_now(self._serve(command, None if reply is None else partial(self._answer, reply)))
+                self._running.add(task)
+                task.add_done_callback(partial(self._finished, command, reply))
+            except Exception:
+                # The commands behind this one must still be served.
+                logger.exception("a message on %s was lost", self._subject)
         self._wake()
 
     async def close(self) -> None:
