@@ -51,7 +51,7 @@ KNOWN_TWINS: set[str] = set()
 FOREIGN_ROOTS: dict[str, str] = {}
 """Public exceptions that a framework wants under a root of its own, with the reason."""
 
-KNOWN_UNROOTED: set[str] = {"MotionRefused", "PermitVoidError"}
+KNOWN_UNROOTED: set[str] = set()
 """Public exceptions that do not derive from StrandsRobotsError yet. The list only ever gets shorter."""
 
 RIDDLES = {

@@ -1,4 +1,4 @@
-"""What every robot here can do, as types, and the one place where a foreign robot is made to fit.
+"""The robot contract as types, and the one place where a foreign robot is made to fit it.
 
 Networks, tools and the command line reach a robot only through these protocols. A robot of ours implements
 :class:`TaskRobot` or :class:`WorldRobot`; any other object with ``start_task``, ``stop_task``,
@@ -54,7 +54,7 @@ Unsubscribe = Callable[[], None]
 
 @runtime_checkable
 class Haltable(Protocol):
-    """The one verb that halts every motion source and says what it did."""
+    """A robot with the one verb that halts every motion source and returns a verdict."""
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop everything that moves this robot; returns within the halt deadline."""
@@ -88,7 +88,7 @@ class TaskRobot(Haltable, Protocol):
         """
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Tell ``observer`` of every rollout event until the returned callable is called."""
+        """Call ``observer`` with every rollout event until the returned callable is called."""
 
 
 @runtime_checkable
@@ -130,11 +130,11 @@ class WorldRobot(Haltable, Protocol):
         """Halt, then put the world back to its initial state."""
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Tell ``observer`` of every rollout event until the returned callable is called."""
+        """Call ``observer`` with every rollout event until the returned callable is called."""
 
 
 Robot = TaskRobot | WorldRobot
-"""What the networks serve."""
+"""A robot that a network can serve."""
 
 JointReader = Callable[[Any], Mapping[str, float]]
 """Reads a robot's joints, by name in its own unit; empty where it has none. Raises what the robot raises."""
@@ -161,7 +161,7 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
 
 
 def body_of(robot: Any) -> Any:
-    """The robot itself, where :func:`adapt` wrapped it anew for each of its networks."""
+    """Return the robot that :func:`adapt` wrapped, else ``robot`` itself."""
     return getattr(robot, "wrapped", robot)
 
 
@@ -171,9 +171,9 @@ class _PutAway:
 
 
 def put_away(robot: Any) -> Callable[[], None]:
-    """Let nothing begin on ``robot`` from now on, over whatever network; what is returned takes that back.
+    """Refuse every motion of ``robot`` from now on, on every network, until the returned callable is called.
 
-    For whoever halts a robot and then leaves its network: a motion asked for in between would outlive the process.
+    For a caller that halts a robot and then leaves its network: a motion requested in between would go on.
     """
     gate, latch = _gate_of(robot, _shared(robot)), _PutAway()
     gate.attach(latch)
@@ -181,7 +181,7 @@ def put_away(robot: Any) -> Callable[[], None]:
 
 
 class _Shared:
-    """What all wrappers of one foreign robot share, so that a stop on one network is one on every other."""
+    """State that all wrappers of one foreign robot share, so that a stop on one network is one on every other."""
 
     def __init__(self) -> None:
         self.gate = MotionGate()
@@ -196,7 +196,7 @@ class _Shared:
 
     @contextmanager
     def calling(self) -> Iterator[None]:
-        """The time of such a verb. It waits for nobody, because it may be a stop."""
+        """Mark the time of such a verb. It waits for no other call, because it may be a stop."""
         call = object()
         self._calls.add(call)
         try:
@@ -209,7 +209,7 @@ _known: WeakKeyDictionary[Any, _Shared] = WeakKeyDictionary()
 
 
 def _shared(robot: Any) -> _Shared:
-    """The same for one robot, however often it is wrapped."""
+    """Return the shared state of one robot, however often it is wrapped."""
     try:
         return _known.setdefault(robot, _Shared())
     except TypeError:  # it cannot be a key; each wrapper has a gate, and every emergency stop knows them all
@@ -305,7 +305,7 @@ class AdaptedRobot:
             return halt_each(sources)
 
     def _refresh(self, status: str) -> str:
-        """Read the joints, where that disturbs nobody; else why these are not those of now."""
+        """Read the joints where that disturbs no other call; else return the reason why they are old."""
         if self._read_joints is None:
             return ""
         busy = "it is being started or stopped" if self._shared.called else "its task runs" if status in RUNNING else ""
@@ -323,6 +323,6 @@ class AdaptedRobot:
 
 
 def _facts(answer: object) -> dict[str, Any]:
-    """What an envelope tells, without its form; a foreign robot may answer with something else."""
-    told = answer if isinstance(answer, Mapping) else {}
-    return {key: value for key, value in told.items() if key not in ("status", "content")}
+    """Return the facts of an envelope without its form; none where a foreign robot answers with something else."""
+    facts = answer if isinstance(answer, Mapping) else {}
+    return {key: value for key, value in facts.items() if key not in ("status", "content")}

@@ -1,4 +1,4 @@
-"""What a calibration file may say."""
+"""The content of a calibration file, checked."""
 
 from __future__ import annotations
 

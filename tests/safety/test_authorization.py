@@ -1,4 +1,4 @@
-"""Who may move a robot, whose emergency stop counts, which policy may be asked for."""
+"""Callers that may move a robot or stop it, and policies that they may ask for."""
 
 from __future__ import annotations
 

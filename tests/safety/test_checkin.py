@@ -22,8 +22,8 @@ def test_a_robot_that_never_hears_a_controller_stops_too() -> None:
 
 def test_it_lapses_once_when_the_last_of_several_is_silent_and_names_them() -> None:
     check = CheckIn(1.0, now=0.0)
-    check.heard("b", 0.5)
-    check.heard("a", 0.9)
+    check.record("b", 0.5)
+    check.record("a", 0.9)
     assert check.lapsed(1.6) is None
     assert check.lapsed(2.0) == ("a", "b")
     assert check.lapsed(5.0) is None
@@ -33,7 +33,7 @@ def test_it_lapses_once_when_the_last_of_several_is_silent_and_names_them() -> N
 def test_it_watches_again_after_a_new_check_in_or_a_resume() -> None:
     check = CheckIn(1.0, now=0.0)
     assert check.lapsed(1.0) == ()
-    check.heard("a", 2.0)
+    check.record("a", 2.0)
     assert check.lapsed(3.0) == ("a",)
     check.rearm(10.0)
     assert check.time_left(10.25) == 0.75
@@ -42,7 +42,7 @@ def test_it_watches_again_after_a_new_check_in_or_a_resume() -> None:
 
 def test_the_status_names_the_controllers_and_the_time_left() -> None:
     check = CheckIn(2.0, now=0.0)
-    check.heard("safety-1", 1.0)
+    check.record("safety-1", 1.0)
     assert check.fields(1.5) == {
         "required": True,
         "timeout_s": 2.0,
@@ -55,5 +55,5 @@ def test_the_status_names_the_controllers_and_the_time_left() -> None:
 def test_a_flood_of_names_is_held_to_a_few(count: int) -> None:
     check = CheckIn(1.0, now=0.0)
     for number in range(count):
-        check.heard(f"c{number}", float(number))
+        check.record(f"c{number}", float(number))
     assert len(check.fields(0.0)["controllers"]) == CONTROLLERS_MAX  # type: ignore[arg-type]

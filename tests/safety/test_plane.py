@@ -1,4 +1,4 @@
-"""Where every emergency stop ends: all robots locked at once, halted side by side, answered for by name."""
+"""The safety plane: all robots locked at once, halted side by side, and reported by name."""
 
 from __future__ import annotations
 
@@ -329,11 +329,11 @@ def test_a_silent_controller_stops_the_robot_which_says_who(
     robot = add()
     assert plane.checkin.timeout_s == 20
     # Heard on and on, as it were; only then is the timeout one that passes while the test looks.
-    plane.checkin.heard("safety-1", time.monotonic() + 3600)
+    plane.checkin.record("safety-1", time.monotonic() + 3600)
     plane.checkin.timeout_s = 0.3
     time.sleep(0.5)
     assert not robot.refuses()
-    plane.checkin.heard("safety-1", time.monotonic())
+    plane.checkin.record("safety-1", time.monotonic())
     eventually(lambda: robot.refuses() and bool(robot.reasons))
     assert "safety-1" in robot.reasons[0]
     assert plane.checkin.time_left(time.monotonic()) == 0.0

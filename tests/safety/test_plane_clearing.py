@@ -79,10 +79,10 @@ def test_a_local_clear_frees_names_who_and_survives_a_restart(plane: SafetyPlane
     assert [each["payload"]["who"] for each in read_audit_log() if each["event"] == "resume_local"] == ["ann"]
 
 
-def test_a_slip_laid_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane, add: Add) -> None:
+def test_order_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane, add: Add) -> None:
     robots = {name: add(name) for name in ("arm-1", "arm-2")}
     plane.emergency_stop(order())
-    clearance.lay("ann", ["arm-1"])
+    clearance.order_clearance("ann", ["arm-1"])
     eventually(lambda: not robots["arm-1"].refuses())
     assert robots["arm-2"].refuses()
     eventually(lambda: [each.suffix for each in clearance.clearances().iterdir()] == [".said"])
@@ -98,7 +98,7 @@ def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_say
     assert clearance.clear_here("ann", ["arm-1"], wait_s=20) == {"arm-1": "cleared"}
     assert not running.refuses(), "what is told to be cleared is"
     plane.emergency_stop(order())
-    # Nobody takes the slips of the others: they are waited for to the end.
+    # No process takes the orders of the others, which are waited for to the end.
     outcome = clearance.clear_here("ann", ["arm-2", "arm-3"], wait_s=0.1)
     assert outcome == {"arm-2": "cleared on disk", "arm-3": "not locked here"}
     assert running.refuses()
@@ -113,7 +113,7 @@ class SlowProcess:
 
     def __init__(self) -> None:
         self.doing, self.go_on = threading.Event(), threading.Event()
-        self._desk = clearance.ClearanceDesk(lambda: ["arm-1"], self._clear)
+        self._inbox = clearance.ClearanceInbox(lambda: ["arm-1"], self._clear)
         self._thread = threading.Thread(target=lambda: eventually(self._took, within=60))
 
     def _clear(self, who: str, name: str) -> str:
@@ -122,7 +122,7 @@ class SlowProcess:
         return "cleared"
 
     def _took(self) -> bool:
-        self._desk.look(0.0)
+        self._inbox.look(0.0)
         return self.doing.is_set()
 
     def __enter__(self) -> SlowProcess:
@@ -134,43 +134,43 @@ class SlowProcess:
         self._thread.join()
 
 
-def test_cleared_is_said_once_the_process_has_done_it() -> None:
-    said: list[dict[str, str]] = []
-    asking = threading.Thread(target=lambda: said.append(clearance.clear_here("ann", ["arm-1"], wait_s=30)))
+def test_cleared_is_answered_once_the_process_has_done_it() -> None:
+    answers: list[dict[str, str]] = []
+    asking = threading.Thread(target=lambda: answers.append(clearance.clear_here("ann", ["arm-1"], wait_s=30)))
     with SlowProcess() as process:
         asking.start()
         assert process.doing.wait(20)
         asking.join(0.2)
-        assert said == []
+        assert answers == []
         process.go_on.set()
         asking.join()
-    assert said == [{"arm-1": "cleared"}]
+    assert answers == [{"arm-1": "cleared"}]
 
 
-def test_an_order_that_its_process_does_not_carry_out_is_not_said_to_be_cleared() -> None:
+def test_order_that_is_not_carried_out_is_not_reported_as_cleared() -> None:
     with SlowProcess():
-        said = clearance.clear_here("ann", ["arm-1"], wait_s=2.0)
-    assert "has not carried it out" in said["arm-1"]
+        answers = clearance.clear_here("ann", ["arm-1"], wait_s=2.0)
+    assert "has not carried it out" in answers["arm-1"]
     assert list(clearance.clearances().iterdir()) == []
 
 
-def test_an_order_from_another_time_is_void_and_not_said_to_be_cleared(
+def test_order_from_another_time_is_void_and_not_reported_as_cleared(
     plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def lay_an_hour_ago(who: str, names: list[str]) -> list[Path]:
+    def order_an_hour_ago(who: str, names: list[str]) -> list[Path]:
         clearance.clearances().mkdir(mode=0o700, parents=True)
-        slip = clearance.clearances() / "a.draft"
-        slip.write_text(json.dumps({"who": who, "robot_id": names[0], "t": time.time() - 3600}), encoding="utf-8")
-        return [slip.replace(slip.with_suffix(".json"))]
+        order = clearance.clearances() / "a.draft"
+        order.write_text(json.dumps({"who": who, "robot_id": names[0], "t": time.time() - 3600}), encoding="utf-8")
+        return [order.replace(order.with_suffix(".json"))]
 
-    monkeypatch.setattr(clearance, "lay", lay_an_hour_ago)
+    monkeypatch.setattr(clearance, "order_clearance", order_an_hour_ago)
     robot = add()
     plane.emergency_stop(order())
     assert "nothing was cleared" in clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
     assert robot.refuses()
 
 
-def test_a_running_robot_that_is_not_locked_is_not_said_to_be_cleared(plane: SafetyPlane, add: Add) -> None:
+def test_running_robot_that_is_not_locked_is_not_reported_as_cleared(plane: SafetyPlane, add: Add) -> None:
     add("arm-1")
     add("arm-2")
     plane.emergency_stop(order())
@@ -178,7 +178,7 @@ def test_a_running_robot_that_is_not_locked_is_not_said_to_be_cleared(plane: Saf
     assert clearance.clear_here("ann", ["arm-1"], wait_s=20) == {"arm-1": "not locked here"}
 
 
-def test_a_robot_that_leaves_before_its_order_is_carried_out_is_not_said_to_be_cleared(
+def test_robot_that_leaves_before_its_order_is_not_reported_as_cleared(
     plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clear = plane.clear_local
@@ -195,7 +195,7 @@ def test_a_robot_that_leaves_before_its_order_is_carried_out_is_not_said_to_be_c
     assert robot.refuses()
 
 
-def test_a_robot_whose_clearing_no_disk_took_is_free_and_that_is_said(
+def test_robot_whose_clearance_was_not_stored_is_free_and_that_is_reported(
     plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = add(key="k")
@@ -205,13 +205,13 @@ def test_a_robot_whose_clearing_no_disk_took_is_free_and_that_is_said(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(plane.store, "save", full)
-    said = clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
-    assert said == "cleared, but not kept on the disk: after a restart it may be locked again"
+    answers = clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
+    assert answers == "cleared, but not kept on the disk: after a restart it may be locked again"
     assert not robot.refuses()
     assert LockoutStore().load("k").state.locked
 
 
-def test_what_was_left_half_done_at_the_desk_is_removed_after_a_minute(plane: SafetyPlane, add: Add) -> None:
+def test_unfinished_orders_are_removed_after_a_minute(plane: SafetyPlane, add: Add) -> None:
     add()
     directory = clearance.clearances()
     directory.mkdir(mode=0o700, parents=True)
@@ -226,10 +226,10 @@ def test_what_was_left_half_done_at_the_desk_is_removed_after_a_minute(plane: Sa
     eventually(lambda: list(directory.iterdir()) == [young])
 
 
-def test_a_slip_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:
+def test_order_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:
     robot = add()
     plane.emergency_stop(order())
-    clearance.lay("ann", ["arm-1"])
+    clearance.order_clearance("ann", ["arm-1"])
     clearance.clearances().chmod(0o777)
     time.sleep(0.6)
     assert robot.refuses()

@@ -33,12 +33,12 @@ _importing = threading.Lock()
 
 
 def light() -> bool:
-    """Whether LeRobot has to do without torch."""
+    """Return True where torch is not installed, so that LeRobot has to do without it."""
     return importlib.util.find_spec("torch") is None
 
 
 def lerobot_module(name: str) -> ModuleType:
-    """A module of LeRobot's, such as ``lerobot.robots``; its drivers also where torch is not installed.
+    """Import a module of LeRobot's, such as ``lerobot.robots``; its drivers also where torch is not installed.
 
     Raises:
         ModuleNotFoundError: LeRobot, or something the module really needs, is not installed.
@@ -72,7 +72,7 @@ def _standin(name: str, words: tuple[str, ...]) -> ModuleType:
 
 
 def unplugged(device: Any) -> bool:
-    """Whether the serial port that a LeRobot device has open is gone from the machine.
+    """Return True when the serial port that a LeRobot device has open is gone from the machine.
 
     LeRobot calls a bus connected for as long as its port object is open, also when the cable is out. The node of a
     removed port has no name left, so the open file has no links.

@@ -21,16 +21,16 @@ StopLevel = Literal["hold", "release"]
 STOP_LEVELS = ("hold", "release")
 
 READ_TRIES = 3
-"""How often joints are asked for before a motor counts as silent; LeRobot waits 50 ms for each answer."""
+"""Joint reads that fail before a motor counts as silent; LeRobot waits 50 ms for each answer."""
 
 CONNECT_TRIES = 3
-"""How often connecting is tried: it takes some two hundred exchanges, and LeRobot gives up at the first lost one.
+"""Attempts to connect: it takes some two hundred exchanges, and LeRobot gives up at the first lost one.
 
 A motor that does not answer its first ping is a ``RuntimeError`` of LeRobot's, one that falls silent later a
 ``ConnectionError``."""
 
 HOLD_FRESH_S = 0.25
-"""How old the last joint read may be to be held at when a new one fails."""
+"""Greatest age, in seconds, of a joint read whose positions are held when a new one fails."""
 
 _INTERFACE = ("get_observation", "send_action", "connect", "disconnect")
 
@@ -82,7 +82,7 @@ class DeviceBody:
 
     @property
     def is_connected(self) -> bool:
-        """What the device says; a device that says nothing counts as connected."""
+        """The device's own state; a device without one counts as connected."""
         return bool(getattr(self.device, "is_connected", True))
 
     @property

@@ -133,7 +133,7 @@ class JointReach:
 
 
 LOOK_TRIES = 5
-"""How often joints are asked for before the calibration is given up; LeRobot waits 50 ms for each answer."""
+"""Joint reads that fail before the calibration is given up; LeRobot waits 50 ms for each answer."""
 
 
 class Calibrator:

@@ -57,7 +57,7 @@ def _here() -> str:
 
 
 BY_ID = Path("/dev/serial/by-id")
-"""Where Linux names serial ports by the make and serial number of their adapter."""
+"""Directory in which Linux names serial ports by the make and serial number of their adapter."""
 
 _HOSTS = ("remote_ip", "robot_ip", "ip_address", "host", "ip")
 

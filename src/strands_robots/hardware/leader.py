@@ -1,4 +1,4 @@
-"""A leader arm on a motor bus of its own, read as a follower is: one lost answer is no lost beat."""
+"""A leader arm on a motor bus of its own; like a follower it is read again after one lost answer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from strands_robots.hardware.body import DeviceBody
 from strands_robots.policies.base import Action
 
 READ_TRIES = 3
-"""How often the joints are asked for before a frame counts as unusable; LeRobot waits 50 ms for each answer."""
+"""Joint reads that fail before a frame counts as unusable; LeRobot waits 50 ms for each answer."""
 
 
 class LeaderArm:
@@ -27,7 +27,7 @@ class LeaderArm:
 
     @property
     def is_connected(self) -> bool:
-        """What the device says; a device that says nothing counts as connected."""
+        """The device's own state; a device without one counts as connected."""
         return bool(getattr(self.device, "is_connected", True))
 
     def __enter__(self) -> Self:
@@ -40,14 +40,14 @@ class LeaderArm:
         try:
             self.device.disconnect()
         except OSError:
-            # Its cable is out, or a servo silent: there is nothing left to say goodbye to.
+            # Its cable is out, or a servo does not answer.
             drop(self.device)
 
     def get_action(self) -> Action:
-        """Where the arm is held, by action key. Raises what the device raises when it does not answer thrice."""
+        """Read the joints by action key. Raises what the device raises when it does not answer three times."""
         with self._lock:
             for left in reversed(range(READ_TRIES)):
-                # An answer that came late would be taken for this one's, and every read after it be old.
+                # A late answer would be taken for this one's, and every read after it would be old.
                 forget_input(self.device)
                 try:
                     return dict(self.device.get_action())
@@ -57,6 +57,6 @@ class LeaderArm:
         raise AssertionError  # the last try returns or raises
 
     def get_teleop_events(self) -> dict[str, Any] | None:
-        """What the device tells besides its joints, where it does."""
+        """Read the device's events besides its joints; None for a device without any."""
         read = getattr(self.device, "get_teleop_events", None)
         return dict(read()) if callable(read) else None

@@ -41,10 +41,10 @@ from strands_robots.utils import ValidationError, choice, number, text
 logger = logging.getLogger(__name__)
 
 WIND_DOWN_S = 5.0
-"""How much longer than its duration :meth:`HardwareRobot.run_task` waits for a task to end."""
+"""Seconds beyond its duration that :meth:`HardwareRobot.run_task` waits for a task."""
 
 IDLE_WAIT_S = 1.0
-"""How long a read of the state waits for the bus while nothing drives the robot."""
+"""Seconds that a read of the state waits for the bus while nothing drives the robot."""
 
 
 class HardwareRobot(TeleopMixin):

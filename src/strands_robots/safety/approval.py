@@ -55,7 +55,7 @@ class Claim:
     def give_back(self) -> None:
         """The verb was not done: a grant may be claimed again until it expires."""
         if self.file is not None:
-            with contextlib.suppress(FileNotFoundError):  # somebody tidied the folder meanwhile
+            with contextlib.suppress(FileNotFoundError):  # the folder was tidied meanwhile
                 self.file.rename(self.file.with_name(self.file.name.removesuffix(_CLAIMED)))
 
 
@@ -116,7 +116,7 @@ class Grants:
 
 
 class Approval:
-    """Whether the operator approved a verb of one robot.
+    """The operator's approval of the verbs of one robot.
 
     Args:
         read_list: gives the list of a setting by its name.
@@ -135,14 +135,14 @@ class Approval:
         self._grants = grants
 
     def claim(self, verb: str, peer: str) -> Claim | None:
-        """Leave to do ``verb`` on ``peer`` now, or None when the operator has not approved it."""
+        """Return leave to do ``verb`` on ``peer`` now, or None when the operator has not approved it."""
         if listed(verb, peer, self._read("STRANDS_ROBOT_COMMAND_ALLOW")) or self._bypass():
             return Claim()
         return self._grants().claim(verb, peer)
 
     @staticmethod
     def refusal(verb: str, peer: str) -> str:
-        """The sentence for a verb that is not approved; it names every way to approve it."""
+        """Return the refusal of a verb that is not approved; it names every way to approve it."""
         return (
             f"{verb} moves real hardware and needs operator approval: the operator runs "
             f"'strands-robots grant {verb}@{peer}' for one time, or adds {verb} or {verb}@{peer} to "

@@ -1,4 +1,4 @@
-"""May this caller? Who may move a robot, whose emergency stop counts, which policy may be asked for.
+"""Authorization: callers that may move a robot or stop it, and policies that they may ask for.
 
 A caller's name is what the caller says it is: no transport of Device Connect vouches for it unless a broker's
 access rules do, so a name here is a label to sort by and to log, not a proof. Stops and reads never come
@@ -27,14 +27,14 @@ NAME_MAX = 255
 
 
 def caller_name(source: object) -> str | None:
-    """The declared name, or None for whatever names nobody: no string, blank, too long or unprintable."""
+    """Return the declared name, or None for a value that is none: no string, blank, too long or unprintable."""
     if not isinstance(source, str) or not source.strip() or len(source) > NAME_MAX or not source.isprintable():
         return None
     return source
 
 
 def entries(words: Sequence[str]) -> tuple[str, ...]:
-    """The list without its blanks; empty means that nobody set it."""
+    """Return the list without its blanks; empty means that it is not set."""
     return tuple(word.strip() for word in words if word.strip())
 
 
@@ -44,9 +44,9 @@ def matches(name: str, words: Sequence[str]) -> bool:
 
 
 def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> str | None:
-    """Why ``source`` may not move a robot, or None.
+    """Return the reason why ``source`` may not move a robot, or None.
 
-    Without a list a simulation moves for anybody and real hardware for nobody. ``*`` and the other globs admit
+    Without a list every caller may move a simulation and none real hardware. ``*`` and the other globs admit
     named callers; only the entry ``anonymous`` admits the unnamed.
     """
     listed, name = entries(allow), caller_name(source)
@@ -70,7 +70,7 @@ def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> s
 
 
 def estop_refusal(source: object, allow: Sequence[str]) -> str | None:
-    """Why an emergency stop of ``source`` does not count, or None. Without a list every named source counts."""
+    """Return the reason why a stop of ``source`` does not count, or None. Without a list every named source counts."""
     name, listed = caller_name(source), entries(allow)
     if name is None:
         return "an emergency stop without a source is not honoured"
@@ -80,7 +80,7 @@ def estop_refusal(source: object, allow: Sequence[str]) -> str | None:
 
 
 def provider_refusal(provider: str, allow: Sequence[str]) -> str | None:
-    """Why a caller may not ask for a policy provider, or None. Without a list every registered one is open."""
+    """Return the reason why a policy provider is refused, or None. Without a list every registered one is open."""
     listed = entries(allow)
     if not listed or matches(provider, listed):
         return None
@@ -103,16 +103,16 @@ class Authorization:
         self.hardware = hardware
         self._read = read_list
         self._robot = robot
-        self._told = threading.Event()
+        self._warned = threading.Event()
 
     def motion(self, source: object, verb: str) -> str | None:
-        """Why ``source`` may not do ``verb``, or None; a refusal and its caller are logged."""
+        """Return the reason why ``source`` may not do ``verb``, or None; a refusal and its caller are logged."""
         allow = self._read("DEVICE_CONNECT_RPC_ALLOW")
         refusal = motion_refusal(source, allow, hardware=self.hardware)
         if refusal is not None:
             logger.warning("%s: %s refused to caller %s (self-declared).", self._robot, verb, shown(source))
-        elif not entries(allow) and not self._told.is_set():
-            self._told.set()
+        elif not entries(allow) and not self._warned.is_set():
+            self._warned.set()
             logger.warning(
                 "%s moves for anybody on its network: it is a simulation and DEVICE_CONNECT_RPC_ALLOW is not set.",
                 self._robot,
@@ -120,9 +120,9 @@ class Authorization:
         return refusal
 
     def estop(self, source: object) -> str | None:
-        """Why an emergency stop of ``source`` does not count, or None."""
+        """Return the reason why an emergency stop of ``source`` does not count, or None."""
         return estop_refusal(source, self._read("DEVICE_CONNECT_ESTOP_ALLOW"))
 
     def provider(self, provider: str) -> str | None:
-        """Why ``provider`` may not be asked for over the network, or None."""
+        """Return the reason why ``provider`` is refused over the network, or None."""
         return provider_refusal(provider, self._read("STRANDS_MESH_POLICY_TYPE_ALLOW"))

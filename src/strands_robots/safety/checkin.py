@@ -11,9 +11,9 @@ CONTROLLERS_MAX = 64
 
 
 class CheckIn:
-    """When each controller was last heard, and whether that is too long ago.
+    """The last check-in of each controller, and the time that is left.
 
-    The clock runs from the start: a robot that needs a controller and never hears one stops too. After it has
+    The clock runs from the start: a robot that needs a controller and never receives a check-in stops too. After it has
     lapsed once it is at rest until a controller checks in or the robots are free again.
     """
 
@@ -28,35 +28,35 @@ class CheckIn:
         """True when a live controller is needed."""
         return self.timeout_s > 0
 
-    def heard(self, controller: str, now: float) -> None:
-        """``controller`` has checked in."""
+    def record(self, controller: str, now: float) -> None:
+        """Record a check-in of ``controller``."""
         if controller not in self._last and len(self._last) >= CONTROLLERS_MAX:
             del self._last[min(self._last, key=self._last.__getitem__)]
         self._last[controller] = now
         self._lapsed = False
 
     def rearm(self, now: float) -> None:
-        """The robots are free again: the timeout starts anew, and whoever went silent before is forgotten."""
+        """Start the timeout anew when the robots are free again, and forget the controllers that fell silent."""
         self._last = {name: at for name, at in self._last.items() if now - at <= self.timeout_s}
         self._since = now
         self._lapsed = False
 
     def time_left(self, now: float) -> float | None:
-        """Seconds until the robots stop for want of a controller; None while off, 0 once lapsed."""
+        """Return the seconds until the robots stop for want of a controller; None while off, 0 once lapsed."""
         if not self.on:
             return None
         latest = max([self._since, *self._last.values()])
         return 0.0 if self._lapsed else max(0.0, self.timeout_s - (now - latest))
 
     def lapsed(self, now: float) -> tuple[str, ...] | None:
-        """Once, when the last controller has been silent for the timeout: who they were. Else None."""
+        """Return, once, the controllers when the last has been silent for the timeout; else None."""
         if not self.on or self._lapsed or (self.time_left(now) or 0.0) > 0.0:
             return None
         self._lapsed = True
         return tuple(sorted(self._last))
 
     def fields(self, now: float) -> dict[str, object]:
-        """For ``getStatus``: timeout and time left in seconds, and the controllers by the age of their last word."""
+        """Return the fields of ``getStatus``: timeout, seconds left, and the age of each controller's last check-in."""
         left = self.time_left(now)
         return {
             "required": self.on,

@@ -1,8 +1,8 @@
-"""The desk at the robot's own machine: how ``resume --local`` reaches a running process, and one that is not.
+"""Clearances: how ``strands-robots resume --local`` clears robots, whether their process runs or not.
 
-Whoever may write into the state directory, which is its owner's alone, is at the machine. A slip of paper laid
-there names who clears which robots; each process looks while one of its robots is locked, takes what is meant for
-its robots, and the audit says who laid it. Slips older than a minute are void.
+A user who may write into the state directory, which is its owner's alone, is at the machine. A file there orders the
+clearance of one robot and names the operator; each process looks while one of its robots is locked, takes the orders
+for its robots, and audits the operator. Orders older than a minute are void.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ VOID = "its process found the order older than a minute, or ahead of its clock; 
 
 
 def clearances() -> Path:
-    """Where the slips lie."""
+    """Return the directory of the orders."""
     return state_dir() / "clearances"
 
 
-def lay(who: str, robot_ids: Iterable[str]) -> list[Path]:
-    """Lay a slip for each robot; it is taken within a second by the process that holds the robot.
+def order_clearance(who: str, robot_ids: Iterable[str]) -> list[Path]:
+    """Write an order for each robot; the process of the robot takes it within a second.
 
     Raises:
         ValidationError: ``who`` is blank, or a name is no identifier.
@@ -51,13 +51,13 @@ def lay(who: str, robot_ids: Iterable[str]) -> list[Path]:
     names = [identifier("robot_id", each) for each in robot_ids]
     directory = clearances()
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    return [_lay(directory, {"who": who, "robot_id": name, "t": time.time()}) for name in names]
+    return [_write_order(directory, {"who": who, "robot_id": name, "t": time.time()}) for name in names]
 
 
 def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[str, str]:
-    """Clear robots of this machine at the word of ``who``, whether their process runs or not.
+    """Clear robots of this machine for the operator ``who``, whether their process runs or not.
 
-    Returns, for each name: what its running process says it did, ``cleared`` where it did so and kept it; ``cleared
+    Returns, for each name, the outcome: that of its running process, ``cleared`` where it did so and kept it; ``cleared
     on disk`` where none runs; ``not locked here``; or that the process took the order and has not carried it out.
     Waits at most ``wait_s`` seconds for the processes to take the orders and as long for them to carry them out.
     What was cleared is recorded in the audit.
@@ -67,11 +67,11 @@ def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[
         OSError, ValueError: the state directory or the lockout file cannot be used.
     """
     names = list(dict.fromkeys(robot_ids))
-    slips = dict(zip(names, lay(who, names), strict=True))
-    _until(lambda: not any(path.exists() for path in slips.values()), time.monotonic() + wait_s)
+    orders = dict(zip(names, order_clearance(who, names), strict=True))
+    _until(lambda: not any(path.exists() for path in orders.values()), time.monotonic() + wait_s)
     deadline = time.monotonic() + wait_s
     outcome: dict[str, str] = {}
-    for name, path in slips.items():
+    for name, path in orders.items():
         try:
             path.unlink()
         except FileNotFoundError:
@@ -81,13 +81,13 @@ def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[
     return outcome
 
 
-def _answered(slip: Path, deadline: float) -> str:
-    said = _said(slip)
-    if _until(said.exists, deadline):
-        answer = said.read_text(encoding="utf-8")
-        said.unlink(missing_ok=True)
+def _answered(order: Path, deadline: float) -> str:
+    answer_file = _answer_of(order)
+    if _until(answer_file.exists, deadline):
+        answer = answer_file.read_text(encoding="utf-8")
+        answer_file.unlink(missing_ok=True)
         return answer
-    _taken(slip).unlink(missing_ok=True)
+    _taken(order).unlink(missing_ok=True)
     return "its process took the order and has not carried it out; ask for its state"
 
 
@@ -99,14 +99,14 @@ def _until(condition: Callable[[], bool], deadline: float) -> bool:
     return True
 
 
-def _taken(slip: Path) -> Path:
-    """Where a slip lies while the process that took it clears the robot."""
-    return slip.with_suffix(".taken")
+def _taken(order: Path) -> Path:
+    """Return the path of an order while its process clears the robot."""
+    return order.with_suffix(".taken")
 
 
-def _said(slip: Path) -> Path:
-    """Where the process that took a slip says what came of it, for whoever waits."""
-    return slip.with_suffix(".said")
+def _answer_of(order: Path) -> Path:
+    """Return the path of the answer of the process that took an order."""
+    return order.with_suffix(".said")
 
 
 def _clear_on_disk(who: str, name: str) -> bool:
@@ -121,21 +121,21 @@ def _clear_on_disk(who: str, name: str) -> bool:
     return True
 
 
-def _lay(directory: Path, slip: dict[str, Any]) -> Path:
+def _write_order(directory: Path, order: dict[str, Any]) -> Path:
     path = directory / f"{secrets.token_hex(8)}.json"
     draft = path.with_suffix(".draft")
     descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     with os.fdopen(descriptor, "w") as file:
-        json.dump(slip, file)
+        json.dump(order, file)
     return draft.replace(path)
 
 
-class ClearanceDesk:
-    """Looks for slips that are meant for this process.
+class ClearanceInbox:
+    """Orders for the robots of this process.
 
     Args:
-        here: the ids of the robots that this process holds.
-        clear: clears the named robot at the word of somebody, and says what came of it.
+        here: returns the ids of the robots of this process.
+        clear: clears the named robot for the named operator, and returns the outcome.
     """
 
     def __init__(self, here: Callable[[], Collection[str]], clear: Callable[[str, str], str]) -> None:
@@ -144,44 +144,44 @@ class ClearanceDesk:
         self._looked = float("-inf")
 
     def look(self, every_s: float = 0.3) -> None:
-        """Take the slips for robots of this process and act on those still valid."""
+        """Take the orders for robots of this process and act on those still valid."""
         now = time.monotonic()
         if now - self._looked < every_s:
             return
         self._looked = now
-        for path, slip in _slips():
-            if slip["robot_id"] not in self._here():
+        for path, order in _orders():
+            if order["robot_id"] not in self._here():
                 continue
             try:
                 taken = path.replace(_taken(path))
             except FileNotFoundError:
                 continue  # another process took it
-            valid = -5.0 < time.time() - slip["t"] < VALID_S
-            answer = self._clear(slip["who"], slip["robot_id"]) if valid else VOID
-            with contextlib.suppress(FileNotFoundError):  # nobody waits for it any more
+            valid = -5.0 < time.time() - order["t"] < VALID_S
+            answer = self._clear(order["who"], order["robot_id"]) if valid else VOID
+            with contextlib.suppress(FileNotFoundError):  # no caller waits for it any more
                 with taken.open("r+", encoding="utf-8") as file:
                     file.truncate()
                     file.write(answer)
-                taken.replace(_said(path))
+                taken.replace(_answer_of(path))
 
 
-def _slips() -> Iterator[tuple[Path, dict[str, Any]]]:
+def _orders() -> Iterator[tuple[Path, dict[str, Any]]]:
     directory = clearances()
-    with contextlib.suppress(FileNotFoundError):  # nobody laid anything yet
+    with contextlib.suppress(FileNotFoundError):  # there was no order yet
         status = directory.lstat()
         if status.st_uid != os.getuid() or status.st_mode & 0o022:
             logger.error("%s may be written by others; no clearance is taken from it.", directory)
             return
         _sweep(directory)
         for path in sorted(directory.glob("*.json")):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # taken by another, or no slip
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # taken by another, or no order
                 if not path.is_symlink():
-                    slip = json.loads(path.read_text())
-                    yield path, {"who": str(slip["who"]), "robot_id": str(slip["robot_id"]), "t": float(slip["t"])}
+                    order = json.loads(path.read_text())
+                    yield path, {"who": str(order["who"]), "robot_id": str(order["robot_id"]), "t": float(order["t"])}
 
 
 def _sweep(directory: Path) -> None:
-    """Remove what somebody who is gone left half done, and answers that nobody waited for."""
+    """Remove orders of processes that died, and answers that no caller waited for."""
     for path in directory.iterdir():
         with contextlib.suppress(OSError):  # gone meanwhile, or none of ours
             if path.suffix in (".taken", ".draft", ".said") and time.time() - path.lstat().st_mtime > VALID_S:

@@ -1,4 +1,4 @@
-"""The hand on the button: an emergency stop that is repeated until each expected robot has answered for itself.
+"""The safety controller: an emergency stop that is repeated until each expected robot has answered.
 
 :class:`SafetyController` owns a link that carries stops, check-ins and verdicts and nothing else, so that no call
 and no telemetry of its process stands before a stop.
@@ -49,7 +49,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class StopReport:
-    """What became of one emergency stop, by name.
+    """Outcome of one emergency stop, by robot.
 
     ``stopped``, ``not_stopped`` and ``refused`` map a robot to its answer; ``silent`` are the expected ones that
     gave none. ``link``: the stop left this machine at least once. ``elapsed_ms`` is the time until the last answer
@@ -66,13 +66,13 @@ class StopReport:
 
     @property
     def ok(self) -> bool:
-        """True when every robot that was expected or answered is known to be still; nobody at all is not ok."""
+        """True when every robot that was expected or answered is known to be still; no answer at all is not ok."""
         return bool(self.stopped) and not (self.not_stopped or self.refused or self.silent)
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a running stop stands; given to ``on_progress`` at each change."""
+    """State of a running stop; given to ``on_progress`` at each change."""
 
     estop_id: str
     answered: Mapping[str, Answer]
@@ -91,7 +91,7 @@ class SafetyController:
         controller_id: the source that robots see; their allowlist must admit it.
         make_link: gives the connection of its own.
         signing_key: Ed25519 private key, for fleets that ask for signed stops.
-        on_link: told at once when the link is lost or back.
+        on_link: called at once when the link is lost or back.
     """
 
     def __init__(
@@ -111,11 +111,11 @@ class SafetyController:
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
         self._link = make_link()
-        self._link.open((VERDICT,), self._hear, self._link_changed)
+        self._link.open((VERDICT,), self._receive, self._link_changed)
 
     @property
     def link_up(self) -> bool:
-        """True while the link reaches somebody."""
+        """True while the link reaches a peer."""
         return self._link.up
 
     def wait_link(self, timeout: float) -> bool:
@@ -136,11 +136,11 @@ class SafetyController:
 
         The stop is sent at once and again until each ``expected`` robot has answered or ``deadline_s`` is over; while
         the link is down it waits for it and is sent in the moment it is back. Without ``expected`` it is repeated to
-        the deadline, and whoever answers is in the report.
+        the deadline, and every robot that answers is in the report.
 
         Args:
             expected: ids of the robots that must answer.
-            reason: told to the robots and their logs, at most 200 characters.
+            reason: for the robots and their logs, at most 200 characters.
             deadline_s: seconds until silence is reported as silence.
             estop_id: 32 hex digits; a fresh one by default.
             on_progress: called at each answer, when the link changes, and once 100 ms have passed.
@@ -153,7 +153,7 @@ class SafetyController:
         with self._changed:
             self._stops[run.estop_id] = run
         try:
-            # The first one leaves before anything else is done.
+            # The first one is sent before anything else is done.
             run.sent = self._link.publish(self.controller_id, ESTOP, payload)
             self._repeat(run, payload, deadline_s, on_progress)
         finally:
@@ -162,7 +162,7 @@ class SafetyController:
         return self._report(run)
 
     def expect(self, estop_id: str, names: Collection[str]) -> None:
-        """Name further robots that must answer the running stop ``estop_id``: for a roll called after it has left."""
+        """Name further robots that must answer the running stop ``estop_id``, as when they are looked up after it."""
         with self._changed:
             run = self._stops.get(estop_id)
             if run is not None:
@@ -190,7 +190,7 @@ class SafetyController:
         self._link.close()
 
     def _repeat(self, run: _Running, payload: bytes, deadline_s: float, on_progress: OnProgress) -> None:
-        pauses, told = iter(REPEAT_S), -1
+        pauses, reported = iter(REPEAT_S), -1
         pause, next_send, again = 0.0, run.started, 0
         renew_at = run.started + max(SETTLE_S, RENEW_S - self._unanswered_s)
         while True:
@@ -199,8 +199,8 @@ class SafetyController:
             with self._changed:
                 state = hash((len(run.answers), len(run.expected), late, self._link.up))
                 finished = run.complete or now - run.started >= deadline_s
-            if state != told or finished:
-                told = state
+            if state != reported or finished:
+                reported = state
                 on_progress(run.progress(self._link.up, now))
             if finished:
                 self._unanswered_s = self._unanswered_s + now - run.started if run.unanswered else 0.0
@@ -246,7 +246,7 @@ class SafetyController:
             logger.critical("Emergency stop %s never left: the link of %s is down.", run.estop_id, self.controller_id)
         return report
 
-    def _hear(self, event: str, source: str, payload: bytes) -> None:
+    def _receive(self, event: str, source: str, payload: bytes) -> None:
         at = time.monotonic()
         try:
             params = json.loads(payload)["params"]
@@ -302,7 +302,7 @@ class _Running:
 
     @property
     def unanswered(self) -> bool:
-        """Somebody who is expected, or anybody at all, gave no answer yet."""
+        """An expected robot, or every robot, has not answered yet."""
         return not self.answers or not self.expected <= self.answers.keys()
 
     def progress(self, link_up: bool, now: float) -> Progress:

@@ -93,7 +93,7 @@ def public_half(signing_key: Any) -> bytes:
 
 
 def passphrase_error(passphrase: str) -> str | None:
-    """Why a passphrase is too weak for an operator's key, or None."""
+    """Return the reason why a passphrase is too weak for an operator's key, or None."""
     classes = (str.islower, str.isupper, str.isdigit, lambda c: not c.isalnum())
     kinds = sum(any(kind(c) for c in passphrase) for kind in classes)
     if len(passphrase) < PASSPHRASE_MIN or kinds < PASSPHRASE_CLASSES or len(set(passphrase)) < PASSPHRASE_DISTINCT:

@@ -37,8 +37,8 @@ SOURCES_MAX = 256
 CHECK_IN_AGE_S = 60.0
 
 SWITCH_S = 0.0005
-"""How long a busy Python thread may keep the interpreter from the stop's threads while the listener runs; Python's own
-default is ten times that, and a stop wakes three threads."""
+"""Longest time in seconds that a busy Python thread may keep the interpreter from the stop's threads while the listener
+runs; Python's own default is ten times that, and a stop wakes three threads."""
 
 BUCKETS = 64
 BUCKET_CAPACITY = 16
@@ -327,7 +327,7 @@ class EstopListener:
         if why is not None:
             self._refusals.record(StopRefused(source, why), received.event)
         else:
-            self._plane.checkin.heard(source, received.at)
+            self._plane.checkin.record(source, received.at)
 
     def _answer(self, report: RobotReport) -> None:
         key, now = (report.robot_id, report.epoch), time.monotonic()

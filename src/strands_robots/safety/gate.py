@@ -16,19 +16,20 @@ from itertools import count
 from typing import ParamSpec, Protocol
 
 from strands_robots.envelope import Envelope, error
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import MissingExtraError, ValidationError
 
 P = ParamSpec("P")
 
 
 class Latch(Protocol):
-    """What may hold a robot still: the lockout."""
+    """A lock on motion: the lockout of the robot."""
 
     def refusal(self, verb: str) -> Envelope | None:
         """The refusal of ``verb`` while locked, or None while clear."""
 
 
-class MotionRefused(RuntimeError):  # noqa: N818 - a refusal, not a fault
+class MotionRefused(StrandsRobotsError, RuntimeError):  # noqa: N818 - a refusal, not a fault
     """Motion is not allowed now; ``envelope`` is the answer to give."""
 
     def __init__(self, envelope: Envelope) -> None:
@@ -36,7 +37,7 @@ class MotionRefused(RuntimeError):  # noqa: N818 - a refusal, not a fault
         self.envelope = envelope
 
 
-class PermitVoidError(RuntimeError):
+class PermitVoidError(StrandsRobotsError, RuntimeError):
     """The permit was void when the write came: the motion was stopped in between, and nothing was written."""
 
 

@@ -1,7 +1,7 @@
 """Lockouts on disk: one small file for all robots of this machine, so that a restart unlocks nothing.
 
 A robot is kept under a key that outlives the process (see :func:`hardware_key`); a robot without one, an unnamed
-simulation, is not kept. Whoever cannot tell what the file says locks: a robot whose record is unreadable comes up
+simulation, is not kept. A file that cannot be read locks: a robot whose record is unreadable comes up
 under the overflow epoch, which an operator at the machine clears.
 """
 
@@ -56,7 +56,7 @@ class LockoutStore:
 
     @property
     def path(self) -> Path:
-        """Where the lockouts are."""
+        """The file."""
         return (self._directory or state_dir()) / "lockouts.json"
 
     @property
@@ -64,7 +64,7 @@ class LockoutStore:
         return self.path.with_suffix(".unreadable")
 
     def load(self, key: str) -> StoredLockout:
-        """What was kept under ``key``; nothing when there is no record, locked when it cannot be read.
+        """Return the record of ``key``; an empty one where there is none, a locked one where it cannot be read.
 
         A robot without a record is locked as well while a file that could not be read lies aside.
         """

@@ -16,7 +16,7 @@ from strands_robots.audit import log_safety_event
 from strands_robots.contract import Haltable, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
-from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceDesk
+from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceInbox
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.lockout import Lockout, LockoutLatch, LockoutState
 from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
@@ -35,7 +35,7 @@ ISSUER_EXCESS = 64
 
 
 class Stoppable(Haltable, Protocol):
-    """What the plane can hold: a robot with a gate and a halt."""
+    """A robot that the plane can stop: one with a gate and a halt."""
 
     gate: MotionGate
 
@@ -83,17 +83,17 @@ class Registered:
         self._plane.unregister(self)
 
     def adopt(self, key: str, kept: StoredLockout) -> None:
-        """Keep this robot under ``key`` from now on, and hold what was kept there."""
+        """Store this robot under ``key`` from now on, and take over the lockouts stored there."""
         self.key = key
         self.inherit(kept.state)
 
     def inherit(self, state: LockoutState) -> None:
-        """Hold what was held elsewhere, except what was resumed here since."""
+        """Take over the lockouts of another entry, except what was resumed here since."""
         for each in state.all:
             self.latch.engage(each.epoch, each.source, each.reason)
 
     def come_up_locked(self) -> None:
-        """Halt what moved before anybody knew that it is locked. Returns at once."""
+        """Halt motion that began before the robot was known to be locked. Returns at once."""
         for gate in self.gates:
             gate.revoke()
         logger.warning("%s comes up locked: epochs %s.", self.robot_id, ", ".join(self.epochs))
@@ -120,7 +120,7 @@ class Registered:
             logger.critical("%s comes up locked and DID NOT STOP: %s", self.robot_id, verdict.envelope().get("reason"))
 
     def remember(self, report: RobotReport) -> None:
-        """Keep the report for whoever asks about this stop again."""
+        """Keep the report for when this stop arrives again."""
         self.reports[report.epoch] = report
         while len(self.reports) > REPORTS_KEPT:
             del self.reports[next(iter(self.reports))]
@@ -149,7 +149,7 @@ class SafetyPlane:
         self._robots: dict[str, Registered] = {}
         self._reporter: Reporter | None = None
         self._issued: dict[str, int] = {}
-        self._desk = ClearanceDesk(self.robot_ids, self._clear_one)
+        self._clearance = ClearanceInbox(self.robot_ids, self._clear_one)
         self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
 
     @property
@@ -167,12 +167,12 @@ class SafetyPlane:
         return frozenset(self._robots)
 
     def register(self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "") -> Registered:
-        """Hold ``robot``: its gate refuses motion while it is locked, and every emergency stop halts it.
+        """Put ``robot`` under the plane: its gate refuses motion while it is locked, and every emergency stop halts it.
 
         Args:
             robot_id: its name in this process.
             wire_id: the name it answers by on its network and that a resume targets; ``robot_id`` by default.
-            key: what its lockout is kept under over a restart, from :func:`~.persistence.hardware_key` or
+            key: under which its lockout is stored over a restart, from :func:`~.persistence.hardware_key` or
                 :func:`~.persistence.simulation_key`. None: it is not kept.
 
         Registering the same robot again under its name, as its second network does, returns the same entry, which
@@ -226,7 +226,7 @@ class SafetyPlane:
         entry.leave_executor()
 
     def _inherit(self, entry: Registered) -> None:
-        """What a robot was locked by when it left the plane holds it here, though it is on no disk."""
+        """Lock the entry by the lockouts with which its robot left the plane, though they are on no disk."""
         living = [each.latch for each in self._robots.values()]
         for latch in entry.robot.gate.latches:
             if isinstance(latch, LockoutLatch) and latch is not entry.latch and latch not in living:
@@ -234,9 +234,9 @@ class SafetyPlane:
                 entry.robot.gate.detach(latch)
 
     def _bequeath(self, entry: Registered) -> None:
-        """The lock of a robot that leaves goes on: on the disk, and in the entry of its other name or its gate."""
+        """Keep the lock of a robot that leaves: on the disk, and in the entry of its other name or its gate."""
         if entry.locked and entry.latch.state is not entry.on_disk:
-            # Its last stop may still be on the way there, and whoever registers next reads it there.
+            # Its last stop may not be written yet, and the next registration reads it there.
             self._kept([entry])
         for gate in entry.gates:
             heirs = [each for each in self._robots.values() if gate in each.gates]
@@ -262,7 +262,7 @@ class SafetyPlane:
                 fresh.append(entry)
         reporter = self._reporter
         if reporter is None:
-            # The last robot is leaving; nobody reports it any more, and it is halted all the same.
+            # The last robot is leaving; its halt is not reported any more, and it is halted all the same.
             for entry in fresh:
                 self.executor.submit(entry.robot, entry.robot_id, order.reason)
         if not fresh or reporter is None:
@@ -341,7 +341,7 @@ class SafetyPlane:
         )
 
     def clear_local(self, who: str, robot_ids: Iterable[str] | None = None) -> dict[str, tuple[Lockout, ...]]:
-        """Clear everything that these robots hold (all by default) at the word of ``who``, at this machine."""
+        """Clear every lockout of these robots (all by default) for ``who``, an operator at this machine."""
         robots = self._robots
         cleared: dict[str, tuple[Lockout, ...]] = {}
         for name in robots.keys() & set(robots if robot_ids is None else robot_ids):
@@ -358,7 +358,7 @@ class SafetyPlane:
         return cleared
 
     def lockouts(self) -> dict[str, tuple[Lockout, ...]]:
-        """Who is locked now, and by what."""
+        """Return the locked robots and their lockouts."""
         return {name: entry.latch.state.all for name, entry in self._robots.items() if entry.locked}
 
     def _clear_one(self, who: str, robot_id: str) -> str:
@@ -425,7 +425,7 @@ class SafetyPlane:
 
     def _look(self) -> None:
         if any(entry.locked for entry in self._robots.values()):
-            self._desk.look()
+            self._clearance.look()
 
 
 _PLANE = SafetyPlane()

@@ -1,4 +1,4 @@
-"""After the halts were ordered: wait for the answers, keep the lockouts, report, record. Never on a stop's way.
+"""The reports of a stop: collects verdicts, stores the lockouts, reports and records. Never on a stop's way.
 
 One thread turns three things into reports: a halt's answer, the lockout file being written, and time. It waits for
 nothing else: the file is written by a thread of its own, and the audit has its own.
@@ -23,7 +23,7 @@ GRACE_S = 0.03
 """Lockouts are written when every robot has answered, or after this long: a slow halt delays only its own report."""
 
 KEEP_S = 0.7
-"""How long a report waits for the lockout file before it says ``persisted: false``."""
+"""Seconds that a report waits for the lockout file before it says ``persisted: false``."""
 
 OnReport = Callable[[RobotReport], None]
 OnDone = Callable[["StopRun"], None]
@@ -101,7 +101,7 @@ class Reporter:
         self._inbox.put(run)
 
     def answer(self, run: StopRun, robot_id: str, verdict: StopVerdict) -> None:
-        """A halt has answered."""
+        """Record the verdict of a halt."""
         self._inbox.put(_Answer(run, robot_id, verdict, time.monotonic()))
 
     def close(self) -> None:

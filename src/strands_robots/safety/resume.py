@@ -29,16 +29,16 @@ REFUSALS_MAX = 5
 BACK_OFF_S = 30.0
 NONCES_MAX = 4096
 ASSERTION_MAX_BYTES = 3600
-"""What one assertion may take of the 4 KiB of a message that relays it, beside the relay's own fields."""
+"""Longest assertion, of the 4 KiB of a message that relays it, beside the relay's own fields."""
 
 REJECTED = "resume rejected"
-"""All that the wire learns of a refusal."""
+"""The one answer to every refused resume on the wire."""
 
 _HEX32 = re.compile(r"[0-9a-f]{32}\Z")
 
 
 class Denial(Enum):
-    """Why an assertion was refused, in the order of the checks; for the local audit only."""
+    """Reasons to refuse an assertion, in the order of the checks; for the local audit only."""
 
     BACKING_OFF = "backing off after five refusals"
     NO_KEYS = "no public key is configured"
@@ -141,7 +141,7 @@ class ResumeVerifier:
         self._closed_until = float("-inf")
 
     def check(self, assertion: object, held: Sequence[str]) -> Admitted | Denial:
-        """Whether ``assertion`` clears one of the ``held`` epochs of this robot now."""
+        """Check that ``assertion`` clears one of the ``held`` epochs of this robot now."""
         with self._lock:
             now = self._monotonic()
             if now < self._closed_until:

@@ -1,8 +1,8 @@
-"""The one grader of "did it stop?".
+"""The grader of every answer to a stop.
 
-Whoever asks a robot to stop gets back something: a :class:`StopVerdict`, an envelope, a foreign robot's
+A robot that is asked to stop answers with a :class:`StopVerdict`, an envelope, a foreign robot's
 dictionary, an exception, or nothing in time. :func:`grade` sorts them. An affirmative failure, an exception,
-a timeout and a shape nobody knows are four different answers, and only an affirmative success is success.
+a timeout and an unknown shape are four different answers, and only an affirmative success is success.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 class Outcome(Enum):
-    """What an answer to a stop says."""
+    """Meaning of an answer to a stop."""
 
     STOPPED = "stopped"
     REFUSED = "did not stop"
@@ -40,7 +40,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class StopVerdict:
-    """What a robot's ``halt`` did.
+    """Outcome of a robot's ``halt``.
 
     ``halted`` names every motion source that was moving and is still now, ``not_stopped`` and ``unknown`` map a
     source to the reason. A verdict with nothing in any of them is a robot that was standing still: stopped.
@@ -53,7 +53,7 @@ class StopVerdict:
 
     @property
     def stopped(self) -> bool | None:
-        """True: nothing moves. False: something is known to. None: nobody knows."""
+        """True: nothing moves. False: something is known to. None: unknown."""
         if self.not_stopped:
             return False
         return None if self.unknown else True
@@ -76,7 +76,7 @@ class StopVerdict:
 
 
 def stop_level() -> Literal["hold", "limp"]:
-    """What a halt does to torque: ``hold`` keeps it on, so that an arm does not fall; ``limp`` takes it off.
+    """Return what a halt does to torque: ``hold`` keeps it on, so that an arm does not fall; ``limp`` takes it off.
 
     ``STRANDS_ESTOP_TORQUE``; a word that is neither is ``hold``, with one line in the log.
     """
@@ -113,7 +113,7 @@ def grade(answer: object) -> Outcome:
 
 
 def explain(answer: object) -> str:
-    """Why :func:`grade` did not say stopped, in a few words for an operator."""
+    """Return the reason why :func:`grade` did not say stopped, in a few words for an operator."""
     outcome = grade(answer)
     if outcome in (Outcome.RAISED, Outcome.TIMED_OUT):
         return f"{outcome.value}: {type(answer).__name__}: {answer}"
@@ -176,7 +176,7 @@ def _json_blocks(answer: Mapping[str, object]) -> list[Mapping[str, object]]:
 
 
 def _denies(fact: Mapping[str, object]) -> bool:
-    # An error whose own verdict is that nobody knows stays unknown when it has travelled as an envelope.
+    # An error whose own verdict is unknown stays unknown when it has travelled as an envelope.
     undecided = "stopped" in fact and fact["stopped"] is None
     return (
         (fact.get("status") == "error" and not undecided)

@@ -1,4 +1,4 @@
-"""What a real arm under LeRobot's driver tells of its motors."""
+"""Health of a real arm's motors under LeRobot's driver."""
 
 from __future__ import annotations
 

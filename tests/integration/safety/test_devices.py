@@ -113,7 +113,7 @@ class Floor:
 
 
 def recorded(event: str) -> list[dict[str, Any]]:
-    """What the audit holds under this name."""
+    """Return the audit records of this name."""
     return [each for each in read_audit_log() if each["event"] == event]
 
 

@@ -38,13 +38,13 @@ def held(robots: Child, name: str = "arm-1") -> list[str]:
 
 
 def halts(robots: Child) -> int:
-    """How often the robot was halted: a moment after it was locked, on a thread of its own."""
+    """Count the halts of the robot: a moment after it was locked, on a thread of its own."""
     count: int = robots.ask("facts")["arm-1"]["halts"]
     return count
 
 
 def events(robots: Child, name: str) -> list[dict[str, Any]]:
-    """What the audit, which verifies, holds under this name."""
+    """Return the records of this name from the audit, which verifies."""
     records, verifies = robots.ask("audit")
     assert verifies
     return [each["payload"] for each in records if each["event"] == name]
@@ -162,7 +162,7 @@ def test_a_signature_does_not_pass_from_one_source_or_stop_to_another(stage: Sta
     assert len(held(robots)) == 1
 
 
-def test_wrong_resumes_free_nobody_and_five_of_them_close_the_desk(stage: Stage) -> None:
+def test_wrong_resumes_free_no_robot_and_five_of_them_start_a_back_off(stage: Stage) -> None:
     key, stranger = Ed25519PrivateKey.generate(), Ed25519PrivateKey.generate()
     public = ed25519.encode(ed25519.public_half(key))
     robots = stage.robots("arm-1", "arm-2", STRANDS_MESH_RESUME_PUBLIC_KEY=public)

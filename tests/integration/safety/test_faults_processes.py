@@ -18,7 +18,7 @@ from strands_robots.safety.orders import new_epoch
 
 
 def recorded(robots: Child, epoch: str) -> list[dict[str, Any]]:
-    """What the audit says of this stop; the log verifies."""
+    """Return the audit records of this stop; the log verifies."""
     records, verifies = robots.ask("audit")
     assert verifies
     return [each["payload"] for each in records if each["payload"].get("estop_id") == epoch]
