@@ -15,7 +15,7 @@ from strands_robots.device_connect.simulation_driver import SimulationDeviceDriv
 from strands_robots.mesh.security import validate_command
 from strands_robots.serving.robot_verbs import ARM_VERBS, PEER_VERBS
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
-from strands_robots.tools.robot_mesh import robot_mesh
+from strands_robots.tools import robot_mesh
 from strands_robots.utils import ValidationError, whole
 
 DRIVERS = (
