@@ -115,6 +115,13 @@ def test_only_another_distribution_with_our_import_package_is_an_owner(tmp_path:
     assert other_owners([str(tmp_path)]) == ["strands-robots 0.4.0"]
 
 
+def test_a_broken_list_of_another_distributions_files_is_passed_over(tmp_path: Path) -> None:
+    installed(tmp_path, "strands-robots", "strands_robots/__init__.py")
+    installed(tmp_path, "broken")
+    (tmp_path / "broken-0.4.0.dist-info" / "RECORD").write_bytes(b"\xff\xfe")
+    assert other_owners([str(tmp_path)]) == ["strands-robots 0.4.0"]
+
+
 def test_doctor_warns_of_another_owner_of_the_import_package(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

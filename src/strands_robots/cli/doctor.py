@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -143,7 +144,10 @@ def other_owners(path: Sequence[str] | None = None) -> list[str]:
     """
     found = set()
     for installed in metadata.distributions(path=list(sys.path if path is None else path)):
-        files = installed.read_text("RECORD") or installed.read_text("installed-files.txt") or ""
+        files = ""
+        # A broken list of another package must not keep a command, least of all a stop, from running.
+        with suppress(OSError, ValueError):
+            files = installed.read_text("RECORD") or installed.read_text("installed-files.txt") or ""
         name = installed.metadata["Name"] if _OWNS.search(files) else None
         if name and name.lower().replace("_", "-") != DISTRIBUTION:
             found.add(f"{name} {installed.version}")
