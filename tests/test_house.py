@@ -80,6 +80,9 @@ KNOWN_RIDDLES: set[str] = {"desk", "seat", "slip"}
 QUESTION_DOCSTRINGS_MAX = 58
 """Docstrings that still open with a question word. The bound only ever goes down."""
 
+LONG_SUMMARIES_MAX = 470
+"""Docstrings whose first line has 80 characters or more. The bound only ever goes down."""
+
 
 @cache
 def tree_of(path: Path) -> ast.Module:
@@ -212,16 +215,25 @@ def test_every_public_exception_derives_from_the_one_root() -> None:
     assert not unrooted - {*FOREIGN_ROOTS, *KNOWN_UNROOTED}
 
 
-def test_no_docstring_opens_with_a_question_word() -> None:
-    question = re.compile(r"(What|Who|Whom|Whose|Where|How|Whether|Why|When)\b")
-    found = []
+def docstrings() -> Iterator[tuple[str, str]]:
+    """Every docstring of the package with its place."""
     for path in SOURCES:
         for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 text = ast.get_docstring(node)
-                if text and question.match(text):
-                    found.append(f"{relative(path)}:{getattr(node, 'lineno', 1)} {text.splitlines()[0]}")
+                if text:
+                    yield f"{relative(path)}:{getattr(node, 'lineno', 1)}", text
+
+
+def test_no_docstring_opens_with_a_question_word() -> None:
+    question = re.compile(r"(What|Who|Whom|Whose|Where|How|Whether|Why|When)\b")
+    found = [f"{place} {text.splitlines()[0]}" for place, text in docstrings() if question.match(text)]
     assert len(found) <= QUESTION_DOCSTRINGS_MAX, "\n".join(found)
+
+
+def test_the_first_line_of_a_docstring_is_short() -> None:
+    found = [f"{place} {first}" for place, text in docstrings() if len(first := text.splitlines()[0]) >= 80]
+    assert len(found) <= LONG_SUMMARIES_MAX, "\n".join(found)
 
 
 def test_no_name_needs_a_word_that_readers_have_to_learn_first() -> None:

@@ -1,4 +1,4 @@
-"""Robots on a network where agents find them, drive them and can always stop them.
+"""Robots on a network where agents find, drive and always can stop them.
 
 Every name is loaded when it is first used, so that the package imports with no extra installed.
 """

@@ -13,7 +13,7 @@ _warned: set[str] = set()
 
 
 def mesh_env_request() -> bool | None:
-    """Return False for ``false``, ``0`` and ``no``, True for ``true``, ``1`` and ``yes``, else None.
+    """Return False for false, 0 and no, True for true, 1 and yes, else None.
 
     Any other value is ignored, with one warning.
     """

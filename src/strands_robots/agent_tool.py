@@ -1,4 +1,4 @@
-"""Decorator of agent tools; importing it without the ``agent`` extra raises an error that names the extra."""
+"""Decorator of agent tools; its import fails with the extra's name without it."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def text_of(answer: Envelope) -> str:
 
 
 def fields_of(answer: object) -> dict[str, Any]:
-    """The facts of an envelope in one flat mapping: its keys over those of its json blocks."""
+    """Return the fields of an envelope: its keys over those of its json blocks."""
     if not isinstance(answer, Mapping):
         return {}
     fields: dict[str, Any] = {}
@@ -56,7 +56,10 @@ def fields_of(answer: object) -> dict[str, Any]:
 
 
 def jsonable(value: object, depth: int = DEPTH_MAX) -> Any:
-    """``value`` in JSON's own types: NaN and infinities become null, a foreign object its short ``repr``."""
+    """Return ``value`` in JSON's own types.
+
+    NaN and infinities become null, a foreign object its short ``repr``.
+    """
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, float):

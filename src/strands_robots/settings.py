@@ -1,4 +1,4 @@
-"""Environment variables: one table of names, kinds, defaults, domains and meanings.
+"""Environment variables: names, kinds, defaults, domains and meanings.
 
 Nothing else in the package reads the environment. A value is read at each call, not at import, so a test or a flag of
 ``serve`` may set it first. An unknown spelling of a boolean gives the safe value and one warning; a number out of its
@@ -20,7 +20,7 @@ FALSE_SPELLINGS = frozenset({"0", "false", "no", "off"})
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One environment variable: its default as text, its kind, its domain and its meaning."""
+    """One environment variable; its default is text."""
 
     name: str
     kind: str
@@ -212,12 +212,12 @@ def raw(name: str) -> str:
 
 
 def verbatim(name: str) -> str:
-    """Return the variable unchanged, "" when unset, for a value that another program compares letter by letter."""
+    """Return the variable unchanged, "" when unset, as another program reads it."""
     return os.environ.get(_TABLE[name].name, "")
 
 
 def put(name: str, value: str) -> None:
-    """Set a declared variable for this process and its children, as a flag of a command does."""
+    """Set a declared variable for this process and its children."""
     os.environ[_TABLE[name].name] = value
 
 
@@ -238,7 +238,7 @@ def boolean(name: str, *, safe: bool = False) -> bool:
 
 
 def number(name: str) -> float:
-    """Return a finite number in the setting's domain, else its default with one warning."""
+    """Return a number in the setting's domain, else its default and one warning."""
     setting, spelling = _TABLE[name], raw(name)
     try:
         value = float(spelling)
@@ -253,7 +253,7 @@ def number(name: str) -> float:
 
 
 def integer(name: str) -> int:
-    """Return a whole number in the setting's domain, else its default with one warning."""
+    """Return an integer in the setting's domain, else its default and a warning."""
     value = number(name)
     if value != int(value):
         _warn_once(name, raw(name), f"is not whole; {_TABLE[name].default} is used")

@@ -40,23 +40,23 @@ class ValidationError(StrandsRobotsError, ValueError):
 
 
 class MissingExtraError(StrandsRobotsError, ImportError):
-    """An optional dependency is not installed; the message names the extra that brings it."""
+    """An optional dependency is missing; the message names its extra."""
 
 
 def install_line(extra: str) -> str:
-    """Return the command that adds an extra to this installation: a clone, or an installed distribution."""
+    """Return the command that adds an extra to this clone or installation."""
     if (Path(__file__).resolve().parents[2] / "pyproject.toml").is_file():
         return f"in the clone, .venv/bin/pip install -e '.[{extra}]'"
     return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
 def missing_extra(what: str, extra: str) -> MissingExtraError:
-    """Return the error for an absent optional package, with the command that installs its extra."""
+    """Return the error for a missing package, with the command that installs it."""
     return MissingExtraError(f"{what} needs the [{extra}] extra: {install_line(extra)}.")
 
 
 def shown(value: object) -> str:
-    """Return ``repr(value)``, shortened so that a hostile value cannot flood a log or a reply."""
+    """Return ``repr(value)``, short enough for a log or a reply."""
     if isinstance(value, str | bytes) and len(value) > _SHOWN_MAX:
         return f"{value[:_SHOWN_MAX]!r}... ({len(value)} long)"
     if isinstance(value, list | tuple | dict | set) and len(value) > 8:
@@ -78,7 +78,7 @@ def number(
     high: float | None = None,
     above: float | None = None,
 ) -> float:
-    """Return ``value`` as a finite float; ``low`` and ``high`` are included, ``above`` is excluded."""
+    """Return a finite float; ``low`` and ``high`` are included, ``above`` is not."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             result = float(value)
@@ -97,7 +97,7 @@ def number(
 
 
 def whole(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:
-    """Return ``value`` as an integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
+    """Return an integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
     if isinstance(value, int) and not isinstance(value, bool):
         inside = (low is None or value >= low) and (high is None or value <= high)
         if inside:
@@ -118,7 +118,7 @@ def flag(name: str, value: object) -> bool:
 
 
 def text(name: str, value: object, *, longest: int = 2000, empty: bool = False) -> str:
-    """Return a string of at most ``longest`` characters without control characters; blank only with ``empty``."""
+    """Return text without control characters; blank only with ``empty``."""
     domain = f"text of {0 if empty else 1} to {longest} characters without control characters"
     if not isinstance(value, str):
         raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
@@ -143,7 +143,7 @@ def mapping(name: str, value: object) -> dict[str, Any]:
 
 
 def identifier(name: str, value: object) -> str:
-    """Return a peer id or message identifier: letters, digits, ``.``, ``_``, ``-``, the first one alphanumeric."""
+    """Return a peer id or a message identifier."""
     domain = f"1 to {IDENTIFIER_MAX} letters, digits, '.', '_' or '-', the first one alphanumeric"
     if not isinstance(value, str) or len(value) > IDENTIFIER_MAX or not _IDENTIFIER.match(value):
         raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
@@ -151,7 +151,7 @@ def identifier(name: str, value: object) -> str:
 
 
 def device_id(name: str, value: object) -> str:
-    """Return an id on Device Connect: an identifier without dots, because discovery cannot see a dotted one."""
+    """Return an id on Device Connect, without dots, which discovery cannot see."""
     domain = f"1 to {IDENTIFIER_MAX} letters, digits, '_' or '-', the first one alphanumeric, without dots"
     if not isinstance(value, str) or len(value) > IDENTIFIER_MAX or not _DEVICE_ID.match(value):
         raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
@@ -164,7 +164,7 @@ def port(name: str, value: object) -> int:
 
 
 def dial_host_error(value: object) -> str | None:
-    """Return the reason why ``value`` is no bare hostname or IP literal, or None when it is one."""
+    """Return the reason why ``value`` is no bare host name or address, or None."""
     domain = "a bare hostname or IP address"
     if not isinstance(value, str) or not 0 < len(value) <= 253:
         return f"host must be {domain}, not {shown(value)}."
@@ -176,21 +176,21 @@ def dial_host_error(value: object) -> str | None:
 
 
 def teleoperator_contract_error(teleoperator: object) -> str | None:
-    """Return the reason why ``teleoperator`` cannot lead a robot, or None; it needs a callable ``get_action``."""
+    """Return the reason why ``teleoperator`` cannot lead a robot, or None."""
     if callable(getattr(teleoperator, "get_action", None)):
         return None
     return f"teleoperator must have a callable get_action(), and {shown(teleoperator)} has none."
 
 
 def w_positive(quat: Sequence[float]) -> list[float]:
-    """Return the one of the two quaternions (w, x, y, z) of a rotation whose w is not negative."""
+    """Return the quaternion (w, x, y, z) of a rotation whose w is not negative."""
     return [-value for value in quat] if quat[0] < 0 else list(quat)
 
 
 def yaw_of(quat: Sequence[float]) -> float:
-    """Return the rotation about z, radians, of a quaternion (w, x, y, z) that need not be normalised.
+    """Return the rotation about z, radians, of a quaternion (w, x, y, z).
 
-    The z-y-x Euler yaw, ``atan2(2(wz + xy), w² + x² - y² - z²)``.
+    It need not be normalised. The z-y-x Euler yaw, ``atan2(2(wz + xy), w² + x² - y² - z²)``.
     """
     w, x, y, z = quat
     return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
