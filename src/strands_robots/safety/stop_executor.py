@@ -44,15 +44,20 @@ The rest is for the verdict to reach the caller in time."""
 
 
 @runtime_checkable
-class DirectTarget(Protocol):
+class NotesMotion(Protocol):
+    """A target that notes what moves before its permits are void, so that its verdict can name it."""
+
+    def halt_ordered(self) -> None:
+        """Note what moves. Must not block."""
+
+
+@runtime_checkable
+class DirectTarget(NotesMotion, Protocol):
     """A target whose public ``halt`` goes through the executor, which then calls :meth:`halt_here`.
 
     It says itself what is known while its halt blocks, and no second thread is started for it meanwhile: whatever
     blocks the first, such as its bus, would block the second.
     """
-
-    def halt_ordered(self) -> None:
-        """Note what moves, before permits are void. Must not block."""
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
         """Halt on the calling thread and return by ``deadline`` (monotonic seconds), unless the device blocks."""
@@ -258,7 +263,7 @@ class StopExecutor:
         stop.future.set_running_or_notify_cancel()
         if answered is not None:
             stop.future.add_done_callback(lambda future: answered(future.result()))
-        if isinstance(target, DirectTarget):
+        if isinstance(target, NotesMotion):
             target.halt_ordered()
         gate = getattr(target, "gate", None)
         if isinstance(gate, MotionGate) and (stop.direct or slot.running is not None):

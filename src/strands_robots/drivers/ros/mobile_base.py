@@ -111,6 +111,7 @@ class MobileBaseRobot:
         self._slot = threading.Lock()
         self._motion: BaseMotion | None = None
         self._latched = False
+        self._driven = False
 
     # Overridden by a platform.
 
@@ -204,6 +205,11 @@ class MobileBaseRobot:
         del tool_context
         return self.halt("stop").envelope()
 
+    def halt_ordered(self) -> None:
+        """Note whether it is driven: a drive that finds its permit void ends by itself, and was halted all the same."""
+        drive = self._motion
+        self._driven |= self._latched or (isinstance(drive, Drive) and not drive.ended.is_set())
+
     def halt(self, reason: str = "") -> StopVerdict:
         """Void every permit, send zeros until the base is still, return the verdict.
 
@@ -213,10 +219,11 @@ class MobileBaseRobot:
         """
         began = time.monotonic()
         deadline = began + ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+        self.halt_ordered()
         self.gate.revoke()
         self._odometry.expect_stillness()
         drive = self._motion if isinstance(self._motion, Drive) else None
-        driven = self._latched or (drive is not None and not drive.ended.is_set())
+        driven, self._driven = self._driven, False
         if drive is not None:
             drive.interrupt()
         hold = self._hold.begin()
