@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import random
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -262,3 +264,58 @@ def test_stop_is_halted_by_its_caller_where_no_thread_can_start(caplog: pytest.L
     assert "No thread can be started to halt arm-1" in caplog.text
     with pytest.raises(RuntimeError):
         executor.attach(robot, "arm-1")
+
+
+def test_target_attached_while_the_reserve_halts_it_leaves_no_thread(executor: StopExecutor, robot: Wedged) -> None:
+    first = executor.submit(robot, "wedged-1", "first", within=0.3)
+    eventually(lambda: robot.reasons == ["first"])
+    executor.attach(robot, "wedged-1")
+    assert first.result(20).stopped is False
+    assert executor.halt(robot, "wedged-1", "second", within=20).stopped is True
+    executor.detach(robot)
+    robot.release.set()
+    eventually(lambda: not threads())
+
+
+def test_under_load_every_stop_is_answered_and_followed_by_a_halt() -> None:
+    executor, end = StopExecutor(), time.monotonic() + 2
+
+    class Slow:
+        def __init__(self) -> None:
+            self.began: list[float] = []
+
+        def halt(self, reason: str = "") -> StopVerdict:
+            self.began.append(time.monotonic())
+            time.sleep(random.choice([0, 0, 0.001, 0.05, 0.2]))
+            return StopVerdict()
+
+    robots = [Slow() for _ in range(4)]
+    stops: list[tuple[float, Slow, Future[StopVerdict]]] = []
+
+    def submit() -> None:
+        while time.monotonic() < end:
+            robot = random.choice(robots)
+            at = time.monotonic()
+            stops.append((at, robot, executor.submit(robot, "load", "x", within=random.choice([0.1, 2.0]))))
+            time.sleep(0.002)
+
+    def attach() -> None:
+        attached: list[Slow] = []
+        while time.monotonic() < end:
+            attached.append(random.choice(robots))
+            executor.attach(attached[-1], "load")
+            if random.random() < 0.6:
+                executor.detach(attached.pop())
+            time.sleep(0.005)
+        for robot in attached:
+            executor.detach(robot)
+
+    workers = [threading.Thread(target=each) for each in (submit, submit, attach, attach)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    for at, robot, stop in stops:
+        assert stop.result(20) is not None
+        eventually(lambda robot=robot, at=at: robot.began[-1] >= at, what="a halt that began after the stop")
+    eventually(lambda: not threads("load"))

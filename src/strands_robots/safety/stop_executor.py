@@ -433,7 +433,10 @@ class StopExecutor:
                         fresh[0].put(None)
                     return
                 if fresh is not None:
+                    before = slot.wake
                     slot.wake, slot.thread = fresh
+                    # Where a thread of the reserve is the stuck one, the target's own still waits.
+                    before.put(None)
             slot.wake.put(slot)
         except RuntimeError as exc:
             logger.critical("%s is stuck in its halt and no other thread can halt it: %s.", stop.name, exc)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -103,3 +105,21 @@ def test_a_broker_killed_in_mid_stop_is_told_and_the_stop_arrives_when_it_is_bac
     assert facts["epochs"] == [epoch]
     eventually(lambda: not robots.ask("facts")["arm-1"]["moving"], what="the loop over")
     assert eventually(lambda: recorded(robots, epoch))
+
+
+FORKED = """
+import os
+from fixtures.devices import RecordingDevice
+from strands_robots.hardware import HardwareRobot
+robot = HardwareRobot(RecordingDevice(), "arm")
+robot.connect()
+assert robot.halt("parent").stopped
+child = os.fork()
+assert robot.halt("both").stopped
+if child:
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+"""
+
+
+def test_forked_process_halts_its_robots() -> None:
+    subprocess.run([sys.executable, "-c", FORKED], timeout=60, check=True)
