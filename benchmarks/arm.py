@@ -95,7 +95,7 @@ def served(robot: Any) -> Iterator[LinkConfig]:
 
 
 def jitter(seconds: float) -> Row:
-    """How far the writes of a rollout stray from their period while its state is read, beside a plain loop.
+    """Jitter of a rollout's writes while its state is read, beside a plain loop.
 
     Both take turns of a few seconds, so that what else the machine does meets both.
     """
@@ -167,7 +167,7 @@ def last_write(stops: int) -> Row:
 
 
 def plain_loop(device: Any, seconds: float) -> int:
-    """What LeRobot's own loop does: read, act, wait for the next beat; the beats that it lost."""
+    """Run LeRobot's own loop (read, act, wait for the next beat) and return the lost beats."""
     lost, began = 0, time.monotonic()
     for beat in range(int(seconds * HZ)):
         try:
@@ -181,7 +181,7 @@ def plain_loop(device: Any, seconds: float) -> int:
 
 
 def strays(writes: list[Write]) -> list[float]:
-    """How far the gaps between the first servo's goals are from the period, ms; the hold at the end is no beat."""
+    """Deviations of the gaps between the first servo's goals from the period, ms; the final hold is no beat."""
     times = [write.at for write in writes if write.servo == 1]
     return [abs(after - before - 1 / HZ) * 1000 for before, after in pairwise(times[:-1])]
 

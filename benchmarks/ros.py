@@ -206,7 +206,7 @@ def _images(seconds: float) -> Row:
 
 
 def _rosbridge(repeats: int) -> list[Row]:
-    """A velocity until the far side tells it to who listens; ours and a bare client in turns, on one server."""
+    """A velocity until the remote side publishes it again; ours and a bare client in turns, on one server."""
     child = _Child("rosbridge")
     try:
         p50, against = _trips(child.ready, repeats)

@@ -103,7 +103,7 @@ class Fleet:
         return self.stop_once(patience=1.0) is not None
 
     def facts(self) -> dict[str, Any]:
-        """What every arm has done."""
+        """Reports of every arm."""
         return {name: each for site in self.sites for name, each in site.ask("facts").items()}
 
     def stop_once(self, arrange: Callable[[], object] = lambda: None, patience: float = LOST_AFTER_S) -> float | None:
@@ -169,7 +169,7 @@ def row(what: str, ours: Figures, bare: Figures | None, bound_s: float, more: st
 
 
 class Hiccups(threading.Thread):
-    """How late this machine wakes a thread that asks for a millisecond: what any figure here is made of, too."""
+    """Lateness of a thread that sleeps for a millisecond on this machine; every figure here contains it."""
 
     def __init__(self) -> None:
         super().__init__(name="hiccups", daemon=True)
@@ -341,7 +341,7 @@ def _flooded(transport: str, url: str, name: str, stops: int) -> Row:
 
         def arrange() -> None:
             if fleet.forger is not None and time.monotonic() >= due[0]:
-                # One may not stop at all, the other may, and its signatures are nobody's.
+                # One may not stop at all; the other may, but its signatures are forged.
                 fleet.forger.ask("forge", ["forger", "safety-9"], 10_000.0, 5.0)
                 due[0] = time.monotonic() + 4.9
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Usage: make-keys.sh FOLDER MEMBER. Makes in FOLDER what the member of a secured DDS graph presents, with openssl alone:
 # MEMBER.pem, MEMBER.key, MEMBER.p7s (signed from MEMBER.xml of this folder) and, once, the two authorities and
-# governance.p7s. Keep the authorities' keys off the robots: whoever has them can make members and laws.
+# governance.p7s. Keep the authorities' keys off the robots: anyone who has them can make members and rules.
 set -euo pipefail
 umask 077
 here=$(cd "$(dirname "$0")" && pwd)
