@@ -39,48 +39,24 @@ FLOORS: list[set[str]] = [
     {"cli", "tools", "robot"},
 ]
 
-KNOWN_CIRCLES: list[set[str]] = []
-"""Circles of imports that are still to be cut. The list only ever gets shorter."""
-
 SIBLING_NAMES: dict[str, str] = {}
 """Public class names that stand for the same idea in sibling backends."""
-
-KNOWN_TWINS: set[str] = set()
-"""Public class names that still stand for two ideas. The list only ever gets shorter."""
 
 FOREIGN_ROOTS: dict[str, str] = {}
 """Public exceptions that a framework wants under a root of its own, with the reason."""
 
-KNOWN_UNROOTED: set[str] = set()
-"""Public exceptions that do not derive from StrandsRobotsError yet. The list only ever gets shorter."""
-
-RIDDLES = {
-    *(
-        "seat",
-        "seats",
-        "door",
-        "doors",
-        "desk",
-        "lane",
-        "lanes",
-        "herald",
-        "pursuit",
-        "freezer",
-        "intake",
-        "tray",
-        "slip",
-    ),
-    *("road", "roads", "whoever", "nobody", "somebody", "anybody", "everybody"),
-}
+RIDDLES = re.compile(
+    "(seats?|doors?|desk|lanes?|herald|pursuit|freezer|intake|tray|slip|roads?|whoever|nobody|somebody|anybody|everybody)"
+)
 """Words that no name in the code may use, because readers have to learn them first."""
 
-KNOWN_RIDDLES: set[str] = {"desk", "seat", "slip"}
+KNOWN_RIDDLES: set[str] = {"seat"}
 """Words of them that names still use. The list only ever gets shorter."""
 
-QUESTION_DOCSTRINGS_MAX = 58
+QUESTION_DOCSTRINGS_MAX = 18
 """Docstrings that still open with a question word. The bound only ever goes down."""
 
-LONG_SUMMARIES_MAX = 470
+LONG_SUMMARIES_MAX = 440
 """Docstrings whose first line has 80 characters or more. The bound only ever goes down."""
 
 
@@ -182,7 +158,7 @@ def test_no_two_modules_import_each_other_directly_or_through_others() -> None:
     found = {}
     for module in MODULES:
         circle = circle_through(module)
-        if circle and not any(set(circle) <= known for known in KNOWN_CIRCLES):
+        if circle:
             found[frozenset(circle)] = " -> ".join(circle)
     assert not found, "\n".join(sorted(found.values()))
 
@@ -200,7 +176,7 @@ def test_a_public_class_name_stands_for_one_idea() -> None:
         if not node.name.startswith("_"):
             homes[node.name].add(module)
     twins = {name: sorted(modules) for name, modules in homes.items() if len(modules) > 1}
-    assert not {name: modules for name, modules in twins.items() if name not in {*SIBLING_NAMES, *KNOWN_TWINS}}
+    assert not {name: modules for name, modules in twins.items() if name not in SIBLING_NAMES}
 
 
 def test_every_public_exception_derives_from_the_one_root() -> None:
@@ -212,7 +188,7 @@ def test_every_public_exception_derives_from_the_one_root() -> None:
         lineage = ancestors(name, bases)
         if not name.startswith("_") and any(map(is_exception, lineage)) and "StrandsRobotsError" not in lineage:
             unrooted.add(name)
-    assert not unrooted - {*FOREIGN_ROOTS, *KNOWN_UNROOTED}
+    assert not unrooted - set(FOREIGN_ROOTS)
 
 
 def docstrings() -> Iterator[tuple[str, str]]:
@@ -245,7 +221,7 @@ def test_no_name_needs_a_word_that_readers_have_to_learn_first() -> None:
             names.add(named or getattr(node, "attr", None) or "")
         for name in sorted(filter(None, names)):
             words = set(re.findall(r"[a-z]+", re.sub(r"([A-Z])", r"_\1", name).lower()))
-            found += [f"{relative(path)}: {name}" for _ in words & (RIDDLES - KNOWN_RIDDLES)]
+            found += [f"{relative(path)}: {name}" for word in words - KNOWN_RIDDLES if RIDDLES.fullmatch(word)]
     assert not found, "\n".join(found)
 
 
