@@ -6,9 +6,13 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
+
+from strands_robots.cli.app import build
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "src" / "strands_robots"
@@ -39,6 +43,32 @@ def test_every_link_leads_to_a_file_and_a_section_of_it(page: Path) -> None:
             linked = page.parent / file if file else page
             assert linked.exists(), f"{page.name} links to {target}"
             assert not anchor or anchor in sections(linked), f"{page.name} links to {target}"
+
+
+def invocations(text: str) -> Iterator[list[str]]:
+    """The words of every ``strands-robots`` command in the code of a page, without comments and outputs."""
+    code = re.findall(r"```(?:console|bash)\n(.*?)```", text, flags=re.DOTALL)
+    code += re.findall(r"`(strands-robots [^`]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    for block in code:
+        for line in block.replace("\\\n", " ").splitlines():
+            for command in re.findall(
+                r"(?:^\$ |^|\s)(?:[\w./]*/)?strands-robots ((?:(?!strands-robots |  #).)+)", line
+            ):
+                yield command.rstrip(".").split()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_and_option_that_a_page_names_exists(page: Path) -> None:
+    application = get_command(build())
+    for words in invocations(page.read_text(encoding="utf-8")):
+        command, rest = application, words
+        while rest and rest[0] in getattr(command, "commands", {}):
+            command, rest = command.commands[rest[0]], rest[1:]
+        assert command is not application or words[0].startswith("--"), f"{page.name}: strands-robots {' '.join(words)}"
+        options = {option for parameter in command.params for option in [*parameter.opts, *parameter.secondary_opts]}
+        for word in rest:
+            if re.fullmatch(r"--?[a-z][a-z-]*", word):
+                assert word in {*options, "--help"}, f"{page.name}: strands-robots {' '.join(words)}"
 
 
 def test_every_term_of_the_glossary_is_linked_from_another_page() -> None:
