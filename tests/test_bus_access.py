@@ -97,7 +97,7 @@ def test_lerobots_motor_modes_are_ranges() -> None:
     assert math.isclose(high, 2047 / 2 * 360 / 4095)
 
 
-def test_what_nobody_knows_is_infinite_and_what_the_device_declares_counts() -> None:
+def test_unknown_ranges_are_infinite_and_declared_ones_count() -> None:
     assert action_ranges(SimpleNamespace(action_features={"a": float})) == {"a": (-math.inf, math.inf)}
     assert action_ranges(RecordingDevice()) == dict(RANGES)
 

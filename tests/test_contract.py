@@ -61,7 +61,7 @@ def test_a_robot_that_fits_is_given_back_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("thing", [None, 5, "arm", object(), []])
-def test_what_is_no_robot_is_refused_by_what_it_lacks(thing: object) -> None:
+def test_object_that_is_no_robot_is_refused_by_the_verbs_it_lacks(thing: object) -> None:
     with pytest.raises(ValidationError, match="lacks start_task"):
         adapt(thing)
 
@@ -75,7 +75,7 @@ def test_a_locked_foreign_robot_is_never_asked_to_move() -> None:
     assert robot.stop_task()["status"] == "success"
 
 
-def test_a_halt_voids_permits_and_asks_the_task_and_the_teleoperation() -> None:
+def test_halt_voids_permits_and_stops_task_and_teleoperation() -> None:
     class Led(Foreign):
         def stop_teleoperate(self) -> Envelope:
             self.calls.append("stop teleoperation")
@@ -92,7 +92,7 @@ def test_a_halt_voids_permits_and_asks_the_task_and_the_teleoperation() -> None:
     assert verdict.halted == ("teleoperation",)
 
 
-def test_a_halt_of_its_own_is_asked_instead_and_graded() -> None:
+def test_own_halt_of_a_foreign_robot_is_called_and_graded() -> None:
     class Own(Foreign):
         tool_name_str = "own"
 
@@ -143,7 +143,7 @@ def test_two_wrappers_of_one_robot_share_its_gate_so_that_a_stop_on_one_network_
     assert AdaptedRobot(Foreign()).gate is not one.gate
 
 
-def test_a_robot_that_is_put_away_begins_nothing_until_it_is_taken_back() -> None:
+def test_robot_that_is_put_away_refuses_motion_until_that_is_taken_back() -> None:
     foreign = Foreign()
     free = put_away(foreign)
     assert "taken off its network" in AdaptedRobot(foreign).start_task("wave")["reason"]
@@ -151,7 +151,7 @@ def test_a_robot_that_is_put_away_begins_nothing_until_it_is_taken_back() -> Non
     assert AdaptedRobot(foreign).gate.permit("start_task").valid
 
 
-def test_the_joints_of_a_foreign_robot_are_read_by_who_adapts_it() -> None:
+def test_joints_of_a_foreign_robot_are_read_by_the_given_reader() -> None:
     class Native(Foreign):
         def get_observation(self) -> dict[str, Any]:
             return {"pan.pos": 4.0, "front": [[0]]}
@@ -186,7 +186,7 @@ def test_a_foreign_robot_is_read_in_its_turn_on_the_bus() -> None:
     assert native.held is True
 
 
-def test_joints_that_cannot_be_read_are_told_beside_the_task() -> None:
+def test_unreadable_joints_are_reported_beside_the_task() -> None:
     class Dead(Foreign):
         def get_observation(self) -> dict[str, Any]:
             raise ConnectionError("no status packet")
@@ -196,7 +196,7 @@ def test_joints_that_cannot_be_read_are_told_beside_the_task() -> None:
     assert (state["joints"], state["task"]["task_status"]) == ({}, "idle")
 
 
-def test_a_foreign_robot_that_tells_its_state_is_not_read() -> None:
+def test_foreign_robot_with_its_own_state_is_not_read() -> None:
     class Telling(Foreign):
         def get_state(self) -> Envelope:
             return success("Told.", joints={"a": 1.0})
@@ -247,9 +247,9 @@ def test_a_foreign_robot_is_not_read_on_any_network_while_it_starts_runs_or_stop
     assert foreign.reads == 1
     assert "its task runs" in running["joints_error"]
     assert all("started or stopped" in each["joints_error"] for each in foreign.during)
-    for told in (running, *foreign.during):
-        assert told["joints"] == {"pan.pos": 1.0}, "those of the last read"
-        assert told["joints_age_s"] >= 0
+    for state in (running, *foreign.during):
+        assert state["joints"] == {"pan.pos": 1.0}, "those of the last read"
+        assert state["joints_age_s"] >= 0
     after = robot.get_state()
     assert after["joints"] == {"pan.pos": 2.0}
     assert "joints_error" not in after
@@ -264,8 +264,8 @@ def test_a_read_that_waited_for_another_looks_anew_at_what_the_robot_does() -> N
         return read_joints(robot)
 
     one, two = adapt(foreign, slow), adapt(foreign, read_joints)
-    told: list[Envelope] = []
-    threads = [threading.Thread(target=lambda each=each: told.append(each.get_state())) for each in (one, two)]
+    states: list[Envelope] = []
+    threads = [threading.Thread(target=lambda each=each: states.append(each.get_state())) for each in (one, two)]
     threads[0].start()
     assert entered.wait(20)
     threads[1].start()
@@ -274,7 +274,7 @@ def test_a_read_that_waited_for_another_looks_anew_at_what_the_robot_does() -> N
     for thread in threads:
         thread.join(20)
     assert foreign.reads == 1
-    assert sorted("joints_error" in each for each in told) == [False, True]
+    assert sorted("joints_error" in each for each in states) == [False, True]
 
 
 def test_a_foreign_robot_without_joints_has_none_that_could_be_old() -> None:

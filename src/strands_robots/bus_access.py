@@ -68,9 +68,9 @@ def read_joints(device: Any) -> dict[str, float]:
         return {}
     with bus_lock(source):
         own = getattr(source, "get_joints", None)
-        told = own() if callable(own) else None
-        if told is not None and "status" not in told:
-            return numbers(told)
+        answer = own() if callable(own) else None
+        if answer is not None and "status" not in answer:
+            return numbers(answer)
         buses = _buses(source)
         if not buses:
             return numbers(source.get_observation())

@@ -28,7 +28,7 @@ RUNNING = frozenset({"running", "starting", "connecting", "busy"})
 
 @dataclass(frozen=True, slots=True)
 class RolloutEvent:
-    """Something that happened in a rollout, told to observers from the control thread.
+    """An event of a rollout, given to observers from the control thread.
 
     ``kind`` is started, step or finished; ``state`` of a finished one is completed, stopped or error.
     ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units.
@@ -84,7 +84,7 @@ class TaskRobot(Haltable, Protocol):
     def get_state(self) -> Envelope:
         """``joints`` (name to position in the device's unit) and ``task``.
 
-        Where it can be told, ``joints_age_s``; where they are not those of now, ``joints_error`` says why.
+        ``joints_age_s`` where it is known; ``joints_error`` is the reason where the joints are old.
         """
 
     def subscribe(self, observer: Observer) -> Unsubscribe:

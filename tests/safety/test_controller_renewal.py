@@ -27,8 +27,8 @@ class DeafLink:
         if event == ESTOP:
             estop_id = json.loads(payload)["params"]["estop_id"]
             for name in self.reached:
-                told = {"device_id": name, "estop_id": estop_id, "stopped": True}
-                self._hear(VERDICT, name, notification(VERDICT, told))
+                answer = {"device_id": name, "estop_id": estop_id, "stopped": True}
+                self._hear(VERDICT, name, notification(VERDICT, answer))
         return True
 
     def renew(self) -> None:

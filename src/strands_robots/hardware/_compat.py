@@ -52,7 +52,7 @@ def lerobot_module(name: str) -> ModuleType:
 
 @contextmanager
 def _standing_in() -> Iterator[None]:
-    put = {name: _standin(name, words) for name, words in _STANDINS.items() if name not in sys.modules}
+    put = {name: _standin(name, classes) for name, classes in _STANDINS.items() if name not in sys.modules}
     sys.modules.update(put)
     try:
         yield
@@ -62,12 +62,12 @@ def _standing_in() -> Iterator[None]:
                 del sys.modules[name]
 
 
-def _standin(name: str, words: tuple[str, ...]) -> ModuleType:
+def _standin(name: str, classes: tuple[str, ...]) -> ModuleType:
     module = ModuleType(name, "Stands in while a LeRobot driver is imported without torch.")
     module.__spec__ = ModuleSpec(name, None)
     module.__path__ = []
-    for word in words:
-        setattr(module, word, type(word, (), {}))
+    for each in classes:
+        setattr(module, each, type(each, (), {}))
     return module
 
 

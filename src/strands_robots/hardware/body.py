@@ -214,7 +214,7 @@ class DeviceBody:
         """The device's own ``hold()``, else the present position as the target and every velocity zero.
 
         Args:
-            urgent: nobody who stops the body is waited for: this is the stop.
+            urgent: do not give the bus up to a stop that waits, for this is the stop.
         """
         own = getattr(self.device, "hold", None)
         if callable(own):

@@ -69,21 +69,21 @@ def stable_id(device: Any, by_id: Path = BY_ID) -> str | None:
     name until it is plugged in elsewhere.
     """
     config = getattr(device, "config", None)
-    port = _word(config, "port")
+    port = _text(config, "port")
     if port:
         named = _adapter(port, by_id)
         if named:
             return named
-    host = next((word for word in (_word(config, name) for name in _HOSTS) if word), "")
+    host = next((each for each in (_text(config, name) for name in _HOSTS) if each), "")
     if host:
         return host
-    parts = [_word(device, "id") or _word(config, "id"), port]
+    parts = [_text(device, "id") or _text(config, "id"), port]
     return "@".join(part for part in parts if part) or None
 
 
 def kind(device: Any) -> str:
     """Return the device's type: LeRobot's name of it, else that of its class."""
-    return _word(device, "name") or type(device).__name__
+    return _text(device, "name") or type(device).__name__
 
 
 def _adapter(port: str, by_id: Path) -> str:
@@ -98,7 +98,7 @@ def _adapter(port: str, by_id: Path) -> str:
     return ""
 
 
-def _word(owner: Any, name: str) -> str:
+def _text(owner: Any, name: str) -> str:
     value = getattr(owner, name, None)
     return value.strip() if isinstance(value, str) else ""
 

@@ -152,8 +152,8 @@ class HardwareRobot(TeleopMixin):
 
     @property
     def joint_units(self) -> dict[str, str]:
-        """``normalized`` (-100 to 100), ``percent`` (0 to 100), ``degrees`` or the device's own word, by action key;
-        a key whose unit nobody states is left out."""
+        """``normalized`` (-100 to 100), ``percent`` (0 to 100), ``degrees`` or the device's own unit, by action key;
+        a key without a stated unit is left out."""
         return joint_units(self.device)
 
     def get_health(self) -> Envelope:

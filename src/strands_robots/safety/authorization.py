@@ -33,14 +33,14 @@ def caller_name(source: object) -> str | None:
     return source
 
 
-def entries(words: Sequence[str]) -> tuple[str, ...]:
+def entries(patterns: Sequence[str]) -> tuple[str, ...]:
     """Return the list without its blanks; empty means that it is not set."""
-    return tuple(word.strip() for word in words if word.strip())
+    return tuple(pattern.strip() for pattern in patterns if pattern.strip())
 
 
-def matches(name: str, words: Sequence[str]) -> bool:
+def matches(name: str, patterns: Sequence[str]) -> bool:
     """True when one of the globs fits ``name``, letter case included."""
-    return any(fnmatchcase(name, word) for word in words)
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> str | None:
@@ -64,7 +64,7 @@ def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> s
             "A caller without a name may not move this robot: add 'anonymous' to DEVICE_CONNECT_RPC_ALLOW to admit "
             "those, or have the caller name itself."
         )
-    if matches(name, [word for word in listed if word != ANONYMOUS]):
+    if matches(name, [pattern for pattern in listed if pattern != ANONYMOUS]):
         return None
     return f"Caller {shown(name)} may not move this robot: no entry of DEVICE_CONNECT_RPC_ALLOW fits it."
 
@@ -93,7 +93,7 @@ class Authorization:
     """The same questions for one robot, with the lists read when they are asked.
 
     Args:
-        hardware: True for a robot that can hurt somebody.
+        hardware: True for a robot that can hurt a person.
         read_list: gives the list of a setting by its name; the environment's by default.
     """
 

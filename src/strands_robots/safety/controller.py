@@ -23,7 +23,7 @@ from strands_robots.utils import ValidationError, device_id, number
 logger = logging.getLogger(__name__)
 
 REPEAT_S = (0.005, 0.005, 0.01, 0.01, 0.02, 0.05, 0.1, 0.2)
-"""Pauses between repetitions; the last one goes on. Quick at first: among forged ones each try may be the one heard."""
+"""Pauses between repetitions; the last one goes on. Quick at first: among forged stops each may be the one served."""
 
 UNCONFIRMED_S = 0.1
 RENEW_S = 6.0

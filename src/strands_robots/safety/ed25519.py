@@ -50,13 +50,13 @@ def decode(text: object, length: int) -> bytes | None:
     return data if len(data) == length else None
 
 
-def public_keys(words: Sequence[str], setting: str) -> tuple[bytes, ...]:
-    """The raw 32-byte keys of a comma list; a word that is none is left out with one error in the log."""
+def public_keys(items: Sequence[str], setting: str) -> tuple[bytes, ...]:
+    """The raw 32-byte keys of a comma list; an item that is none is left out with one error in the log."""
     keys = []
-    for word in words:
-        key = decode(word, 32)
+    for item in items:
+        key = decode(item, 32)
         if key is None:
-            logger.error("%s holds %s, which is no base64url of 32 bytes; it is left out.", setting, shown(word))
+            logger.error("%s holds %s, which is no base64url of 32 bytes; it is left out.", setting, shown(item))
         else:
             keys.append(key)
     return tuple(keys)

@@ -82,7 +82,7 @@ class Asked:
 
 
 class Permit:
-    """Leave to move, until the next halt or until whoever started the motion withdraws it."""
+    """Leave to move, until the next halt or until the caller that started the motion withdraws it."""
 
     __slots__ = ("_asked", "_gate", "_withdrawn", "verb")
 
@@ -104,7 +104,7 @@ class Permit:
 
     @property
     def revoked(self) -> bool:
-        """True for ever once the whole robot was halted or locked: whoever did that also freezes it."""
+        """True for ever once the whole robot was halted or locked: that halt also freezes it."""
         return self._gate.generation != self._asked.generation
 
     def check(self) -> None:
@@ -239,7 +239,7 @@ class MotionGate:
     def renew(self, permit: Permit) -> Permit:
         """Void every other permit, as a halt does, and go on with a fresh one in the place of this.
 
-        Raises :class:`MotionRefused` where anybody else has halted or locked the robot since ``permit`` was given.
+        Raises :class:`MotionRefused` where another caller has halted or locked the robot since ``permit`` was given.
         """
         permit.check()
         mine = self._generation = next(self._numbers)

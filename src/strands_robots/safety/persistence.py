@@ -106,7 +106,7 @@ class LockoutStore:
             try:
                 records = self._read()
             except ValueError:
-                # What is unreadable is kept aside for a person; whoever has no record yet comes up locked by it.
+                # The unreadable file is set aside for a person; a robot without a record comes up locked by it.
                 path.replace(self._aside)
                 records = {}
             records.update({key: _record(each) for key, each in kept.items()})

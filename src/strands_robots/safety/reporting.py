@@ -165,7 +165,7 @@ class Reporter:
             self._finish(run)
 
     def _time_out(self, run: StopRun) -> None:
-        """Report the rest as unanswered: nobody will be there to report it when the executor answers."""
+        """Report the rest as unanswered: the reporter ends before the executor answers."""
         for robot_id in run.robot_ids:
             if robot_id not in run.reports:
                 why = {robot_id: f"no answer in {run.deadline_s:g} s"}

@@ -2,7 +2,7 @@
 
 An assertion is exactly ``v``, ``epoch``, ``targets``, ``t``, ``nonce`` and ``sig``, the Ed25519 signature over the
 canonical JSON of the other five. It clears one epoch of the robots it names, once, within a minute. Why one was
-refused is for the local audit; whoever sent it learns only that it was.
+refused is for the local audit; the sender learns only that it was.
 """
 
 from __future__ import annotations

@@ -78,13 +78,13 @@ class StopVerdict:
 def stop_level() -> Literal["hold", "limp"]:
     """Return what a halt does to torque: ``hold`` keeps it on, so that an arm does not fall; ``limp`` takes it off.
 
-    ``STRANDS_ESTOP_TORQUE``; a word that is neither is ``hold``, with one line in the log.
+    ``STRANDS_ESTOP_TORQUE``; another value is ``hold``, with one line in the log.
     """
-    word = settings.raw("STRANDS_ESTOP_TORQUE").lower()
-    if word == "limp":
+    level = settings.raw("STRANDS_ESTOP_TORQUE").lower()
+    if level == "limp":
         return "limp"
-    if word != "hold":
-        logger.warning("STRANDS_ESTOP_TORQUE=%s is neither hold nor limp; hold is used.", shown(word))
+    if level != "hold":
+        logger.warning("STRANDS_ESTOP_TORQUE=%s is neither hold nor limp; hold is used.", shown(level))
     return "hold"
 
 

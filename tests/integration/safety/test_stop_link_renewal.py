@@ -29,9 +29,9 @@ def test_a_link_carries_stops_while_it_is_made_anew_and_leaves_no_thread() -> No
     others = set(threading.enumerate())
     link, world = loopback_config(free_port()), ToyWorld("arm-1")
     runtime = init_device_connect_sync(world, peer_id="arm-1", link=link)
-    hand, told = ZenohStopLink(link), list[bool]()
+    hand, states = ZenohStopLink(link), list[bool]()
     try:
-        hand.open((), lambda event, source, data: None, told.append)
+        hand.open((), lambda event, source, data: None, states.append)
         eventually(lambda: hand.up and all(each.link.up for each in estop_listener().registrations))
         assert isinstance(hand, RenewableLink)
         # The device's own session, which holds the meeting port, and the hand's.
@@ -39,13 +39,13 @@ def test_a_link_carries_stops_while_it_is_made_anew_and_leaves_no_thread() -> No
         hand.renew()
         hand.renew()
         for number in range(1, 4):
-            # During the change and after it; whoever is told of a stop twice acts once.
+            # During the change and after it; a robot that gets a stop twice acts once.
             stopped(hand, world, f"{number:032x}")
             plane().clear_local("the test")
             if number == 2:
                 eventually(lambda: len(seen_by(estop_listener().registrations[0].link) - before) == 1)
                 eventually(lambda: not before <= seen_by(estop_listener().registrations[0].link))
-        assert told == [True], "it never was down"
+        assert states == [True], "it never was down"
     finally:
         hand.close()
         stop_device_connect(runtime)
