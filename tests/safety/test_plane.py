@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from fixtures.planes import own_plane
 from fixtures.recording_robot import RecordingRobot
+from fixtures.toy_robots import ToyWorld
 from fixtures.waiting import eventually
 
 from strands_robots.audit import read_audit_log
@@ -316,6 +317,22 @@ def test_the_last_robot_out_ends_the_threads() -> None:
     for entry in entries:
         entry.close()
     eventually(lambda: not any(thread.is_alive() for thread in ours))
+
+
+def test_idle_world_shares_the_reserve_and_owns_a_thread_once_it_moves(plane: SafetyPlane) -> None:
+    def threads() -> int:
+        return sum(thread.name == "halt-world-1" for thread in threading.enumerate())
+
+    world = ToyWorld()
+    entry = plane.register("world-1", world)
+    assert threads() == 0
+    assert plane.emergency_stop(order())["world-1"].stopped is True
+    plane.clear_local("ann")
+    world.gate.permit("start_policy")
+    assert threads() == 1
+    assert plane.emergency_stop(order())["world-1"].stopped is True
+    entry.close()
+    eventually(lambda: not threads())
 
 
 def test_a_stop_without_robots_is_answered_by_none(plane: SafetyPlane) -> None:
