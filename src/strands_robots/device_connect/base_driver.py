@@ -161,7 +161,8 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
     async def answer(self, verb: Verb, arguments: Mapping[str, Any], caller: object) -> Envelope:
         """Serve one call of a verb. Never raises for what the caller or the robot did."""
         if verb.kind is Kind.STOP:
-            return await self.stop_answer(verb.name)
+            problem = verb.unfit(arguments)
+            return error(problem) if problem else await self.stop_answer(verb.name)
         moves = verb.kind is Kind.MOTION
         command = Command(verb, arguments, caller, self.pipeline.pending.arrive() if moves else None)
         loop = asyncio.get_running_loop()
