@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -69,6 +71,16 @@ def test_every_command_and_option_that_a_page_names_exists(page: Path) -> None:
         for word in rest:
             if re.fullmatch(r"--?[a-z][a-z-]*", word):
                 assert word in {*options, "--help"}, f"{page.name}: strands-robots {' '.join(words)}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_program_of_a_page_parses_and_imports_names_that_exist(page: Path) -> None:
+    for program in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
+        for node in ast.walk(ast.parse(program)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("strands_robots"):
+                module = importlib.import_module(node.module)
+                for alias in node.names:
+                    assert hasattr(module, alias.name), f"{page.name}: {node.module} has no {alias.name}"
 
 
 def test_every_term_of_the_glossary_is_linked_from_another_page() -> None:
