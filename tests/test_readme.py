@@ -1,4 +1,4 @@
-"""The pages name files, sections, make targets, settings and extras that exist."""
+"""The pages name files, sections, commands, programs, settings and extras that exist."""
 
 from __future__ import annotations
 
