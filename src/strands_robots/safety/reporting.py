@@ -11,7 +11,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from strands_robots.safety.orders import RobotReport, StopOrder
@@ -226,8 +226,3 @@ def _call(listener: Callable[..., None], *args: object) -> None:
         listener(*args)
     except Exception:
         logger.critical("A listener of a stop's report raised.", exc_info=True)
-
-
-def all_stopped(reports: Iterable[RobotReport]) -> bool:
-    """True when every report says that its robot is known to be still."""
-    return all(report.stopped is True for report in reports)
