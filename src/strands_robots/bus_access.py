@@ -1,4 +1,4 @@
-"""Access to a device's bus: which object is read, one re-entrant lock for each device, joints without cameras.
+"""Access to a device's bus: one re-entrant lock, joints without cameras.
 
 A serial motor bus carries one exchange at a time, so every read and every write of a device holds
 :func:`bus_lock` of it. A wrapper and the device inside it share one lock.
@@ -43,7 +43,7 @@ def joint_read_source(robot: Any) -> Any | None:
 
 
 def bus_lock(device: Any) -> threading.RLock:
-    """The one lock of the bus behind ``device``; the same for a wrapper and what it wraps."""
+    """Return the lock of the bus behind ``device``; a wrapper has the same."""
     source = joint_read_source(device)
     key = device if source is None else source
     with _guard:
@@ -55,7 +55,7 @@ def bus_lock(device: Any) -> threading.RLock:
 
 
 def read_joints(device: Any) -> dict[str, float]:
-    """Joint positions by observation key, in the device's unit, read under the bus lock and without its cameras.
+    """Read joint positions by key, in the device's unit, under the bus lock.
 
     From ``get_joints()`` where the device has it and answers with numbers (a native driver that answers with an
     envelope names its motors there, not its action keys), from the motor buses alone where those of a LeRobot device
@@ -82,7 +82,7 @@ def read_joints(device: Any) -> dict[str, float]:
 
 
 def action_ranges(device: Any) -> dict[str, tuple[float, float]]:
-    """The range of every action key: the device's ``joint_ranges``, LeRobot's normalised ones, else infinite.
+    """Return the range of every action key; infinite where none is known.
 
     A LeRobot motor in degrees has the range of its calibration, which LeRobot centres on 0:
     ``(range_max - range_min) / 2`` encoder counts each way, of 4096 a turn minus one.
@@ -114,7 +114,7 @@ def _motor_range(device: Any, motor: str, motors: Mapping[str, Any]) -> tuple[fl
 
 
 def _motors(device: Any) -> Mapping[str, Any] | None:
-    """The motors of a device whose one bus gives every number of its observation; else None."""
+    """Return the motors whose one bus gives every observed number, else None."""
     bus: Any = getattr(device, "bus", None)
     if not _is_bus(bus) or _scalars(device) != {f"{name}.pos" for name in bus.motors}:
         return None
@@ -123,7 +123,7 @@ def _motors(device: Any) -> Mapping[str, Any] | None:
 
 
 def _buses(device: Any) -> list[tuple[str, Any]]:
-    """The motor buses that give every number of a device's observation, each with the prefix of its keys; else none."""
+    """Return the buses, with key prefixes, that give every observed number, if any."""
     if _motors(device) is not None:
         return [("", device.bus)]
     found: list[tuple[str, Any]] = []
@@ -154,7 +154,7 @@ def _readable(candidate: Any) -> bool:
 
 
 def _kept(key: Any) -> object:
-    """A weak reference that forgets the lock with the device; the device itself where it allows none."""
+    """Return a weak reference to the device, or the device where it allows none."""
     number = id(key)
     try:
         return weakref.ref(key, lambda _: _locks.pop(number, None))

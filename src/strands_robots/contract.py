@@ -1,4 +1,4 @@
-"""The robot contract as types, and the one place where a foreign robot is made to fit it.
+"""Robot contract as types, and the adapter of foreign robots.
 
 Networks, tools and the command line reach a robot only through these protocols. A robot of ours implements
 :class:`TaskRobot` or :class:`WorldRobot`; any other object with ``start_task``, ``stop_task``,
@@ -70,13 +70,13 @@ class TaskRobot(Haltable, Protocol):
     def start_task(
         self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
     ) -> Envelope:
-        """Start a rollout and return at once; ``duration`` in seconds, port 0 the provider's default."""
+        """Start a rollout and return at once; ``duration`` in s, port 0 the default."""
 
     def stop_task(self) -> Envelope:
         """Stop the rollout; ``stopped`` is false when its loop outlived the join."""
 
     def get_task_status(self) -> Envelope:
-        """``task_status``, ``instruction``, ``step_count``, ``duration`` of the current or last task."""
+        """Return status, instruction, step count and duration of the latest task."""
 
     def get_features(self) -> Envelope:
         """``observation_features`` and ``action_features``, as data."""
@@ -88,7 +88,7 @@ class TaskRobot(Haltable, Protocol):
         """
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Call ``observer`` with every rollout event until the returned callable is called."""
+        """Call ``observer`` with every rollout event; return its unsubscribe."""
 
 
 @runtime_checkable
@@ -118,7 +118,7 @@ class WorldRobot(Haltable, Protocol):
         """One row a running rollout: robot, instruction, policy, step, elapsed_s."""
 
     def get_state(self) -> Envelope:
-        """``sim_time`` (s), ``step_count``, ``robots`` (name to joints in radians) and ``running_policies``."""
+        """Return ``sim_time`` (s), steps, joints of each robot, running policies."""
 
     def get_features(self) -> Envelope:
         """Joints, actuators and cameras by robot."""
@@ -130,7 +130,7 @@ class WorldRobot(Haltable, Protocol):
         """Halt, then put the world back to its initial state."""
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Call ``observer`` with every rollout event until the returned callable is called."""
+        """Call ``observer`` with every rollout event; return its unsubscribe."""
 
 
 Robot = TaskRobot | WorldRobot
@@ -143,7 +143,7 @@ _TASK_VERBS = ("start_task", "stop_task", "get_task_status", "get_features")
 
 
 def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
-    """``robot`` itself when it fits :class:`TaskRobot`, else a wrapper that gives it what it lacks.
+    """Return ``robot`` when it fits :class:`TaskRobot`, else a wrapper that does.
 
     Args:
         robot: what is to fit.
@@ -171,7 +171,7 @@ class _PutAway:
 
 
 def put_away(robot: Any) -> Callable[[], None]:
-    """Refuse every motion of ``robot`` from now on, on every network, until the returned callable is called.
+    """Refuse every motion of ``robot`` until the returned callable is called.
 
     For a caller that halts a robot and then leaves its network: a motion requested in between would go on.
     """
@@ -181,7 +181,7 @@ def put_away(robot: Any) -> Callable[[], None]:
 
 
 class _Shared:
-    """State that all wrappers of one foreign robot share, so that a stop on one network is one on every other."""
+    """State that all wrappers of one foreign robot share, on every network."""
 
     def __init__(self) -> None:
         self.gate = MotionGate()
@@ -196,7 +196,7 @@ class _Shared:
 
     @contextmanager
     def calling(self) -> Iterator[None]:
-        """Mark the time of such a verb. It waits for no other call, because it may be a stop."""
+        """Mark the time of such a verb; wait for no other call, it may be a stop."""
         call = object()
         self._calls.add(call)
         try:
@@ -222,7 +222,7 @@ def _gate_of(robot: Any, shared: _Shared) -> MotionGate:
 
 
 class AdaptedRobot:
-    """A foreign robot behind the contract: gated, haltable, with its own optional verbs used where it has them."""
+    """Foreign robot behind the contract; its own optional verbs are used."""
 
     def __init__(self, robot: Any, joints: JointReader | None = None) -> None:
         self.wrapped = robot
@@ -263,7 +263,7 @@ class AdaptedRobot:
         return answer
 
     def get_state(self) -> Envelope:
-        """The robot's own state where it tells one, else its joints, ``joints_age_s`` and task.
+        """Return the robot's own state, else its joints, ``joints_age_s`` and task.
 
         While its task runs, or it is being started or stopped, its joints are not read: it drives its bus itself, and
         does not know of our turns on it. They are then those of the last read, and ``joints_error`` says so.
@@ -305,7 +305,7 @@ class AdaptedRobot:
             return halt_each(sources)
 
     def _refresh(self, status: str) -> str:
-        """Read the joints where that disturbs no other call; else return the reason why they are old."""
+        """Read the joints unless a call is disturbed; else return the reason."""
         if self._read_joints is None:
             return ""
         busy = "it is being started or stopped" if self._shared.called else "its task runs" if status in RUNNING else ""
@@ -323,6 +323,6 @@ class AdaptedRobot:
 
 
 def _facts(answer: object) -> dict[str, Any]:
-    """Return the facts of an envelope without its form; none where a foreign robot answers with something else."""
+    """Return the fields of an envelope; none for any other answer."""
     facts = answer if isinstance(answer, Mapping) else {}
     return {key: value for key, value in facts.items() if key not in ("status", "content")}

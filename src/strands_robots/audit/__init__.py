@@ -50,7 +50,7 @@ def log_safety_event(event_type: str, peer_id: str, payload: dict[str, Any]) -> 
 
 
 def flush_audit(timeout: float = FLUSH_S) -> bool:
-    """Return True when every record so far is on the disk; waits ``timeout`` seconds at most."""
+    """Return True when every record is on the disk; wait ``timeout`` s at most."""
     if not _WRITER.used:
         return True
     done = threading.Event()
@@ -59,7 +59,7 @@ def flush_audit(timeout: float = FLUSH_S) -> bool:
 
 
 def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
-    """Return every record over all rotations, oldest first; with ``since`` (wall-clock s) only those not older."""
+    """Return every record, oldest first; with ``since`` (wall-clock s) newer ones."""
     flush_audit(FLUSH_S)
     records = Journal(*_journal_key()).records()
     return [each for each in records if since is None or _time(each) >= since]
@@ -92,7 +92,7 @@ def _time(record: dict[str, Any]) -> float:
 
 
 class _Pending:
-    """Records of one journal that are not on the disk yet, and the flushes that wait for them."""
+    """Records of one journal that are not on the disk yet, and waiting flushes."""
 
     def __init__(self, key: _Key) -> None:
         self.directory = key[0]
@@ -143,7 +143,7 @@ class _Pending:
 
 
 class _Writer:
-    """The thread that owns the journals. Everything reaches it through one queue that is never full."""
+    """Thread that owns the journals, fed by one queue that is never full."""
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[tuple[_Key, AuditEntry | threading.Event]] = queue.SimpleQueue()

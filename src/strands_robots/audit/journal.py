@@ -1,4 +1,4 @@
-"""The audit file: one chained record a line, append only, shared by every process under one lock, and its check.
+"""Audit file: one chained record a line, shared by processes, and its check.
 
 A record is sorted compact JSON with ``ts`` (wall-clock s), ``event``, ``peer_id``, ``payload``, ``seq`` (per peer,
 never reused), ``prev`` (SHA-256 of the line before it) and, with a key, ``sig`` (HMAC-SHA256 of the rest). The head
@@ -43,7 +43,7 @@ class AuditEntry:
 
 @dataclass(slots=True)
 class Head:
-    """State of the chain: hash of the last line, size and inode of its file, last number of each peer.
+    """State of the chain: last line's hash, its file, last number of each peer.
 
     ``origin`` is the hash that the oldest kept record continues from.
     """
@@ -56,7 +56,7 @@ class Head:
 
 
 class Journal:
-    """One audit log in ``directory``. Not thread-safe; processes are kept apart by a file lock.
+    """Audit log in ``directory``. Not thread-safe; a file lock excludes processes.
 
     Raises, from :meth:`append`:
         OSError: full disk, read-only directory, a link where the log should be, a lost permission.
@@ -98,7 +98,7 @@ class Journal:
             self._head = head
 
     def lines(self) -> Iterator[tuple[Path, int, bytes]]:
-        """Yield every line, oldest first: file, line number from 1, bytes without the line's end."""
+        """Yield file, line number from 1 and bytes of every line, oldest first."""
         for path in self.files():
             with contextlib.suppress(FileNotFoundError), path.open("rb") as file:  # rotated away meanwhile
                 for number, line in enumerate(file, 1):
@@ -123,7 +123,7 @@ class Journal:
         return self._key is not None and isinstance(sig, str) and hmac.compare_digest(sig, self._sign(bare))
 
     def head(self) -> Head | None:
-        """Return the content of the head file, or None where it is missing, unreadable or not signed by the key."""
+        """Return the head file's content; None if missing, unreadable or unsigned."""
         try:
             data = json.loads(_read(self._head_path))
             sig = data.pop("sig", "")
@@ -244,7 +244,7 @@ def parse(line: bytes) -> dict[str, Any] | None:
 
 
 def storable(payload: Any) -> Any:
-    """Return ``payload`` where JSON can hold it, else a record that says so, with the part that was kept."""
+    """Return ``payload`` as JSON can hold it, else a record that says so."""
     try:
         text = canonical({"payload": payload})
         if len(text) <= PAYLOAD_MAX_BYTES:
@@ -258,7 +258,7 @@ def storable(payload: Any) -> Any:
 
 @dataclass(slots=True)
 class Findings:
-    """Counts of a check of the log; ``breaks`` are the places of its breaks, in order."""
+    """Counts of a check of the log; ``breaks`` are places, in order."""
 
     total: int = 0
     signed: int = 0

@@ -107,7 +107,7 @@ def _print(screen: Screen, records: Iterable[dict[str, Any]]) -> None:
 
 
 def _line(record: Mapping[str, Any]) -> str:
-    """Return a record as one line: the most important fields first, the technical ones left to ``show``."""
+    """Return a record as one line, without the technical fields of ``show``."""
     payload = record.get("payload")
     facts = dict(payload) if isinstance(payload, Mapping) else {"payload": payload}
     first = [name for name in FIRST_FIELDS if name in facts]
@@ -119,7 +119,7 @@ def _line(record: Mapping[str, Any]) -> str:
 
 
 def _contains(value: object, what: str) -> bool:
-    """Return whether ``what`` is a text, a key or a list's item anywhere in the record."""
+    """Return True when ``what`` is a text, key or item anywhere in the record."""
     if isinstance(value, Mapping):
         return any(key == what or _contains(each, what) for key, each in value.items())
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Functions as commands: ``--json`` and network flags added, ``key=value`` parsed, errors turned into exit codes."""
+"""Functions as commands: flags added, arguments parsed, errors to exit codes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _parameters(function: Callable[..., Any]) -> dict[str, Parameter]:
 
 
 def assignments(arguments: Iterable[str]) -> dict[str, Any]:
-    """Parse ``key=value`` arguments; a value that is JSON is read as JSON, everything else is text.
+    """Parse ``key=value`` arguments; a value is JSON where possible, else text.
 
     ``speed=1.5`` is a number, ``name='"1.5"'`` the text 1.5, ``instruction=wave`` the text wave.
 
@@ -89,7 +89,7 @@ def assignments(arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def parse_ports(ports: Iterable[str]) -> tuple[int | None, str | None]:
-    """Return the TCP port and the serial port among the values of a ``--port`` that may mean either.
+    """Return the TCP port and the serial port among the values of ``--port``.
 
     Raises:
         ValidationError: one that is neither, or two of a kind.

@@ -1,4 +1,4 @@
-"""``doctor``: check what is installed and what works here, and name a remedy for what does not."""
+"""``doctor``: check the installation, and name remedies."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _installation() -> Iterator[Finding]:
 
 
 def other_owners(path: Sequence[str] | None = None) -> list[str]:
-    """Return name and version of every other distribution on ``path`` that installs our import package.
+    """Return every other distribution that installs our import package.
 
     The lists of installed files are searched as text, in about 5 ms: ``importlib.metadata.packages_distributions``
     parses all of them in about 100 ms, which every command would pay.
@@ -155,7 +155,7 @@ def other_owners(path: Sequence[str] | None = None) -> list[str]:
 
 
 def owner_remedy(others: Sequence[str]) -> str:
-    """Return the commands that leave this project as the only owner of its import package."""
+    """Return the commands that make this project the only owner of its import."""
     names = " ".join(other.split()[0] for other in others)
     return f"pip uninstall {names}, then reinstall {DISTRIBUTION} (pip install --force-reinstall --no-deps)"
 
@@ -209,7 +209,7 @@ def _multicast() -> Iterator[Finding]:
 
 
 def multicast_error(within: float = 0.5) -> str | None:
-    """Return why a multicast datagram does not come back within ``within`` seconds, or None when it does."""
+    """Return the reason why no multicast datagram comes back in time, or None."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
@@ -243,7 +243,7 @@ def _certificates() -> Iterator[Finding]:
 
 
 def certificate_error(ca: str, cert: str, key: str, now: datetime | None = None) -> tuple[str, str]:
-    """Return why the three PEM files cannot be used together, or empty; and the certificate's last day."""
+    """Return the problem of three PEM files, or empty, and the last valid day."""
     try:
         from cryptography import x509  # noqa: PLC0415 - comes with the [device-connect] extra
         from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415

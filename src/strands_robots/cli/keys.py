@@ -109,7 +109,7 @@ def signing_key(path: Path, passphrase_file: Path | None = None) -> Any:
 
 
 def _passphrase(prompt: str, file: Path | None = None) -> str:
-    """Read the passphrase from a file, or ask for it on the terminal without showing it.
+    """Read the passphrase from a file, or ask for it without showing it.
 
     Raises:
         CliError: the file cannot be read, or there is neither a file nor a terminal.

@@ -1,4 +1,4 @@
-"""Network of a command: its flags, else the environment, else this machine alone; and how to join it."""
+"""Network of a command: its flags, else the environment, else this machine."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _option(flag: str, text: str, **more: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Network flags as the user gave them, the same for every command that uses a network."""
+    """Network flags as the user gave them."""
 
     nats: Annotated[str | None, _option("--nats", "NATS server, such as nats://host:4222.", metavar="URL")] = None
     connect: Annotated[
@@ -169,7 +169,7 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
 
 
 def temporary_mesh_id(name: str) -> str:
-    """Return a fresh mesh id for one command, covered by the certificate where there is one."""
+    """Return a fresh mesh id for one command, covered by its certificate, if any."""
     from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - loaded when a network is used
     from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
@@ -181,7 +181,7 @@ def temporary_mesh_id(name: str) -> str:
 
 @contextmanager
 def mesh_peer(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mesh]:
-    """Join the native mesh for the length of the block. Raises :class:`CliError` when that is impossible."""
+    """Join the native mesh while the block runs; raise :class:`CliError` if it fails."""
     with ExitStack() as stack:
         try:
             mesh = stack.enter_context(joined_mesh(robot, peer_id, peer_type))

@@ -1,4 +1,4 @@
-"""Terminal output of the commands: exit codes, errors, and a screen for people or for programs.
+"""Output of the commands: exit codes, errors, a screen or JSON.
 
 Text that came over a network is shown as it is, never as markup and never as a control sequence: it passes
 through :func:`plain` and goes to Rich as :class:`rich.text.Text`.
@@ -41,7 +41,7 @@ class Exit(IntEnum):
 
 
 class CliError(StrandsRobotsError):
-    """The failure of a command: one sentence for the user, an exit code for scripts, fields for ``--json``."""
+    """Failure of a command: a sentence, an exit code, fields for ``--json``."""
 
     def __init__(self, reason: str, code: Exit = Exit.REFUSED, **fields: Any) -> None:
         super().__init__(reason)
@@ -51,7 +51,7 @@ class CliError(StrandsRobotsError):
 
 
 def plain(value: object, longest: int = LENGTH_MAX) -> str:
-    """Return ``value`` as one printable line; control, format and bidi characters become visible escapes."""
+    """Return ``value`` as one printable line, control characters escaped."""
     text = value if isinstance(value, str) else _compact(value)
     visible = "".join(_visible(char) for char in text[:longest])
     return visible if len(text) <= longest else f"{visible}... ({len(text)} characters)"
@@ -68,7 +68,7 @@ def first_line(description: object) -> str:
 
 
 class Screen:
-    """Output of one command: tables and sentences for people, or one JSON value a line for programs.
+    """Output of one command: for people, or one JSON value a line for programs.
 
     Args:
         machine: true with ``--json``; then stdout carries only JSON.
@@ -90,7 +90,7 @@ class Screen:
         self.show(label(text, style))
 
     def copyable(self, text: str) -> None:
-        """Print one line for people to paste elsewhere: never broken at the width of the terminal."""
+        """Print a line to paste elsewhere, never broken at the terminal's width."""
         if not self.machine:
             self.out.print(label(text), soft_wrap=True)
 
@@ -125,7 +125,7 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) 
 
 @contextmanager
 def progress_bar(screen: Screen, seconds: float | None, title: str = "playing") -> Iterator[Callable[[float], None]]:
-    """Yield a function that moves a bar to the seconds that have passed; it does nothing without a terminal."""
+    """Yield a function that moves a progress bar; without a terminal it does nothing."""
     if seconds is None or not screen.live:
         yield lambda _: None
         return

@@ -1,4 +1,4 @@
-"""``record DEVICE...``: write their events into a file; and ``--record`` of the commands that move a robot."""
+"""``record DEVICE...``, and ``--record`` of the commands that move a robot."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def record(
 def record_robot(
     screen: Screen, robot: Any, device: str, file: Path | None, cameras: str | None = None
 ) -> Iterator[None]:
-    """Record ``robot`` while the block runs, halts and lockouts included; do nothing without a ``file``.
+    """Record ``robot`` while the block runs, halts included, if there is a ``file``.
 
     Args:
         screen: where the summary is printed.
@@ -131,7 +131,7 @@ def _take_fleet_message(recorder: Recorder, part: str, key: str, body: dict[str,
 
 
 def _wait(screen: Screen, recorder: Recorder, seconds: float | None) -> None:
-    """Wait for the end or for Ctrl-C, with a bar where the end is known and a count where it is not."""
+    """Wait for the end or Ctrl-C, with a bar or, for an unknown end, a count."""
     began = time.monotonic()
     counting = screen.live and seconds is None
     with (

@@ -1,4 +1,4 @@
-"""Operator's permissions: ``resume`` and ``lockout`` after an emergency stop, ``grant`` for one motion of hardware."""
+"""Permissions: ``resume`` and ``lockout`` after an e-stop, ``grant`` of a motion."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def grant(
 
 @dataclass(frozen=True, slots=True)
 class LockoutReport:
-    """Lockouts and status of one robot as it reports them; ``problem`` says why it does not, empty otherwise.
+    """Lockouts and status of one robot; ``problem`` is empty if it reports them.
 
     ``at`` is the time of the report in monotonic seconds.
     """
@@ -167,7 +167,7 @@ def operator() -> str:
 
 
 def _stored_lockouts() -> dict[str, tuple[Lockout, ...]]:
-    """Return the lockouts in this machine's file, by robot; by key where a robot has no name.
+    """Return the lockouts in this machine's file, by robot or by its key.
 
     Raises:
         CliError: the file cannot be read.
@@ -200,7 +200,7 @@ def _lockout(row: Mapping[str, Any]) -> Lockout:
 
 
 def _lockout_rows(name: str, lockouts: Iterable[Lockout]) -> list[tuple[str, str]]:
-    """Return two cells for each lockout: since when, by whom and why; and its epoch, which other commands take."""
+    """Return two cells for each lockout: time, source and reason; and its epoch."""
     cells: list[tuple[str, str]] = []
     for each in lockouts:
         why = f": {each.reason}" if each.reason else ""
@@ -227,7 +227,7 @@ def _clear_locally(screen: Screen, wanted: list[str]) -> None:
 def _resume_all(
     fleet: FleetClient, found: list[LockoutReport], signer: Any, seconds: float
 ) -> dict[str, tuple[bool, str]]:
-    """Sign for every lockout and present the assertions; return whether each robot is free, and its answer."""
+    """Sign and send a resume of every lockout; return each robot's answer."""
     by_epoch: dict[str, list[str]] = {}
     for robot in found:
         for lockout in robot.lockouts:

@@ -1,4 +1,4 @@
-"""``safety-controller``: a full-screen terminal whose space bar stops every robot."""
+"""``safety-controller``: a full screen whose space bar stops every robot."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _run(screen: Screen, controller: SafetyController, fleet: FleetScreen, reaso
 
 @contextmanager
 def _keys(pressed: Callable[[str], None], closed: Callable[[], None]) -> Iterator[None]:
-    """Call ``pressed`` with each key from standard input, a terminal, on a thread of its own; ``closed`` at its end.
+    """Call ``pressed`` with each key of the terminal, on a thread of its own.
 
     Ctrl-C stays a signal. The terminal's modes are restored when the block is left.
     """
@@ -132,7 +132,7 @@ def _keys(pressed: Callable[[str], None], closed: Callable[[], None]) -> Iterato
 
 
 class StopButton:
-    """Emergency stop at each press, sent before anything else is done, with the latest progress and report.
+    """Emergency stop at each press, with the latest progress and report.
 
     A press during a running stop is part of it. A stop runs until it has left and every expected robot has answered:
     a link that swallows everything looks as if it were up for seconds.
@@ -191,7 +191,7 @@ class StopButton:
 
 
 class FleetScreen:
-    """Table of every robot with its lockout, last answer and check-in, polled on a thread and connection of its own.
+    """Table of robots, polled on a thread and a connection of its own.
 
     Args:
         controller: whose link and id are shown.
@@ -206,7 +206,7 @@ class FleetScreen:
         self._closed = threading.Event()
 
     def expected(self) -> Collection[str]:
-        """Return the robots that must answer a stop: every one that was seen and not forgotten."""
+        """Return the robots that must answer a stop: seen and not forgotten."""
         return tuple(self._robots)
 
     def forget(self) -> None:

@@ -1,4 +1,4 @@
-"""``serve ROBOT``: put a robot on the network until Ctrl-C, which stops the robot first."""
+"""``serve ROBOT``: put a robot on the network until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
 
 
 def _network_flags(link: LinkConfig, network: Network) -> str:
-    """Return the flags with which another terminal reaches the same network; none names a secret."""
+    """Return the flags for another terminal of the same network, without secrets."""
     flags = []
     if network.nats:
         flags += ["--nats", network.nats]
@@ -238,7 +238,7 @@ def _halt(screen: Screen, body: Any) -> bool:
 
 
 def _wait(signals: StopSignal, piped: bool) -> int | None:
-    """Wait for a signal, or for the end of standard input where ``piped``; return the signal's number."""
+    """Wait for a signal, or for the end of a piped input; return its number."""
     closed = threading.Event()
 
     def read() -> None:

@@ -1,4 +1,4 @@
-"""``stop``: stop one robot, or all. ``estop``: stop and lock every robot, with each robot's answer by name."""
+"""``stop``: stop one robot, or all. ``estop``: stop and lock every robot."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ class RunningStop:
 
 
 def exit_code(report: StopReport) -> Exit:
-    """Return 0 when all stopped, 1 when one did not or refused, 3 when one or all are silent."""
+    """Return 0 when all stopped, 1 when one did not, 3 when one is silent."""
     if report.not_stopped or report.refused:
         return Exit.REFUSED
     return Exit.OK if report.ok else Exit.SILENT
@@ -266,7 +266,7 @@ def _show_outcomes(screen: Screen, outcomes: Mapping[str, tuple[bool | None, str
 
 
 def _report_mesh_stop(screen: Screen, answer: Envelope, then: str = "") -> None:
-    """Print the answers to a stop on the mesh. Raises :class:`CliError` unless every robot confirmed it."""
+    """Print the mesh's answers; raise :class:`CliError` unless all confirmed."""
     moving, silent = answer.get("not_stopped", []), answer.get("silent", [])
 
     def outcome(name: str) -> bool | None:

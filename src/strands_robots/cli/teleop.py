@@ -1,4 +1,4 @@
-"""``teleop`` and ``replay``: a leader or a recording drives a follower. ``calibrate``: measure an arm by hand."""
+"""``teleop`` and ``replay``: lead a follower. ``calibrate``: measure an arm."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _drive(
     publish: str | None = None,
     record: Path | None = None,
 ) -> None:
-    """Make the follower, let the leader that ``connected`` returns for it drive it, and stop it in every case.
+    """Let the leader that ``connected`` returns drive a follower, and stop it.
 
     Raises:
         CliError: it was refused, it failed, or the follower did not confirm its stop.
@@ -195,7 +195,7 @@ def _drive(
 def _follow(
     screen: Screen, peer: str, follower: str, arm: dict[str, Any], *, options: TeleopOptions, record: Path | None
 ) -> None:
-    """Let a leader that a peer of the mesh publishes drive a follower of this machine."""
+    """Let a leader published on the mesh drive a follower of this machine."""
     with _made_follower(screen, follower, arm, record, mesh=True, peer_id=temporary_mesh_id("follow")) as robot:
         why, stats = follow_peer(screen, peer, robot, options)
         verdict = _stop(screen, robot)
@@ -210,7 +210,7 @@ def _follow(
 def _made_follower(
     screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, name: str | None = None, **more: Any
 ) -> Iterator[Any]:
-    """Make the follower of this machine, ``TYPE@PORT`` or a model; record it, and halt it at the end."""
+    """Make and record the follower, ``TYPE@PORT`` or a model; halt it at the end."""
     from strands_robots.robot import NO_SUCH_MODEL, Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
@@ -268,7 +268,7 @@ def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Itera
 
 @contextmanager
 def _connected_arm(name: str, arm: LeaderArm) -> Iterator[LeaderArm]:
-    """Yield the leader arm while it is connected. Raises ``ConnectionError`` with one sentence where it cannot be."""
+    """Yield the connected leader arm; raise ``ConnectionError`` where it fails."""
     with ExitStack() as stack:
         try:
             stack.enter_context(arm)
@@ -278,7 +278,7 @@ def _connected_arm(name: str, arm: LeaderArm) -> Iterator[LeaderArm]:
 
 
 def _recorded_leader(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
-    """Return a recording as a leader: ``.csv``, a LeRobot ``.parquet``, or ``.mcap`` of one device.
+    """Return a recording as a leader: ``.csv``, ``.parquet`` or ``.mcap``.
 
     Args:
         path: the file.

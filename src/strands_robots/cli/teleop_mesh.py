@@ -1,4 +1,4 @@
-"""Teleoperation over the mesh: lead a remote peer, publish a leader, or follow a leader published elsewhere.
+"""Teleoperation over the mesh: lead a peer, publish or follow a leader.
 
 Authorization and lockout are the follower's, wherever its leader is.
 """
@@ -61,7 +61,7 @@ class TeleopOptions:
 
 
 class RemoteFollower:
-    """A peer of the mesh as its leader sees it: its joints and ranges, as it answered.
+    """Peer of the mesh with the joints and ranges that it answered.
 
     Raises:
         CliError: it does not answer, or has no action that can be led.
@@ -91,7 +91,7 @@ class RemoteFollower:
         return dict(self._joints)
 
     def ask(self, action: str, **fields: Any) -> dict[str, Any]:
-        """Send a command. Raises :class:`CliError` with the peer's own reason when it refuses."""
+        """Send a command; raise :class:`CliError` with the reason of a refusal."""
         reply = self._mesh.send(self.peer, {"action": action, **fields}, _ANSWER_S)
         result = reply.get("result")
         if reply.get("status") == "timeout":
@@ -104,7 +104,7 @@ class RemoteFollower:
         return result
 
     def open_stream(self, leader: str) -> None:
-        """Have the peer open the stream; retried while it does not know the leader's id yet."""
+        """Have the peer open the stream; retry until it knows the leader's id."""
         deadline = time.monotonic() + _OPEN_S
         while True:
             try:
@@ -127,7 +127,7 @@ class RemoteFollower:
 
 
 class LimitedFollower:
-    """Applies the frames of a stream with a bounded speed, from the robot's present joints: no jump at the start.
+    """Bounded-speed application of a stream, from the robot's present joints.
 
     Args:
         body: has ``bounds`` and ``get_joints``.
@@ -143,7 +143,7 @@ class LimitedFollower:
         self._at = now()
 
     def __call__(self, robot: Any, action: dict[str, float]) -> Any:
-        """Apply one frame and return the robot's answer. Raises :class:`ValidationError` for an unknown key."""
+        """Apply a frame, return the answer; refuse an unknown key."""
         target = checked_action(action, self._bounds)
         now = self._now()
         # The time of a pause does not count, or the next frame could jump.
@@ -153,7 +153,7 @@ class LimitedFollower:
 
 
 class NoFollower:
-    """Stand-in for a robot where none follows here; a leader that starts from its joints is refused."""
+    """Stand-in for a robot where none follows here."""
 
     def body(self) -> NoFollower:
         """Raise :class:`ValidationError`."""
@@ -163,7 +163,7 @@ class NoFollower:
 
 
 class _PublishedLeader:
-    """A leader that notes when it has finished; its followers receive nothing more then."""
+    """Leader that notes its end; its followers receive nothing more then."""
 
     def __init__(self, leader: Any) -> None:
         self.finished = False
@@ -187,7 +187,7 @@ def peer_in_reach(mesh: Mesh, peer: str) -> bool:
 
 
 def check_keys(follower: str, leader: Any, bounds: Ranges) -> None:
-    """Raise :class:`ValidationError` for a leader of joints that the follower lacks, before anything moves."""
+    """Refuse a leader of joints that the follower lacks, before anything moves."""
     unknown = [key for key in getattr(leader, "keys", ()) if key not in bounds]
     if unknown:
         raise ValidationError(f"{follower} has {', '.join(bounds)}, not {', '.join(unknown)}, which the leader leads.")
@@ -207,7 +207,7 @@ def lead_peer(
     connected: Callable[[Any], AbstractContextManager[Any]],
     options: TeleopOptions,
 ) -> None:
-    """Let a leader drive a peer of the mesh until it ends, and stop the peer in every case.
+    """Let a leader drive a peer of the mesh until it ends, then stop the peer.
 
     Args:
         screen: where it is reported.
@@ -256,7 +256,7 @@ def lead_peer(
 
 
 def publish_leader(screen: Screen, leader: str, peer: str, source: Any, options: TeleopOptions) -> None:
-    """Publish a leader on the mesh as ``peer``, for followers elsewhere, until it ends.
+    """Publish a leader on the mesh as ``peer`` until it ends.
 
     Raises:
         CliError: there is no mesh, or nothing could be published.
@@ -320,7 +320,7 @@ def follow_peer(screen: Screen, peer: str, robot: Any, options: TeleopOptions) -
 def _leading_over(
     follower: RemoteFollower, leader: str, bounded: BoundedLeader, seconds: float | None, counters: dict[str, Any]
 ) -> Callable[[], str]:
-    """Return a function that says why leading is over; it reads the follower's counters a few times a second."""
+    """Return a function that gives the reason why leading is over, or None."""
     began = time.monotonic()
     asked_at = answered_at = began
 

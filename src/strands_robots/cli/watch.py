@@ -103,7 +103,7 @@ class DeviceView:
 
 
 def describe_task(event: DeviceEvent) -> str:
-    """Return what an event reports of the device's task; empty where it reports nothing."""
+    """Return the task that an event reports, or an empty text."""
     facts = event.payload
     if event.name in ("taskStarted", "policyStarted"):
         return f"started {facts.get('instruction', '')!r} with {facts.get('policy_provider', '')}"
@@ -127,7 +127,7 @@ def describe_task(event: DeviceEvent) -> str:
 
 
 def until(events: Iterator[DeviceEvent], longest: float | None, device: str) -> Iterator[DeviceEvent]:
-    """Yield events for ``longest`` seconds. Raises :class:`CliError` when the device falls silent."""
+    """Yield events for ``longest`` s; raise :class:`CliError` at silence."""
     ends = None if longest is None else time.monotonic() + longest
     for event in events:
         yield event
@@ -148,7 +148,7 @@ def print_changes(screen: Screen, events: Iterator[DeviceEvent]) -> None:
 
 
 def joint_limits(features: Mapping[str, Any]) -> dict[str, Range]:
-    """Return the joint limits in a device's answer to getFeatures, by joint; of a world, those of its first robot."""
+    """Return the joint limits in an answer to getFeatures; a world's first robot."""
     robots = features.get("robots")
     chosen: Any = features
     if isinstance(robots, Mapping) and robots:
@@ -176,7 +176,7 @@ def joint_bar(value: float, limits: Range = FULL_TURN) -> Text:
 
 
 def joints_table(joints: Mapping[str, object], limits: Mapping[str, Range]) -> Table:
-    """Return every joint with its bar and its value; values that are no finite number are left out."""
+    """Return every joint of a finite value with its bar and its value."""
     grid = _grid()
     grid.add_column(no_wrap=True)
     grid.add_column(justify="right", no_wrap=True)
@@ -212,7 +212,7 @@ def _finite(value: object) -> TypeGuard[int | float]:
 
 
 def _present_state(fleet: FleetClient, device: str, limits: Mapping[str, Range]) -> DeviceView:
-    """Return a view of the device as it is now: an idle robot may send no joints by itself."""
+    """Return a view of the device now; an idle robot may send no joints."""
     view = DeviceView(device, limits)
     for function in ("getState", "getStatus"):
         with contextlib.suppress(CliError):  # a device answers one of the two

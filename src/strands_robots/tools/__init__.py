@@ -1,4 +1,4 @@
-"""Tools for agents. Importing this package needs no extra; a tool is loaded on first access."""
+"""Tools for agents, loaded at first access; the package needs no extra."""
 
 from __future__ import annotations
 

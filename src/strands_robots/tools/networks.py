@@ -1,4 +1,4 @@
-"""Networks of the ``robot_mesh`` tool: Device Connect and the native mesh, with the same verbs.
+"""Networks of the ``robot_mesh`` tool, with the same verbs.
 
 Each verb answers with an envelope and never raises.
 """
@@ -39,7 +39,7 @@ class MeshUnavailableError(StrandsRobotsError, RuntimeError):
 
 
 def network() -> DeviceConnect | NativeMesh:
-    """Return Device Connect, or the mesh where it is absent or ``STRANDS_ROBOT_MESH_DC`` says off."""
+    """Return Device Connect, or the mesh where it is absent or switched off."""
     absent = importlib.util.find_spec("device_connect_edge") is None
     if absent or settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_SPELLINGS:
         return NativeMesh()
@@ -53,7 +53,7 @@ def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
 
 
 def combined_verdict(answers: Mapping[str, Envelope]) -> Envelope:
-    """Return one answer for the stop of several robots: success only when each of them confirmed it."""
+    """Return one answer for several stops: success when all were confirmed."""
     if not answers:
         return error("No robot that can be stopped answered.", stopped=None, robots={})
     outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
@@ -94,7 +94,7 @@ def joined_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mes
 
 
 class NativeMesh:
-    """Robots on the native mesh, called by a peer of this process without a robot. Silence is an error."""
+    """Robots on the native mesh, called by a peer without a robot."""
 
     def peers(self) -> Envelope:
         """List every peer in reach, with its type and state."""
@@ -133,7 +133,7 @@ class NativeMesh:
         return _on_mesh(stopped, stopped=None)
 
     def emergency_stop(self, reason: str) -> Envelope:
-        """Send the mesh's emergency stop at once, and again while a peer has not confirmed it.
+        """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
         A peer that was seen and did not answer is named. Each repetition is an epoch of its own; one signed resume
         clears all of them. ``estop_id`` names the first.
@@ -158,7 +158,7 @@ class NativeMesh:
 
 
 def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
-    """Send a stop now, and at most every :data:`AGAIN_S` while a peer in reach has not confirmed it."""
+    """Send a stop, and again while a peer in reach has not confirmed it."""
     seen: set[str] = set()
     answers: dict[str, Envelope] = {}
     sent = time.monotonic()
@@ -216,7 +216,7 @@ def _discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None) -> Non
 
 
 def _reply(mesh: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
-    """Send a command once ``target`` is in reach, or once it is known that it is not; return its reply."""
+    """Send a command once ``target`` is in reach or known not to be."""
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when it is used
     from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
 
@@ -238,7 +238,7 @@ def _on_mesh(work: Callable[[Mesh], Envelope], **fields: Any) -> Envelope:
 
 
 class DeviceConnect:
-    """Robots on Device Connect. A robot that does not answer is an error, never an empty success."""
+    """Robots on Device Connect; a robot without an answer is an error."""
 
     def peers(self) -> Envelope:
         """List every device that answers, with its type, state and functions."""

@@ -1,4 +1,4 @@
-"""``demo``: two processes on loopback, an arm that an agent finds, drives and stops, and that a stop locks."""
+"""``demo``: an agent finds, drives and stops an arm, and a stop locks it."""
 
 from __future__ import annotations
 

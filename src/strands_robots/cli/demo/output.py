@@ -1,4 +1,4 @@
-"""Output of the demo: its screen with a recording as SVG, and pictures of the path that the agent saw."""
+"""Output of the demo: its screen, recorded as SVG, and pictures of the path."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FONT_FACES = re.compile(r"@font-face\s*\{[^}]*\}\s*")
 
 
 class DemoScreen:
-    """Sentences, tables and a live frame on the terminal; a recording has the last state of each frame.
+    """Terminal with a live frame; a recording has each frame's last state.
 
     Args:
         screen: the terminal; silent with ``--json``.
@@ -99,7 +99,7 @@ class DemoScreen:
 
 
 def draw_path(robot: str, path: Sequence[tuple[float, dict[str, float]]], folder: Path) -> tuple[list[Path], str]:
-    """Replay a path on a simulated arm; write ``arm-path.png`` and ``demo.gif``; return both and how they were drawn.
+    """Replay a path on a simulated arm and write ``arm-path.png``, ``demo.gif``.
 
     Args:
         robot: the model that the agent drove.
@@ -148,7 +148,7 @@ def draw_path(robot: str, path: Sequence[tuple[float, dict[str, float]]], folder
 
 
 def sample_poses(path: Sequence[tuple[float, dict[str, float]]], hz: float, most: int) -> list[dict[str, float]]:
-    """Return one pose for each 1/``hz`` seconds with an event, at most ``most``; pauses are left out."""
+    """Return at most ``most`` poses, one for each 1/``hz`` s with an event."""
     chosen: list[dict[str, float]] = []
     slot = -1
     for at, joints in path:

@@ -1,4 +1,4 @@
-"""Both sides of the demo: the robot's process, and the agent with the framework's own, unmodified tools."""
+"""Processes of the demo: the robot, and the agent with the framework's tools."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class RobotProcess:
 
 @contextmanager
 def served_robot(robot: str, peer_id: str, port: int, tenant: str) -> Iterator[RobotProcess]:
-    """Serve ``robot`` on 127.0.0.1 at ``port``; its process is gone when the block is left, in every case.
+    """Serve ``robot`` on 127.0.0.1 at ``port`` while the block runs.
 
     Raises:
         CliError: it is not on the network within :data:`READY_S` seconds.
@@ -123,7 +123,7 @@ def _read_lines(pipe: IO[str] | None, take: Any) -> None:
 
 @dataclass(frozen=True, slots=True)
 class AgentEvent:
-    """One event of a device as the agent received it; ``at`` is its arrival in monotonic seconds."""
+    """Event of a device at the agent; ``at`` is its arrival, monotonic seconds."""
 
     name: str
     payload: Mapping[str, Any]
@@ -216,7 +216,7 @@ class EventStream:
 
 @contextmanager
 def connected_agent(port: int) -> Iterator[Agent]:
-    """Connect the agent to the loopback endpoint at ``port``; the user's own settings do not apply.
+    """Connect the agent to loopback at ``port``, without the user's settings.
 
     Raises:
         CliError: no connection could be made.

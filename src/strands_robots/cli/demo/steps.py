@@ -70,7 +70,7 @@ class DemoReport:
 
 @contextmanager
 def demo_operator() -> Iterator[Any]:
-    """Yield an operator's key made for this demo; the robot's process gets its public half.
+    """Yield an operator's key for this demo; the robot gets its public half.
 
     Robot and audit get a state folder of their own, so that no demo finds the lockout of an earlier one.
     """
@@ -87,7 +87,7 @@ def demo_operator() -> Iterator[Any]:
 
 
 class DriveSteps:
-    """First steps: discovery, a motion, a stop in mid-motion; and the motions that later steps use.
+    """First steps: discovery, a motion, a stop in mid-motion.
 
     Args:
         screen: where it is printed.
@@ -152,7 +152,7 @@ class DriveSteps:
         )
 
     def run_motion(self, stream: EventStream, title: str, seconds: float) -> tuple[int, float]:
-        """Run a motion to its end; return its steps and the travel of its busiest joint (rad).
+        """Run a motion to its end; return its steps and largest joint travel (rad).
 
         Raises:
             CliError: it was refused, did not end, ended otherwise, or nothing moved.
@@ -169,7 +169,7 @@ class DriveSteps:
         return int(ended.payload.get("steps") or 0), self._travelled(self.report.path[before:])
 
     def start_motion(self, stream: EventStream, title: str, seconds: float) -> None:
-        """Start a motion of a minute and return after ``seconds``. Raises :class:`CliError` when nothing moved."""
+        """Start a motion of a minute and return after ``seconds`` of movement."""
         before = len(self.report.path)
         self._agent.call(self._peer, "execute", instruction=title, policy_provider="mock", duration=60.0)
         self._follow(stream, title, seconds, lambda event: False, total=60.0)
@@ -178,7 +178,7 @@ class DriveSteps:
     def _follow(
         self, stream: EventStream, title: str, within: float, until: Callable[[AgentEvent], bool], total: float
     ) -> AgentEvent | None:
-        """Draw events until ``until`` or for ``within`` seconds; add the joints to the report's path."""
+        """Draw events until ``until`` or for ``within`` s; add joints to the path."""
         started = time.monotonic()
         with self._screen.live() as frame:
             for event in stream.follow(within):
@@ -192,7 +192,7 @@ class DriveSteps:
         return None
 
     def _travelled(self, path: list[tuple[float, Joints]]) -> float:
-        """Return the travel of the busiest joint (rad). Raises :class:`CliError` when none moved."""
+        """Return the largest joint travel (rad); raise :class:`CliError` for none."""
         names = {name for _, joints in path for name in joints}
         spans = [_span([joints[name] for _, joints in path if name in joints]) for name in names]
         most = max(spans, default=0.0)
@@ -228,7 +228,7 @@ class DriveSteps:
 
 
 class SafetySteps:
-    """Last steps: an emergency stop that locks, a refusal, an operator's signature, and a motion again.
+    """Last steps: an emergency stop, a refusal, a signed resume, a motion again.
 
     Args:
         screen: where it is printed.
@@ -260,7 +260,7 @@ class SafetySteps:
         return self.emergency_stop, self.refuse, self.resume, self.move_again
 
     def emergency_stop(self) -> None:
-        """Stop the arm in mid-motion by a safety controller, on a connection that carries nothing else."""
+        """Stop the arm in mid-motion by a safety controller."""
         self._screen.head("It moves once more, and a safety controller stops everything")
         with self._report.step("emergency stop") as row, self._agent.events(self._peer) as stream:
             self._motions.start_motion(stream, "wave on", 1.2)
@@ -277,7 +277,7 @@ class SafetySteps:
         )
 
     def refuse(self) -> None:
-        """Check that the next motion is refused, with the source of the stop and the way to resume."""
+        """Check that the next motion is refused, naming the stop and the resume."""
         self._screen.head("The agent tries to go on")
         with self._report.step("refusal") as row:
             answer = self._agent.ask(self._peer, "execute", instruction="go on", policy_provider="mock", duration=1.0)
