@@ -301,7 +301,7 @@ def _traced() -> bool:
 
 
 def observed(driver: Any) -> bool:
-    """Return True while the framework's log lines of a call, its spans or its metrics reach somebody."""
+    """Return True while the framework's log lines, spans or metrics are recorded."""
     integration = callable(getattr(driver, "log_integration", None))
     return integration or decorators.logger.isEnabledFor(logging.INFO) or _traced()
 

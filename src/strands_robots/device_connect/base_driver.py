@@ -1,4 +1,4 @@
-"""A robot as a device: RPC methods made from its verbs, its stop, and its state in status, presence and events.
+"""Robot as a device: RPC methods made from its verbs, its stop, its state.
 
 The driver is a codec: it turns an RPC into a :class:`~strands_robots.serving.pipeline.Command`, and the pipeline's
 answer into an envelope that JSON can carry. Robot calls run on threads, never on the event loop.
@@ -50,7 +50,7 @@ _EVENTS: WeakKeyDictionary[type, tuple[EventDef, ...]] = WeakKeyDictionary()
 
 @dataclass(frozen=True, slots=True)
 class Activity:
-    """The present doing of a robot, as told in status, presence, heartbeat and ``stateUpdate``."""
+    """Present activity of a robot, as status, presence and events report it."""
 
     busy: bool = False
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class Activity:
 
 
 def rpc_method(verb: Verb) -> Callable[..., Any]:
-    """Make the RPC method of a verb; its signature, docstring and schema are the verb's description."""
+    """Make the RPC method of a verb from the verb's description."""
 
     async def method(self: RobotDriver, *values: object, **named: object) -> dict[str, Any]:
         arguments = {**dict(zip(verb.by_name, values, strict=False)), **named}
@@ -151,7 +151,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
     # Commands.
 
     async def invoke(self, function_name: str, /, **params: Any) -> Any:
-        """Call an RPC by name; the framework's spans and log lines are left out while nothing takes them."""
+        """Call an RPC by name, without spans and log lines that nothing records."""
         verb = self.verbs.get(function_name)
         if verb is None or observed(self):
             problem = verb and verb.unfit(params.keys() - {"source_device"})
@@ -185,7 +185,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         return enveloped(verb.name, result.result)
 
     def authorize(self, command: Command, arguments: Arguments) -> None:
-        """Refuse a motion of a caller that may not move the robot, and a policy that callers may not ask for."""
+        """Refuse a caller that may not move the robot, and a policy not allowed."""
         if command.verb.kind is not Kind.MOTION:
             return
         refusal = self.authorization.motion(command.caller, command.verb.name)
@@ -227,7 +227,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         return enveloped("stop", self.stop_envelope(verdict))
 
     def handle_estop(self, device_id: object, payload: object) -> StopVerdict | None:
-        """Act on an emergency stop and wait for the verdict; None when it does not count. Any thread."""
+        """Act on an emergency stop; return the verdict, None when it does not count."""
         halting = self._begin_estop(device_id, payload)
         return None if halting is None else halting.result()
 
@@ -245,7 +245,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         await self.on_estop(device_id, payload)
 
     async def on_estop(self, device_id: object, payload: object) -> None:
-        """Act on an emergency stop that came by the runtime: in the safety plane, or off the network by itself."""
+        """Act on an emergency stop of the runtime, in the safety plane if registered."""
         if device_id != self.peer_id and self.registration is not None:
             self.registration.runtime_estop(device_id, payload)
         else:
@@ -288,7 +288,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     @property
     def functions(self) -> list[FunctionDef]:
-        """The functions that can be called; read off a class once, not for each robot of a fleet."""
+        """Return the functions that can be called, read once for each class."""
         if type(self) not in _FUNCTIONS:
             _FUNCTIONS[type(self)] = tuple(super().functions)
         return list(_FUNCTIONS[type(self)])
@@ -321,7 +321,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         return str(getattr(self.runtime, "device_id", "") or self.robot.tool_name_str)
 
     def set_event_callback(self, callback: Callable[[str, dict[str, Any]], Any]) -> None:
-        """Emit through ``callback`` on the loop of this call, from whatever thread or loop an event comes."""
+        """Emit through ``callback`` on the loop of this call, from any thread."""
         home = asyncio.get_running_loop()
 
         async def emit_at_home(name: str, payload: dict[str, Any]) -> None:

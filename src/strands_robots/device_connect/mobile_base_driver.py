@@ -1,4 +1,4 @@
-"""Mobile bases as devices: ``drive``, and ``navigateTo`` where there is a navigation stack."""
+"""Mobile bases as devices: ``drive``, and ``navigateTo`` with a navigation stack."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Reachy Mini as a device: its verbs, its availability and the events of its motions."""
+"""Reachy Mini as a device: verbs, availability, events of its motions."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class ReachyMiniDriver(RobotDriver):
 
     @property
     def status(self) -> DeviceStatus:
-        """``busy`` while it moves, ``idle`` while it could, else ``unavailable`` with the reason as error state."""
+        """Return ``busy``, ``idle``, or ``unavailable`` with the reason as error state."""
         away = self.reachy.connection.refusal()
         if away is None:
             return super().status

@@ -60,7 +60,7 @@ class RobotDeviceDriver(RobotDriver):
         )
 
     def authorize(self, command: Command, arguments: Arguments) -> None:
-        """Refuse as every device does, and note the policy for a robot that tells no rollout by itself."""
+        """Refuse as every device does; note the policy for a robot without events."""
         super().authorize(command, arguments)
         self._provider = arguments.get("policy_provider", self._provider)
 
@@ -119,7 +119,7 @@ class RobotDeviceDriver(RobotDriver):
         return Activity(state in RUNNING, told)
 
     async def tell(self, activity: Activity) -> None:
-        """Emit ``stateUpdate``, and the start and end of a task that a foreign robot does not tell by itself."""
+        """Emit ``stateUpdate``, and start and end of a foreign robot's task."""
         if not self._tells:
             await self._tell_change(activity)
         await self.stateUpdate(**activity.facts)

@@ -1,4 +1,4 @@
-"""A device's registration with the safety plane: its robot, its e-stop connection, and its runtime's e-stop handler."""
+"""Registration of a device with the safety plane, and its runtime's handler."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 def register_safety(
     device_id: str, driver: DeviceDriver, link: LinkConfig, *, named: bool
 ) -> SafetyRegistration | None:
-    """Put a driver's robot under the safety plane before it is on the network; None for a driver without a robot.
+    """Register a driver's robot with the safety plane; None without a robot.
 
     Args:
         named: the operator gave ``device_id``; a simulation's lockout is kept only then.
@@ -72,7 +72,7 @@ class SafetyRegistration:
         return self._seat.link.up
 
     def runtime_estop(self, source: object, params: object) -> None:
-        """An emergency stop that came by the runtime's own handler; returns at once, halts nothing twice."""
+        """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
             estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime")
 
@@ -81,7 +81,7 @@ class SafetyRegistration:
         return self.entry.resume(assertion, "device-connect")
 
     def facts(self) -> dict[str, Any]:
-        """For ``getStatus``: what holds the robot, since when and by whom, and the dead-man check-in."""
+        """Return the lockouts and the check-in of the robot, for ``getStatus``."""
         holds = self.entry.latch.state.all
         return {
             "locked": bool(holds),
@@ -91,7 +91,7 @@ class SafetyRegistration:
         }
 
     def leave(self) -> None:
-        """Leave lane and plane; the lockout on disk stays. Blocks while a link closes; safe to call twice."""
+        """Leave listener and plane; block while a link closes. Safe to call twice."""
         self._seat.close()
         entry, self._held = self._held, None
         if entry is not None:

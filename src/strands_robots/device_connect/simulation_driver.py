@@ -1,4 +1,4 @@
-"""A simulated world as a device: policies on its robots, physics by hand, and observations of every robot."""
+"""Simulated world as a device: policies, physics by hand, observations."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class SimulationDeviceDriver(RobotDriver):
         """
 
     def glance(self) -> Activity:
-        """Time, steps and running policies of the world; keeps the joints for :meth:`observationUpdate`."""
+        """Return time, steps and policies of the world; store the joints for events."""
         facts = fields_of(self.world.get_state())
         rows = self.world.list_policies_running()
         running = {str(row.get("robot", "")): {k: v for k, v in row.items() if k != "robot"} for row in rows}

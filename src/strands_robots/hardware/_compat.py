@@ -1,4 +1,4 @@
-"""LeRobot as it is, and what of it is used beyond its documented interface. Written for LeRobot 0.4.4.
+"""Use of LeRobot 0.4.4 beyond its documented interface.
 
 LeRobot's motor drivers need no torch, but importing them loads helpers that do: ``lerobot.utils.utils`` imports torch,
 accelerate and datasets at its top, and ``lerobot.processor``, of which the drivers use two type aliases, all of torch
@@ -38,7 +38,7 @@ def light() -> bool:
 
 
 def lerobot_module(name: str) -> ModuleType:
-    """Import a module of LeRobot's, such as ``lerobot.robots``; its drivers also where torch is not installed.
+    """Import a module of LeRobot's; its drivers also where torch is missing.
 
     Raises:
         ModuleNotFoundError: LeRobot, or something the module really needs, is not installed.
@@ -72,7 +72,7 @@ def _standin(name: str, classes: tuple[str, ...]) -> ModuleType:
 
 
 def unplugged(device: Any) -> bool:
-    """Return True when the serial port that a LeRobot device has open is gone from the machine.
+    """Return True when the open serial port of a LeRobot device is gone.
 
     LeRobot calls a bus connected for as long as its port object is open, also when the cable is out. The node of a
     removed port has no name left, so the open file has no links.
@@ -87,14 +87,14 @@ def unplugged(device: Any) -> bool:
 
 
 def forget_input(device: Any) -> None:
-    """Throw away what has come in on the serial port of a LeRobot device and was not read."""
+    """Discard unread bytes of the serial port of a LeRobot device."""
     serial = getattr(getattr(getattr(device, "bus", None), "port_handler", None), "ser", None)
     if serial is not None and serial.is_open and not unplugged(device):
         serial.reset_input_buffer()
 
 
 def drop(device: Any) -> None:
-    """Close what a LeRobot device has open on a port that is gone or did not answer, so that it can be tried again.
+    """Close the port of a LeRobot device that is gone or silent, for another try.
 
     LeRobot leaves the port open when its handshake fails, and an exchange that broke off leaves the SDK's port marked
     as in use, so that every later one would be refused. Nothing for a device without such a port.

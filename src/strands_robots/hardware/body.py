@@ -1,4 +1,4 @@
-"""A device as the body of a control loop: every exchange under its bus lock, every write under a valid permit."""
+"""Device as the body of a control loop, under its bus lock and a permit."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class DeviceBody:
         return None if latest is None else (time.monotonic() - latest[0], dict(latest[1]))
 
     def connect(self) -> None:
-        """Connect the device, a LeRobot device without a prompt; nothing when it is. Raises what the device raises."""
+        """Connect the device unless it is connected, a LeRobot device without a prompt."""
         with self.lock:
             if self.lost:
                 drop(self.device)
@@ -108,7 +108,7 @@ class DeviceBody:
 
     @staticmethod
     def bring_up(device: Any) -> None:
-        """Connect a follower or leader, its calibration first. Raises what it raises, with its port closed."""
+        """Connect a follower or leader, its calibration first; close it on failure."""
         require_port(device)
         for left in reversed(range(CONNECT_TRIES)):
             try:
@@ -132,7 +132,7 @@ class DeviceBody:
             return observation
 
     def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
-        """The joints now. An answer that is lost is asked for again, unless a stop waits for the bus.
+        """Read the joints; repeat after a lost answer unless a stop waits for the bus.
 
         Raises what the device raises.
         """
@@ -155,7 +155,7 @@ class DeviceBody:
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
-        """Hold the bus for a stop of the body: readers give it up after the exchange that is under way.
+        """Reserve the bus for a stop; readers release it after their exchange.
 
         The bus is waited for without end, so a caller with a deadline does this on the stop executor's thread.
         """
@@ -174,7 +174,7 @@ class DeviceBody:
                 self._stops.remove(stop)
 
     def stop(self) -> None:
-        """Freeze, or let go, as the stop level says; nothing where it is disconnected and was not moved since.
+        """Freeze or release as the stop level says; nothing if idle and disconnected.
 
         Raises:
             ConnectionError: the port is gone, or some motors did not confirm that they let go.
@@ -211,7 +211,7 @@ class DeviceBody:
         raise AssertionError  # the last try returns or raises
 
     def _hold(self, *, urgent: bool = False) -> None:
-        """The device's own ``hold()``, else the present position as the target and every velocity zero.
+        """Use the device's ``hold()``, else target the present position.
 
         Args:
             urgent: do not give the bus up to a stop that waits, for this is the stop.
@@ -242,7 +242,7 @@ class DeviceBody:
         return {key: present[key] for key in self.bounds if key in present and not _is_velocity(key)}
 
     def _release(self) -> None:
-        """Torque off, motor by motor where they have names, so that a silent one keeps none of the others on."""
+        """Switch torque off motor by motor, so that a silent one delays no other."""
         bus = self.device.bus
         silent = {}
         for motor in getattr(bus, "motors", None) or (None,):

@@ -1,4 +1,4 @@
-"""The calibration of an arm of bus servos: read from a file, written into the servos, or made by hand.
+"""Calibration of bus servos: read from a file, written, or made by hand.
 
 A servo counts 4096 steps a turn. Its homing offset puts the middle of the joint's motion at 2047, and its range is
 where the joint ends. LeRobot keeps both in a file by the arm's id, the servos keep them in their own memory, and
@@ -57,7 +57,7 @@ def calibrate_from(device: Any, given: object, *, name: str, role: str) -> None:
 
 
 def checked_calibration(content: object, motors: Mapping[str, int]) -> dict[str, dict[str, int]]:
-    """Return ``content`` as LeRobot writes it, checked against the ``motors`` (servo id by name) it is for.
+    """Return ``content`` checked against ``motors`` (servo id by name).
 
     Raises:
         ValidationError: another arm's motors, or a number outside its domain.
@@ -84,7 +84,7 @@ def checked_calibration(content: object, motors: Mapping[str, int]) -> dict[str,
 
 
 def write_to_servos(device: Any) -> None:
-    """Make the servos hold the calibration of their device, torque off while it is written.
+    """Write the device's calibration into the servos, torque off meanwhile.
 
     Their positions are counted from the homing offset, so it must not change while a servo holds a goal. Nothing for
     a device without a calibration. The device is not connected before and not after.
@@ -167,7 +167,7 @@ class Calibrator:
         self._reaches = {}
 
     def look(self) -> dict[str, JointReach]:
-        """Read the joints once; return the reach of each since :meth:`centre`. Raises what the bus raises."""
+        """Read the joints once; return the reach of each since :meth:`centre`."""
         for motor, position in self._positions().items():
             at = int(position)
             known = self._reaches.get(motor, JointReach(at, at, at))
@@ -180,7 +180,7 @@ class Calibrator:
             report(self.look())
 
     def finish(self) -> Path:
-        """Write the calibration into the servos and into LeRobot's file of the device's id, and disconnect.
+        """Write the calibration into servos and LeRobot's file, and disconnect.
 
         Returns:
             The file.
@@ -204,7 +204,7 @@ class Calibrator:
             self._bus.disconnect(disable_torque=False)
 
     def _positions(self) -> dict[str, Any]:
-        """Read the positions again after a lost answer, which must not throw away a calibration by hand."""
+        """Read the positions, again after a lost answer."""
         motors = [motor for motor in self._bus.motors if motor not in FULL_TURN]
         for left in reversed(range(LOOK_TRIES)):
             forget_input(self._device)

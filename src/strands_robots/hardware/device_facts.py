@@ -19,7 +19,7 @@ _PORTS_SHOWN = 8
 
 
 def serial_ports(dev: Path = Path("/dev")) -> list[str]:
-    """Return the USB serial ports of this machine, by their own names where they have any."""
+    """Return the USB serial ports of this machine, by id where there is one."""
     for pattern in _PATTERNS:
         found = sorted(str(path) for path in dev.glob(pattern))
         if found:
@@ -63,7 +63,7 @@ _HOSTS = ("remote_ip", "robot_ip", "ip_address", "host", "ip")
 
 
 def stable_id(device: Any, by_id: Path = BY_ID) -> str | None:
-    """Return the serial adapter's own id, else the device's host, else its calibration id; None where it has none.
+    """Return the serial adapter's id, the host or the calibration id, or None.
 
     A calibration id goes with its port: two arms of one type may share it. A port without an id of its own keeps its
     name until it is plugged in elsewhere.
@@ -111,7 +111,7 @@ TEMPERATURE = "Present_Temperature"
 
 
 def joint_units(device: Any) -> dict[str, str]:
-    """Return the unit by action key: that of the device's own ``joint_units``, else that of its motor."""
+    """Return the unit by action key: the device's ``joint_units``, else its motor's."""
     own = getattr(device, "joint_units", None)
     stated: Mapping[str, Any] = own if isinstance(own, Mapping) else {}
     motors = _motors(device)
@@ -126,7 +126,7 @@ def joint_units(device: Any) -> dict[str, str]:
 
 
 def has_temperatures(device: Any) -> bool:
-    """Return True when every motor of the device's one bus has the temperature register."""
+    """Return True when every motor of the one bus has the temperature register."""
     bus = _bus(device)
     tables = getattr(bus, "model_ctrl_table", None)
     motors = _motors(device)
@@ -136,7 +136,7 @@ def has_temperatures(device: Any) -> bool:
 
 
 def temperatures(device: Any) -> dict[str, float]:
-    """Read degrees Celsius by motor, in one exchange; the caller holds the bus. Raises what the device raises."""
+    """Read degrees Celsius by motor, in one exchange; the caller has the bus."""
     # A late answer to an earlier read would be taken for this one's.
     forget_input(device)
     read = _bus(device).sync_read(TEMPERATURE, normalize=False)

@@ -1,4 +1,4 @@
-"""A leader arm on a motor bus of its own; like a follower it is read again after one lost answer."""
+"""Leader arm on a bus of its own, read again after a lost answer."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class LeaderArm:
             drop(self.device)
 
     def get_action(self) -> Action:
-        """Read the joints by action key. Raises what the device raises when it does not answer three times."""
+        """Read the joints by action key; raise after three lost answers."""
         with self._lock:
             for left in reversed(range(READ_TRIES)):
                 # A late answer would be taken for this one's, and every read after it would be old.

@@ -1,4 +1,4 @@
-"""A real robot behind the contract: tasks, teleoperation and single actions, and one verb that halts them all."""
+"""Real robot behind the contract: tasks, teleoperation, actions, and halt."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ IDLE_WAIT_S = 1.0
 
 
 class HardwareRobot(TeleopMixin):
-    """Any device with LeRobot's robot interface, driven by tasks, leaders and single actions.
+    """Device with LeRobot's robot interface, driven by tasks, leaders or actions.
 
     Args:
         device: has ``observation_features``, ``action_features``, ``get_observation``, ``send_action``, ``connect``,
@@ -95,7 +95,7 @@ class HardwareRobot(TeleopMixin):
 
     @property
     def safety_key(self) -> str:
-        """Under what its lockout is kept: the hardware's own id, whatever it is called; empty where it has none."""
+        """Return the hardware's own id, the key of its lockout; empty for none."""
         given = getattr(self.device, "safety_key", "")
         if given:
             return str(given)
@@ -103,7 +103,7 @@ class HardwareRobot(TeleopMixin):
         return "" if own is None else hardware_key(kind(self.device), own)
 
     def connect(self) -> None:
-        """Connect the device, without asking for calibration, and again after its port was gone.
+        """Connect the device without calibration, again after its port was gone.
 
         Raises what the device raises.
         """
@@ -116,7 +116,7 @@ class HardwareRobot(TeleopMixin):
                 raise ConnectionError(f"{self.tool_name_str} is locked: {verdict.envelope()['reason']}")
 
     def get_features(self) -> Envelope:
-        """``observation_features`` and ``action_features`` as data (``float``, or an image's shape), with ranges."""
+        """Return observation and action features as data, with ranges."""
         return success(
             f"{len(self._body.bounds)} action keys.",
             observation_features={key: _kind(feature) for key, feature in self.device.observation_features.items()},
@@ -157,7 +157,7 @@ class HardwareRobot(TeleopMixin):
         return joint_units(self.device)
 
     def get_health(self) -> Envelope:
-        """``temps``, degrees Celsius by motor, where the motors tell; the read waits for the bus a control period."""
+        """Return ``temps``, Celsius by motor; wait a control period for the bus."""
         if not self._body.is_connected or self._body.lost or not has_temperatures(self.device):
             return success("Nothing is known of its motors' health.")
         if not self._body.lock.acquire(timeout=1 / self.control_hz):
@@ -173,11 +173,11 @@ class HardwareRobot(TeleopMixin):
         return success(f"The warmest motor has {max(temps.values(), default=0.0):g} degrees Celsius.", temps=temps)
 
     def get_observation(self) -> dict[str, Any]:
-        """Everything the device sees, images included, in its turn on the bus. Raises what the device raises."""
+        """Read joints and images in its turn on the bus."""
         return self._body.get_observation()
 
     def camera_frames(self) -> Mapping[str, Any]:
-        """The newest picture of each of the device's cameras, RGB (height, width, 3), without the bus.
+        """Return the newest RGB picture (height, width, 3) of each camera.
 
         A picture is taken when it is asked for by its name; that raises what its camera raises.
         """
@@ -185,7 +185,7 @@ class HardwareRobot(TeleopMixin):
         return LazyFrames({str(name): partial(_picture, camera) for name, camera in (cameras or {}).items()})
 
     def send_action(self, action: Mapping[str, float]) -> Envelope:
-        """Set targets once; ``sent`` is what the device really took. Refused while a task or a leader drives it."""
+        """Set targets once; ``sent`` has the values taken. Refused while it is driven."""
         try:
             permit = self.gate.permit("send_action")
             with self.starting:
@@ -273,7 +273,7 @@ class HardwareRobot(TeleopMixin):
         policy_port: int = 0,
         **policy: Any,
     ) -> Envelope:
-        """The same, but wait for the end; an error when the policy failed or did not end in its time."""
+        """Run a task to its end; an error when the policy failed or ran too long."""
         with self.gate.asked_at(self.gate.asked()), self.starting:
             started = self.start_task(instruction, policy_provider, duration, policy_port, **policy)
             task = self._task
@@ -287,7 +287,7 @@ class HardwareRobot(TeleopMixin):
         return success(f"The task {task.state} after {task.step_count} steps.", **self._task_fields())
 
     def stop_task(self) -> Envelope:
-        """Stop the task and freeze the robot; ``stopped`` is false when the loop outlived the halt deadline."""
+        """Stop the task and freeze the robot, within the halt deadline."""
         self._waiting.void()
         task = self._task
         if task is None or not task.running:
@@ -311,7 +311,7 @@ class HardwareRobot(TeleopMixin):
         return f"the task {task.instruction!r}" if task is not None and task.running else ""
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop tasks, leaders and single actions, and freeze the robot; answers within ``STRANDS_HALT_DEADLINE_S``.
+        """Stop every motion and freeze, within ``STRANDS_HALT_DEADLINE_S``.
 
         Every permit is void first. A verdict of stopped means: no write is in flight, none will follow until a motion
         is started anew, and the robot was frozen. A bus that does not answer is ``not_stopped``, and the robot is
@@ -320,11 +320,11 @@ class HardwareRobot(TeleopMixin):
         return stop_executor().halt(self, self.tool_name_str, reason)
 
     def halt_ordered(self) -> None:
-        """Note what moves: a loop that finds its permit void ends by itself, and was halted all the same."""
+        """Note what moves; a loop whose permit is void counts as halted."""
         self._moved.update(dict.fromkeys(self._moving()))
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
-        """Halt on the calling thread, the stop executor's; returns by ``deadline`` unless the bus blocks."""
+        """Halt on the stop executor's thread; return by ``deadline`` if the bus does."""
         ordered = self.gate.generation
         moved = self._halting = dict.fromkeys([*self._moved, *self._moving()])
         self._moved = {}
@@ -347,13 +347,13 @@ class HardwareRobot(TeleopMixin):
         return verdict
 
     def unanswered(self, why: str) -> StopVerdict:
-        """Return what is known while the bus does not answer: what moved may move on; a robot at rest is unknown."""
+        """Return the verdict while the bus does not answer."""
         if self._frozen_at == self.gate.generation:
             return halt_each(self._ends(time.monotonic()))
         return _unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
 
     def cleanup(self) -> Envelope:
-        """Halt and disconnect. A robot that did not stop stays connected, so that it can still be stopped."""
+        """Halt and disconnect; a robot that did not stop stays connected."""
         verdict = self.halt("cleanup")
         if not verdict.stopped:
             return verdict.envelope()
@@ -371,7 +371,7 @@ class HardwareRobot(TeleopMixin):
         return success("Halted and disconnected.", stopped=True)
 
     def _stand_by(self) -> None:
-        """Have a thread ready for this robot's stops from before its first motion; cheap when there is one."""
+        """Have a thread ready for this robot's stops before its first motion."""
         with self._readying:
             if not self._ready:
                 stop_executor().attach(self, self.tool_name_str)
@@ -391,7 +391,7 @@ class HardwareRobot(TeleopMixin):
         return ends | self.teleop_stops(deadline)
 
     def _reconnect(self) -> None:
-        """Whoever asks for a motion after the cable was out gets the robot back, if the port is."""
+        """Connect again before a motion, if the port is back."""
         if not self._body.lost:
             return
         try:
@@ -482,12 +482,12 @@ def _stopped() -> Envelope:
 
 
 def _unfrozen(problem: str, moving: Mapping[str, None]) -> StopVerdict:
-    """Return the verdict on a robot that may not be frozen: what moved may move on; at rest it is unknown."""
+    """Return the verdict on a robot that is perhaps not frozen."""
     return StopVerdict(not_stopped=dict.fromkeys(moving, problem), unknown={} if moving else {"bus": problem})
 
 
 def _picture(camera: Any) -> Any:
-    """LeRobot's cameras keep the newest picture of a thread of their own; older ones only hand out new ones."""
+    """Return the newest picture; older LeRobot cameras only give new ones."""
     newest = getattr(camera, "read_latest", None)
     return newest() if callable(newest) else camera.async_read()
 

@@ -1,4 +1,4 @@
-"""The native mesh: robots that find, drive and stop one another over Zenoh, without Device Connect.
+"""Native mesh: robots that find, drive and stop one another over Zenoh.
 
 Every name is loaded when it is first used, so the package imports with no extra installed.
 """

@@ -1,4 +1,4 @@
-"""The robots of a world of several, each as a peer of its own beside the world: ``<parent>__<robot>``.
+"""Robots of a world as peers of their own: ``<parent>__<robot>``.
 
 A child is announced from its parent's session, answers commands for its one robot, and stops with it when the fleet is
 told to stop. Locking and resuming are its parent's. What concerns the whole world, its parent is asked for.
@@ -115,12 +115,12 @@ class _Child:
     gone: bool = False
 
     def presentable(self) -> bool:
-        """Whether it may be announced: it has a description, or one that hangs had its time."""
+        """True when it may be announced: described, or waited for long enough."""
         return self.presence.described.is_set() or self.context.monotonic() - self.since >= DESCRIBE_S
 
 
 class Children:
-    """The children of one peer, as its world has them now; none while it holds fewer than two robots.
+    """Children of one peer; none while its world has fewer than two robots.
 
     Args:
         context: the parent's.

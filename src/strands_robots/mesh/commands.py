@@ -1,4 +1,4 @@
-"""Commands of other peers: their wire form, the mesh's question to their sender, and the replies."""
+"""Commands of other peers: wire form, checks of the sender, replies."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TargetOf = Callable[[str], Haltable | None]
 
 
 class SenderCheck:
-    """May this sender? The mesh's part of the pipeline: freshness, replays, and attribution for real hardware.
+    """Check a sender: freshness, replays, and attribution for real hardware.
 
     Args:
         hardware: False for a simulation, which asks for no attribution.
@@ -81,7 +81,7 @@ class SenderCheck:
 
 
 def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
-    """Return what a stop halts: the robot, or the named robot of a world; None for a peer without a robot.
+    """Return the robot, or the named robot of a world, that a stop halts, or None.
 
     Raises:
         ValidationError: the world has no robot of this name.
@@ -95,7 +95,7 @@ def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
 
 
 def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lambda: False) -> Own:
-    """Make the ``execute`` of a peer: it runs a policy to its end, or until the peer leaves the mesh."""
+    """Make the ``execute`` of a peer: a policy runs to its end."""
     return lambda arguments: run_to_end(robot, arguments, lambda: closed() or not context.running())
 
 

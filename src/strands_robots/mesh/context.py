@@ -1,4 +1,4 @@
-"""What the parts of one peer share: its name, its transport, and the things that tests replace."""
+"""Shared state of a peer's parts: name, transport, replaceable functions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Context:
         return self.transport is not None and self.transport.is_alive()
 
     def put(self, key: str, payload: Mapping[str, Any]) -> None:
-        """Publish. Raises TransportError when off the mesh, WireError for a message above its topic's size."""
+        """Publish; raise TransportError off the mesh, WireError above the size."""
         transport = self.transport
         if transport is None:
             raise TransportError("the mesh is not running.")

@@ -1,4 +1,4 @@
-"""A robot as a peer of the mesh: its presence, commands, streams and safety, composed from their modules."""
+"""Robot as a peer of the mesh: presence, commands, streams and safety."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Parts:
 
 
 class Mesh(SensorLoopsMixin):
-    """A peer on the mesh, embedded in one robot or simulation; made by :func:`init_mesh`, ended by :meth:`stop`.
+    """Peer on the mesh; made by :func:`init_mesh`, ended by :meth:`stop`.
 
     Args:
         robot: a robot or a simulated world, or None for a peer that only watches and commands.
@@ -176,7 +176,7 @@ class Mesh(SensorLoopsMixin):
         return self._context.running()
 
     def start(self) -> None:
-        """Join the mesh: take the session and start publishing. Twice is once; off the mesh it is logged why."""
+        """Join the mesh and start publishing; a second call does nothing."""
         with self._lifecycle_lock:
             if self._context.transport is not None:
                 return
@@ -211,7 +211,7 @@ class Mesh(SensorLoopsMixin):
         self._compose()
 
     def _begin(self, transport: Transport) -> None:
-        """Receive before being seen: the safety topics first, then commands, presence, the publishers."""
+        """Open safety topics first, then commands, presence, the publishers."""
         context, peer = self._context, self.peer_id
         context.transport = transport
         context.identity = (self._parts.identity or identity_of)(transport)
@@ -301,7 +301,7 @@ class Mesh(SensorLoopsMixin):
         return {row["peer_id"]: row for row in self.peers}
 
     def get_peer(self, peer_id: str, max_age_s: float | None = None) -> dict[str, Any] | None:
-        """One other peer, or None when it is unknown, this peer itself, or silent for longer than ``max_age_s``.
+        """Return another peer, or None when unknown or silent above ``max_age_s``.
 
         Raises:
             ValidationError: ``max_age_s`` is not positive and finite.
@@ -310,11 +310,11 @@ class Mesh(SensorLoopsMixin):
         return None if peer_id == self.peer_id else self._context.registry.get(peer_id, bound)
 
     def peer_cert(self, peer_id: str) -> tuple[str, str] | None:
-        """(SHA-256, common name) of the certificate that a peer last announced itself with, or None."""
+        """Return SHA-256 and common name of a peer's last certificate, or None."""
         return self._context.registry.certificate_of(peer_id)
 
     def peer_wire_zid(self, peer_id: str) -> str | None:
-        """The session that a peer last announced itself from, or None. A hint: its publisher chose it."""
+        """Return the session that a peer claimed last, or None."""
         return self._context.registry.session_of(peer_id)
 
     @property
@@ -325,11 +325,11 @@ class Mesh(SensorLoopsMixin):
     # Asking.
 
     def send(self, target: str, cmd: dict[str, Any], timeout: float = 30.0) -> dict[str, Any]:
-        """Send a command to one peer. Its raw reply; or status ``timeout``; or status ``error`` with the reason."""
+        """Send a command; return the raw reply, status ``timeout`` or ``error``."""
         return self._requester.send(target, cmd, timeout)
 
     def ping(self, target: str, timeout: float = 2.0) -> dict[str, Any]:
-        """Is a peer reachable, and how fast: ``status``, ``latency_ms``, ``via``, and ``confirmed`` where it is ok."""
+        """Return a peer's ``status``, ``latency_ms``, ``via``, and ``confirmed``."""
         return self._requester.ping(target, timeout)
 
     def broadcast(self, cmd: dict[str, Any], timeout: float = 5.0) -> list[dict[str, Any]]:
@@ -337,7 +337,7 @@ class Mesh(SensorLoopsMixin):
         return self._requester.broadcast(cmd, timeout)
 
     def tell(self, target: str, instruction: str, **kw: Any) -> dict[str, Any]:
-        """Ask a peer to run a policy and wait: an ``execute`` with ``policy_provider=`` and what it needs."""
+        """Ask a peer to ``execute`` with a ``policy_provider`` and wait."""
         duration = kw.get("duration")
         patience = 30.0 + (duration if isinstance(duration, int | float) and 0 < duration <= 3600 else 30.0)
         timeout = kw.pop("timeout", patience)
@@ -362,7 +362,7 @@ class Mesh(SensorLoopsMixin):
         *,
         on_sample: SampleCallback | None = None,
     ) -> str | None:
-        """Hear a key expression; the subscription's name, or None with the reason at WARNING.
+        """Subscribe to a key expression; return the name, or None with a warning.
 
         Args:
             callback: called with key and object; without one they are kept in ``inbox[name]``.
@@ -382,7 +382,7 @@ class Mesh(SensorLoopsMixin):
         return chosen if done else None
 
     def listen(self, topic: str, heard: Callable[[Sample], None], name: str) -> bool:
-        """Hear raw samples on the transport's thread; for parts of the mesh that return at once."""
+        """Subscribe to raw samples on the transport's thread, for quick handlers."""
         transport = self._context.transport
         return transport is not None and self._subscriptions.add(transport, topic, name, direct=heard)
 
@@ -403,7 +403,7 @@ class Mesh(SensorLoopsMixin):
         instruction: str = "",
         policy: str = "",
     ) -> None:
-        """Publish one policy step; more than ``STRANDS_MESH_STREAM_HZ`` a second are thinned out.
+        """Publish a policy step, at most ``STRANDS_MESH_STREAM_HZ`` a second.
 
         The rollouts of this peer's own robot are published without it, at the same rate.
         """
@@ -414,7 +414,7 @@ class Mesh(SensorLoopsMixin):
         return self.subscribe(topics.stream(peer_id), callback)
 
     def announce_input(self, device: str, method: str | None, hz: float) -> None:
-        """Name an input stream of this peer in its presence; without ``method`` it is no longer named."""
+        """Name an input stream in the presence, or remove it without ``method``."""
         if method is None:
             self._inputs.pop(device, None)
         else:
@@ -437,11 +437,11 @@ class Mesh(SensorLoopsMixin):
 
     @property
     def lockout_epoch(self) -> str | None:
-        """The id of the e-stop that holds this peer's lockout, the oldest of several; None while clear."""
+        """Return the oldest epoch that locks this peer, or None."""
         return next(iter(self._adapter.epochs()), None)
 
     def emergency_stop(self) -> list[dict[str, Any]]:
-        """Stop and lock this robot and every peer; the answer of the robot here, if any, then each peer's.
+        """Stop and lock this robot and every peer; return the answers.
 
         A peer that did not stop or did not answer is named at CRITICAL.
 
@@ -467,7 +467,7 @@ class Mesh(SensorLoopsMixin):
 
 
 def _safety_key(robot: Any, peer: str, *, keep: bool) -> str | None:
-    """Under what the robot's lockout outlives the process: its hardware's own key, else the id it was given."""
+    """Return the key of the robot's lockout: its hardware's, else its given id."""
     own = getattr(robot, "safety_key", None)
     if isinstance(own, str) and own:
         return own
@@ -487,7 +487,7 @@ def identity_of(transport: Transport) -> Identity:
 
 
 def init_mesh(robot: Any, peer_id: str | None = None, peer_type: str = "robot", mesh: bool = True) -> Mesh | None:
-    """Make a mesh peer for ``robot`` and start it; None when ``mesh`` is False or ``STRANDS_MESH`` forces it off.
+    """Make and start a mesh peer for ``robot``; None when the mesh is off.
 
     Args:
         peer_id: default ``<tool_name_str or "robot">-<8 hex>``.

@@ -1,4 +1,4 @@
-"""A few threads and a bounded queue, for work that must hold up neither the transport nor a command."""
+"""Few threads and a bounded queue for work off the transport's thread."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Work = Callable[[], None]
 
 
 class BoundedExecutor:
-    """At most ``workers`` threads and ``depth`` waiting jobs. Threads start with the first job and end with stop.
+    """At most ``workers`` threads, started with the first job, and ``depth`` jobs.
 
     Args:
         drop_oldest: a full executor forgets its oldest job instead of refusing the new one.
@@ -53,7 +53,7 @@ class BoundedExecutor:
             return self._open
 
     def close(self) -> None:
-        """Take no more jobs, forget those waiting, and let the threads end; twice is once."""
+        """Take no more jobs, drop waiting ones, and let the threads end."""
         with self._lock:
             if not self._open:
                 return
@@ -65,7 +65,7 @@ class BoundedExecutor:
             self._queue.put(None)
 
     def stop(self, timeout: float) -> list[str]:
-        """Take no more jobs, forget those waiting, and wait for those that run; names of threads still running."""
+        """Close and wait; return the names of threads still running."""
         self.close()
         return self.join(timeout)
 

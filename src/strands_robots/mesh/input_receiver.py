@@ -1,4 +1,4 @@
-"""The follower's half of an input stream: every guard a frame passes before it moves the robot."""
+"""Follower's side of an input stream: the guards before a frame moves it."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class InputReceiver:
 
     @property
     def stats(self) -> dict[str, Any]:
-        """Counters; ``rejected`` is the sum of the ``rejected_*``, each a guard that refused a frame."""
+        """Return the counters; ``rejected`` is the sum of the ``rejected_*``."""
         running = self.running
         counts, elapsed = self._counts, (self._ended or time.monotonic()) - self._opened
         rejections = {f"rejected_{why}": counts[why] for why in REJECTIONS}
@@ -125,7 +125,7 @@ class InputReceiver:
         }
 
     def start(self) -> None:
-        """Open the stream, bound to the leader's announced session; :attr:`start_refusal` says why it did not."""
+        """Open the stream for the leader's session, or set :attr:`start_refusal`."""
         if self.running:
             return
         self.close()
@@ -139,7 +139,7 @@ class InputReceiver:
         self._mesh.record("input_stream_opened", self._source, **fields, lifetime_s=ttl)
 
     def stop(self) -> dict[str, Any]:
-        """Close the stream, wait at most 2 s for a frame that is being applied, and return the counters."""
+        """Close the stream, wait up to 2 s for its last frame, return the counters."""
         self.close()
         self.join(2.0)
         return self.stats
@@ -158,7 +158,7 @@ class InputReceiver:
                 self._executor.close()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the frame that a closed stream still applies; False, with a warning, when that is not done."""
+        """Wait for the last frame of a closed stream; False, with a warning, if late."""
         if self._executor is None or not self._executor.join(timeout):
             return True
         logger.warning("%s: an action is still being applied.", self.topic)
@@ -224,7 +224,7 @@ class InputReceiver:
             self._do(action)
 
     def _checked(self, frame: Mapping[str, Any], heard: float) -> dict[str, float] | None:
-        """The action of a frame that passed every guard, in the wire's order; else None, counted."""
+        """Return the action of a frame that passed every guard; else count it."""
         stamp = wire.finite(frame.get("t"))
         if stamp is None or not wire.fresh(stamp, self._mesh.now()):
             self._counts["freshness"] += 1
@@ -315,7 +315,7 @@ class InputReceiver:
 
 
 def joint_limits(robot: Any) -> dict[str, float]:
-    """Largest magnitude by joint: twice its full scale, where the follower states its units."""
+    """Return the largest magnitude by joint: twice its full scale, if known."""
     units = getattr(robot, "joint_units", None)
     if not isinstance(units, Mapping):
         return {}
@@ -324,7 +324,7 @@ def joint_limits(robot: Any) -> dict[str, float]:
 
 
 def present_joints(robot: Any) -> dict[str, float]:
-    """Where the joints of a follower are, by name, of a world those of its first robot; empty where it cannot tell.
+    """Return a follower's joints by name, of a world its first robot's.
 
     Raises:
         ConnectionError: it can tell, but not now, as while its bus is busy.

@@ -1,4 +1,4 @@
-"""What a peer may ask for: the bounds of commands and input frames, checked once at the door.
+"""Bounds of commands and input frames, checked once at the edge.
 
 Identifiers and :class:`ValidationError` are :mod:`strands_robots.utils`'s; this module is their documented door on
 the mesh, and holds the table of a command's fields. A machine reads ``ValidationError.code``.

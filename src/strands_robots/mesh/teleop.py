@@ -1,4 +1,4 @@
-"""Input streams of one peer that were opened by command: ``teleop_receive``, ``teleop_status``, ``teleop_stop``."""
+"""Input streams that commands open: ``teleop_receive``, ``_status``, ``_stop``."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class TeleopReceivers:
         return success(f"{sum(stream['running'] for stream in streams)} input streams run.", streams=streams)
 
     def stop(self, command: Arguments) -> Envelope:
-        """Close the named stream, or all of them, and wait at most 2 s for the frames that are being applied."""
+        """Close the named stream or all, and wait up to 2 s for last frames."""
         source, device = command.get("source_peer_id"), command.get("device_name")
         with self._lock:
             ended = self._end(lambda key, _: source in (None, key[0]) and device in (None, key[1]))
@@ -69,7 +69,7 @@ class TeleopReceivers:
             receiver.void()
 
     def reap(self) -> None:
-        """Close the streams that a stop has voided; their last frames are waited for on a thread of the pool."""
+        """Close the streams that a stop has voided, without waiting."""
         with self._lock:
             ended = self._end(lambda key, each: not each.running)
         if ended:
@@ -83,7 +83,7 @@ class TeleopReceivers:
 
 
 def join(closed: Iterable[InputReceiver], timeout: float) -> list[str]:
-    """Wait for the frames that closed streams still apply, ``timeout`` seconds in all; whose are not done by then."""
+    """Wait for the last frames of closed streams; return the unfinished ones."""
     deadline = time.monotonic() + timeout
     return [each.topic for each in closed if not each.join(max(0.0, deadline - time.monotonic()))]
 

@@ -119,7 +119,7 @@ class RateLimiter:
 
 
 class RecentKeys:
-    """Keys that were used lately, bounded by age in seconds and by number; thread-safe."""
+    """Recently used keys, bounded by age in seconds and by number; thread-safe."""
 
     def __init__(self, seconds: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._seconds = seconds

@@ -55,7 +55,7 @@ class DdsCredentials:
         return uri.removeprefix(_DATA).encode() if uri.startswith(_DATA) else Path(uri.removeprefix(_FILE)).read_bytes()
 
     def policies(self, qos: Any) -> list[Any]:
-        """Return property policies of a participant, made with the given ``cyclonedds.qos``.
+        """Return property policies of a participant for the given ``cyclonedds.qos``.
 
         Raises:
             ValidationError: the loaded Cyclone DDS has no DDS Security.

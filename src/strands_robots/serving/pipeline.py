@@ -1,4 +1,4 @@
-"""The way of a command from a network to a robot's method, the same for every network.
+"""Pipeline of a command from any network to a robot's method.
 
 In order: arguments, caller, lockout, the operator's approval, the robot's method. The first that refuses raises
 :class:`Refused`, which says which it was. Whatever is raised on the way becomes an
@@ -75,7 +75,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Result:
-    """A command's end: the robot's own answer, or the refusal that kept the command from it."""
+    """Result of a command: the robot's answer, or a refusal."""
 
     result: Any
     refusal: Refused | None = None
@@ -99,7 +99,7 @@ Own = Callable[[Arguments], object]
 
 
 class PendingCommands:
-    """Commands that have arrived and not been carried out, each as old as its arrival.
+    """Commands that have arrived and not been carried out.
 
     A halt since then refuses what one of them begins; so does the stop of the one robot of a world that it names.
 
@@ -132,7 +132,7 @@ class PendingCommands:
         return nullcontext() if self._gate is None or asked is None else self._gate.asked_at(asked)
 
     def void(self, robot: str = "") -> None:
-        """Void what arrived for this robot of the world, or for any, because the robot is being stopped."""
+        """Void pending commands of this robot of the world, because it is stopped."""
         name = robot or self._robot
         with self._lock:
             for asked, named in self._pending.items() if name else ():
@@ -168,14 +168,14 @@ class Pipeline:
 
     @classmethod
     def of(cls, robot: Robot | None, peer_id: Callable[[], str], **parts: Any) -> Pipeline:
-        """Make the pipeline of a robot, with the robot's own shares and pending commands where none are given."""
+        """Make the pipeline of a robot, with shares and pending commands of its own."""
         gate = None if robot is None else robot.gate
         parts.setdefault("pending", PendingCommands(gate))
         parts.setdefault("shares", Shares() if robot is None else shares_of(robot))
         return cls(robot, peer_id, **parts)
 
     def share(self, verb: Verb) -> Share:
-        """Return the threads for a verb. A motion may keep its thread while it lasts; nothing else waits for that."""
+        """Return the share of threads for a verb; only motions wait for motions."""
         if verb.kind is Kind.RESUME:
             return self.shares.resume
         return self.shares.motion if verb.kind is Kind.MOTION else self.shares.read
@@ -226,7 +226,7 @@ class Pipeline:
         return self._closed
 
     def close(self, timeout: float = 0.0) -> list[str]:
-        """Refuse what still waits, and wait for the verbs that run; return the names of those still running."""
+        """Refuse waiting commands and wait; return the verbs still running."""
         self._closed = True
         with self._changed:
             self._changed.wait_for(lambda: not self._serving, timeout)
@@ -243,7 +243,7 @@ class Pipeline:
             raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None
 
     def _claim(self, verb: Verb) -> Claim:
-        """Leave to move: not locked, and approved by the operator where the robot is hardware."""
+        """Check the lockout and, for hardware, claim the operator's approval."""
         if self.robot is not None:
             locked = self.robot.gate.lockout(verb.name)
             if locked is not None:

@@ -1,4 +1,4 @@
-"""Bounds of what a network peer may ask of a policy: its provider, its server's host, its checkpoint, its targets."""
+"""Bounds of policy options from a network: provider, host, checkpoint, targets."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _REPO = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,95})/([A-Za-z0-9][A-Za-z0-9._-
 
 @lru_cache(maxsize=1)
 def registered_providers() -> tuple[str, ...]:
-    """Return this machine's policy providers; read once, because a message must not cost a look at the disk."""
+    """Return this machine's policy providers, read from the disk once."""
     return policy_names()
 
 
 def policy_host_refusal(host: str) -> str | None:
-    """Return why a policy server's host is not allowed, or None. A name is compared as a name, never resolved."""
+    """Return why a server's host is not allowed, or None; names are not resolved."""
     name = host.strip("[]").lower()
     allow = settings.items("STRANDS_MESH_POLICY_HOST_ALLOW")
     if name in LOOPBACK_NAMES or name in {entry.lower() for entry in allow}:
@@ -53,7 +53,7 @@ def policy_host_refusal(host: str) -> str | None:
 
 
 def known_provider(name: str, value: object) -> str:
-    """Check a provider that this machine, another build or the operator's list knows, and that is not shut out."""
+    """Check that a provider is known here or listed, and allowed."""
     provider = identifier(name, value)
     allow = settings.items("STRANDS_MESH_POLICY_TYPE_ALLOW")
     if provider not in PROVIDERS and provider not in FOREIGN_PROVIDERS and provider not in allow:
@@ -89,7 +89,7 @@ def repository(name: str, value: object) -> str:
 
 
 def vector(longest: int, *, exactly: bool = False) -> Check:
-    """Make a check of at most (or exactly) so many numbers within 1e6, as a list or, where not exact, by name."""
+    """Make a check of at most (or exactly) so many numbers within 1e6."""
     domain = f"{'' if exactly else 'at most '}{longest} numbers within 1e6"
 
     def check(name: str, value: object) -> list[float] | dict[str, float]:

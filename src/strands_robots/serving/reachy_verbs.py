@@ -1,4 +1,4 @@
-"""The verbs of a Reachy Mini. Degrees and millimetres here, radians and metres in its driver."""
+"""Verbs of a Reachy Mini, in degrees and mm; its driver has radians and m."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verbs of arms, vehicles and simulated worlds, and the robot methods that carry them out.
+"""Verbs of arms, vehicles and worlds, and the methods that carry them out.
 
 Device Connect serves :data:`ARM_VERBS` and :data:`WORLD_VERBS`, the mesh :data:`PEER_VERBS`.
 """
@@ -71,7 +71,7 @@ def served_world(robot: Any) -> WorldRobot:
 
 
 def robot_of(world: WorldRobot, name: str | None, *, first: bool = False) -> str:
-    """Return the robot of a world that a caller means: the named one, the only one, or with ``first`` the first.
+    """Return the named robot of a world, its only one, or its ``first``.
 
     Raises:
         ValidationError: no robot of this name, or several and none is named.
@@ -90,12 +90,12 @@ def robot_of(world: WorldRobot, name: str | None, *, first: bool = False) -> str
 
 @dataclass(frozen=True)
 class WorldStop:
-    """The stop of everything in a world: a halt of all, then the word of each rollout that ran."""
+    """Stop everything in a world: halt all, then read each rollout's end."""
 
     world: WorldRobot
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Halt the world and grade each running rollout; an error of a rollout outweighs the halt's success."""
+        """Halt the world and grade each rollout; an error outweighs success."""
         world, running = self.world, list[str]()
         unlisted: dict[str, str] = {}
         try:
@@ -131,7 +131,7 @@ class RobotStop:
 
 
 def world_stop_answer(verdict: StopVerdict) -> Envelope:
-    """Return the verdict on a world as its device answers ``stop``: names of what stopped and of what did not."""
+    """Return the verdict on a world as the answer to ``stop``."""
     refused = {**verdict.unknown, **verdict.not_stopped}
     stopped = list(verdict.halted)
     fields = {"stopped": stopped, "not_stopped": sorted(refused), "reasons": refused}
@@ -184,7 +184,7 @@ def _status(robot: Robot, arguments: Arguments) -> Envelope:
 
 
 def start(robot: Robot, arguments: Arguments) -> Envelope:
-    """Start a policy with everything that a mesh peer may say about it; ``robot_name`` picks a robot of a world."""
+    """Start a policy with a mesh peer's options, on ``robot_name`` of a world."""
     options = {name: value for name, value in arguments.items() if name != "robot_name"}
     if options.get("policy_host") == "localhost":
         del options["policy_host"]
@@ -198,7 +198,7 @@ def start(robot: Robot, arguments: Arguments) -> Envelope:
 
 
 def run_to_end(robot: Robot, arguments: Arguments, closing: Callable[[], bool]) -> Envelope:
-    """Start a policy and wait for its end, or until ``closing`` says that the peer leaves its network."""
+    """Start a policy and wait for its end or for ``closing``."""
     name = None
     if isinstance(robot, WorldRobot):
         name = arguments.get("robot_name") or (robot.list_robots() or [""])[0]

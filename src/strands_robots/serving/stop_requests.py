@@ -1,4 +1,4 @@
-"""Stops that were asked for over a network and wait for their verdict; every one is carried out, a flood included.
+"""Requested stops that wait for their verdict; every one is carried out.
 
 The stop executor shares one halt among the stops that wait for it. Here is counted who waits for an answer, so that a
 flood costs its sender answers and no robot its stop, and answers are given on another thread than halts.
@@ -55,7 +55,7 @@ class StopRequests:
         return len(self._waiting)
 
     def add(self, target: Haltable, name: str, reason: str, request: Request) -> None:
-        """Have ``target`` halted and ``request`` answered with the verdict; returns at once."""
+        """Have ``target`` halted and ``request`` answered; return at once."""
         with self._lock:
             if request not in self._waiting:
                 self._waiting[request] = None
@@ -106,7 +106,7 @@ class StopRequests:
 
 
 def _grouped(due: deque[tuple[StopVerdict, Request]]) -> list[tuple[StopVerdict, list[Request]]]:
-    """Put requests whose verdicts name the same together; a request that stands twice is answered once."""
+    """Merge requests of the same target; a repeated one is answered once."""
     groups: dict[tuple[object, ...], tuple[StopVerdict, dict[Request, None]]] = {}
     answered: set[Request] = set()
     for verdict, request in due:

@@ -1,4 +1,4 @@
-"""Every verb described once: its name, its parameters with domain and unit, and what it returns.
+"""Every verb described once: name, parameters with domain and unit, result.
 
 Device Connect makes its RPC methods and their schemas from these descriptions, the mesh its validation, and
 ``tests/serving/test_verbs.py`` holds the agent tool to them. A new verb is one entry here and one robot method.

@@ -1,4 +1,4 @@
-"""Threads for robot verbs, with a share for each robot, so that a wedged robot fills only its own.
+"""Threads for robot verbs, with a share for each robot.
 
 One pool serves the process and grows with the calls that run at the same moment; idle threads end by themselves. Its
 threads are daemons: a robot call that never returns must not keep the process from ending. Stops never come here; they
@@ -40,7 +40,7 @@ class ShareFullError(StrandsRobotsError, RuntimeError):
 
 
 class WorkerPool:
-    """Daemon threads that appear when no idle one is left and end after ``idle_s`` without work.
+    """Daemon threads, started on demand, that end after ``idle_s`` without work.
 
     Work comes to them by a :class:`Share`.
     """
@@ -84,7 +84,7 @@ POOL = WorkerPool()
 
 
 class Share:
-    """One robot's part of the pool for one kind of call: some run, some wait, one more is refused."""
+    """One robot's part of the pool for one kind of call."""
 
     def __init__(self, running: int = RUNNING_MAX, waiting: int = WAITING_MAX, pool: WorkerPool = POOL) -> None:
         self._running_max, self._waiting_max = running, waiting
@@ -99,7 +99,7 @@ class Share:
         return len(self._waiting)
 
     def submit(self, job: Job) -> None:
-        """Run ``job`` on a thread, after those that came before it when all turns are taken.
+        """Run ``job`` on a thread, in the order of arrival.
 
         Raises:
             ShareFullError: as many calls as may wait are waiting.
@@ -135,7 +135,7 @@ class Share:
         return done
 
     def _next(self) -> Job | None:
-        """Return the call whose turn it is on the calling thread, which has ended one; None gives the turn back."""
+        """Return the next call for the calling thread, or None and free its place."""
         with self._lock:
             if self._waiting:
                 return self._waiting.popleft()
@@ -148,7 +148,7 @@ UNBOUNDED = Share(sys.maxsize)
 
 
 class Shares:
-    """The shares of one robot: motions, reads, and resumes, none of which waits for another kind."""
+    """Shares of one robot: motions, reads, resumes; no kind waits for another."""
 
     def __init__(self, pool: WorkerPool = POOL) -> None:
         self.motion = Share(pool=pool)
@@ -169,7 +169,7 @@ def shares_of(robot: object) -> Shares:
 
 
 async def awaited(start: Callable[[Callable[[T], None]], None], within: float) -> T:
-    """Return what ``start`` hands to the callback that it is given, from whatever thread; the loop is not blocked.
+    """Return the value that ``start`` gives to its callback, from any thread.
 
     Raises:
         TimeoutError: nothing came within ``within`` seconds.
@@ -192,7 +192,7 @@ async def awaited(start: Callable[[Callable[[T], None]], None], within: float) -
 
 
 async def called(share: Share, call: Callable[[], T], within: float) -> T:
-    """Return what ``call`` returns on a thread of ``share``, and raise what it raises.
+    """Return the result of ``call`` on a thread of ``share``, or raise its error.
 
     Raises:
         ShareFullError: the share is full.

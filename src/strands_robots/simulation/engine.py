@@ -1,4 +1,4 @@
-"""MuJoCo, imported in one place so that the OpenGL backend is always chosen first."""
+"""MuJoCo, imported in one place after the OpenGL backend is chosen."""
 
 from __future__ import annotations
 

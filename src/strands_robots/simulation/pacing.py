@@ -1,4 +1,4 @@
-"""Real time: one thread for all worlds of a process, alive while one of them runs.
+"""Real time: one thread for all worlds of a process, while one runs.
 
 Stepping releases the GIL, and thirty worlds that each wake a thread two hundred times a second would spend more
 time passing it on than computing; one thread visits them in turn instead. A world runs while a rollout or a
@@ -38,7 +38,7 @@ _CHUNK = 16
 
 
 class WorldClock:
-    """Pacing of one world; ``slipped_s`` is simulated time that was dropped when late."""
+    """Pacing of one world; ``slipped_s`` is simulated time dropped when late."""
 
     def __init__(self, physics: Physics, *, on_command: bool = True) -> None:
         self._physics = physics
@@ -81,7 +81,7 @@ class WorldClock:
             self._until = 0.0
 
     def close(self) -> None:
-        """Stop for good; return when the pacing thread does not visit this world any more."""
+        """Stop for good; return when the pacing thread has left this world."""
         with self._lock:
             self.closed = True
         _pacer.forget(self)

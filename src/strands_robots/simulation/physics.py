@@ -53,7 +53,7 @@ class Snapshot:
         return {key: float(qpos[joint.qpos]) for key, joint in robot.joints.items()}
 
     def observation(self, robot: RobotParts) -> dict[str, float]:
-        """Return joints, and ``base_x``, ``base_y`` (m), ``base_yaw`` (rad) of a free base."""
+        """Return joints, and ``base_x``, ``base_y`` (m), ``base_yaw`` (rad) of a base."""
         if robot.base is None:
             return self.joints(robot)
         x, y, _, *quat = (float(v) for v in self.qpos[robot.base : robot.base + 7])

@@ -179,7 +179,7 @@ def _cover(mask: Pixels, points: Floats) -> None:
 
 
 def _faces(stage: Stage, data: Any) -> tuple[list[Face], bool]:
-    """Return every visible face in world coordinates, and True where there is a floor."""
+    """Return every visible face in world coordinates, and True with a floor."""
     model = stage.model
     faces: list[Face] = []
     floor = False

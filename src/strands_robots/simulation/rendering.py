@@ -59,7 +59,7 @@ class CameraView:
     distance: float = 0.0
 
     def pixels(self, points: Iterable[Iterable[float]], width: int, height: int) -> Floats:
-        """Convert points (n, 3) in metres to pixels x (right) and y (down), depth in metres."""
+        """Convert points (n, 3) in m to pixels x (right), y (down), and depth in m."""
         local = (np.array([list(p) for p in points], dtype=np.float64).reshape(-1, 3) - self.position) @ self.rotation
         depth = -local[:, 2]
         scale = height / 2 / np.tan(np.radians(self.fovy) / 2)

@@ -453,7 +453,7 @@ class Simulation(TeleopMixin):
         *,
         path: Iterable[tuple[float, float, float]] = (),
     ) -> tuple[Picture, Literal["opengl", "projection"]]:
-        """Draw the best possible picture and ``path`` (metres); also return how it was made."""
+        """Draw the best possible picture and ``path`` (m); return it and its method."""
         how: Literal["opengl", "projection"] = "opengl"
         try:
             picture = self.render(camera, width, height, quality=True)

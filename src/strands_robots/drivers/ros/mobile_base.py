@@ -206,7 +206,7 @@ class MobileBaseRobot:
         return self.halt("stop").envelope()
 
     def halt_ordered(self) -> None:
-        """Note whether it is driven: a drive that finds its permit void ends by itself, and was halted all the same."""
+        """Note whether it is driven; a drive whose permit is void counts as halted."""
         drive = self._motion
         self._driven |= self._latched or (isinstance(drive, Drive) and not drive.ended.is_set())
 

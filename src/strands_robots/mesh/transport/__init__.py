@@ -152,5 +152,5 @@ class Transport(ABC):
         return True
 
     def lost_link_at(self) -> float | None:
-        """Monotonic seconds at which the link to the hub was last lost; None without a hub."""
+        """Return the time of the last loss of the hub, monotonic s, or None."""
         return None
