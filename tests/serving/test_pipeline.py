@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from fixtures.toy_robots import ToyRobot
-from fixtures.waiting import eventually
 
 from strands_robots.envelope import error
 from strands_robots.safety.approval import Approval, Grants
@@ -109,13 +108,19 @@ def test_a_stop_of_one_robot_voids_the_commands_for_it_and_for_any(robot: ToyRob
 
 
 def test_a_closed_pipeline_refuses_and_names_what_still_runs(robot: ToyRobot) -> None:
-    let_go = threading.Event()
-    robot.before["start_task"] = let_go.wait
+    started, let_go = threading.Event(), threading.Event()
+
+    def wait_in_the_robot() -> None:
+        started.set()
+        let_go.wait()
+
+    robot.before["start_task"] = wait_in_the_robot
     line = pipeline(robot)
     results: list[Result] = []
     command = Command(ARM_VERBS["execute"], {"instruction": "wave"}, "agent", line.pending.arrive())
     line.share(command.verb).submit(lambda: line.serve(command, results.append))
-    eventually(lambda: line.close() == ["execute"])
+    assert started.wait(20.0)
+    assert line.close() == ["execute"]
     refused = served(line, instruction="wave").refusal
     assert refused is not None
     assert refused.why is RefusalReason.BUSY
