@@ -1,4 +1,4 @@
-"""The safety plane: who may stop, what is locked, what was halted, and the record of it.
+"""Safety plane: permission to stop, lockouts, halts, and their record.
 
 How a robot and its network enter it::
 

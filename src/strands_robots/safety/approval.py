@@ -31,7 +31,7 @@ _CLAIMED = ".claimed"
 
 
 def state_dir() -> Path:
-    """Directory of grants and lockouts: ``STRANDS_STATE_DIR``, else ``~/.strands_robots``."""
+    """Return the directory of grants and lockouts, ``STRANDS_STATE_DIR`` first."""
     stated = settings.raw("STRANDS_STATE_DIR")
     return Path(stated).expanduser() if stated else Path.home() / ".strands_robots"
 
@@ -43,7 +43,7 @@ def listed(verb: str, peer: str, allow: Sequence[str]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Leave to do one verb once; :meth:`give_back` where the command was refused after all, else :meth:`spend`."""
+    """Leave to do one verb once; end it by :meth:`spend` or :meth:`give_back`."""
 
     file: Path | None = None
 
@@ -135,14 +135,14 @@ class Approval:
         self._grants = grants
 
     def claim(self, verb: str, peer: str) -> Claim | None:
-        """Return leave to do ``verb`` on ``peer`` now, or None when the operator has not approved it."""
+        """Return leave to do ``verb`` on ``peer`` now, or None when not approved."""
         if listed(verb, peer, self._read("STRANDS_ROBOT_COMMAND_ALLOW")) or self._bypass():
             return Claim()
         return self._grants().claim(verb, peer)
 
     @staticmethod
     def refusal(verb: str, peer: str) -> str:
-        """Return the refusal of a verb that is not approved; it names every way to approve it."""
+        """Return the refusal of a verb, with every way to approve it."""
         return (
             f"{verb} moves real hardware and needs operator approval: the operator runs "
             f"'strands-robots grant {verb}@{peer}' for one time, or adds {verb} or {verb}@{peer} to "

@@ -1,4 +1,4 @@
-"""Authorization: callers that may move a robot or stop it, and policies that they may ask for.
+"""Authorization: callers that may move or stop a robot, and their policies.
 
 A caller's name is what the caller says it is: no transport of Device Connect vouches for it unless a broker's
 access rules do, so a name here is a label to sort by and to log, not a proof. Stops and reads never come
@@ -27,7 +27,7 @@ NAME_MAX = 255
 
 
 def caller_name(source: object) -> str | None:
-    """Return the declared name, or None for a value that is none: no string, blank, too long or unprintable."""
+    """Return the declared name, or None for a value that is no printable name."""
     if not isinstance(source, str) or not source.strip() or len(source) > NAME_MAX or not source.isprintable():
         return None
     return source
@@ -70,7 +70,7 @@ def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> s
 
 
 def estop_refusal(source: object, allow: Sequence[str]) -> str | None:
-    """Return the reason why a stop of ``source`` does not count, or None. Without a list every named source counts."""
+    """Return the reason why a stop of ``source`` does not count, or None."""
     name, listed = caller_name(source), entries(allow)
     if name is None:
         return "an emergency stop without a source is not honoured"
@@ -80,7 +80,7 @@ def estop_refusal(source: object, allow: Sequence[str]) -> str | None:
 
 
 def provider_refusal(provider: str, allow: Sequence[str]) -> str | None:
-    """Return the reason why a policy provider is refused, or None. Without a list every registered one is open."""
+    """Return the reason why a policy provider is refused, or None."""
     listed = entries(allow)
     if not listed or matches(provider, listed):
         return None
@@ -106,7 +106,7 @@ class Authorization:
         self._warned = threading.Event()
 
     def motion(self, source: object, verb: str) -> str | None:
-        """Return the reason why ``source`` may not do ``verb``, or None; a refusal and its caller are logged."""
+        """Return and log the reason why ``source`` may not do ``verb``, or None."""
         allow = self._read("DEVICE_CONNECT_RPC_ALLOW")
         refusal = motion_refusal(source, allow, hardware=self.hardware)
         if refusal is not None:

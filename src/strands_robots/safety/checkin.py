@@ -1,4 +1,4 @@
-"""The dead-man check-in: a robot that needs a live safety controller stops when the last one falls silent.
+"""Check-in: a robot stops when its last safety controller falls silent.
 
 Pure: times come in (monotonic seconds), decisions go out. Off while the timeout is 0.
 """
@@ -36,27 +36,27 @@ class CheckIn:
         self._lapsed = False
 
     def rearm(self, now: float) -> None:
-        """Start the timeout anew when the robots are free again, and forget the controllers that fell silent."""
+        """Restart the timeout when the robots are free; forget silent controllers."""
         self._last = {name: at for name, at in self._last.items() if now - at <= self.timeout_s}
         self._since = now
         self._lapsed = False
 
     def time_left(self, now: float) -> float | None:
-        """Return the seconds until the robots stop for want of a controller; None while off, 0 once lapsed."""
+        """Return the seconds until the robots stop; None while off, 0 once lapsed."""
         if not self.on:
             return None
         latest = max([self._since, *self._last.values()])
         return 0.0 if self._lapsed else max(0.0, self.timeout_s - (now - latest))
 
     def lapsed(self, now: float) -> tuple[str, ...] | None:
-        """Return, once, the controllers when the last has been silent for the timeout; else None."""
+        """Return, once, the silent controllers after the timeout; else None."""
         if not self.on or self._lapsed or (self.time_left(now) or 0.0) > 0.0:
             return None
         self._lapsed = True
         return tuple(sorted(self._last))
 
     def fields(self, now: float) -> dict[str, object]:
-        """Return the fields of ``getStatus``: timeout, seconds left, and the age of each controller's last check-in."""
+        """Return the fields of ``getStatus``: timeout, seconds left, check-in ages."""
         left = self.time_left(now)
         return {
             "required": self.on,

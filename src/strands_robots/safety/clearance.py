@@ -1,4 +1,4 @@
-"""Clearances: how ``strands-robots resume --local`` clears robots, whether their process runs or not.
+"""Clearances: ``resume --local`` clears robots, running or not.
 
 A user who may write into the state directory, which is its owner's alone, is at the machine. A file there orders the
 clearance of one robot and names the operator; each process looks while one of its robots is locked, takes the orders
@@ -41,7 +41,7 @@ def clearances() -> Path:
 
 
 def order_clearance(who: str, robot_ids: Iterable[str]) -> list[Path]:
-    """Write an order for each robot; the process of the robot takes it within a second.
+    """Write an order for each robot; its process takes it within a second.
 
     Raises:
         ValidationError: ``who`` is blank, or a name is no identifier.
@@ -55,7 +55,7 @@ def order_clearance(who: str, robot_ids: Iterable[str]) -> list[Path]:
 
 
 def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[str, str]:
-    """Clear robots of this machine for the operator ``who``, whether their process runs or not.
+    """Clear robots of this machine for the operator ``who``, running or not.
 
     Returns, for each name, the outcome: that of its running process, ``cleared`` where it did so and kept it; ``cleared
     on disk`` where none runs; ``not locked here``; or that the process took the order and has not carried it out.

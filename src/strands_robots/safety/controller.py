@@ -1,4 +1,4 @@
-"""The safety controller: an emergency stop that is repeated until each expected robot has answered.
+"""Safety controller: a stop, repeated until each expected robot has answered.
 
 :class:`SafetyController` owns a link that carries stops, check-ins and verdicts and nothing else, so that no call
 and no telemetry of its process stands before a stop.
@@ -38,7 +38,7 @@ REFUSED = "resumed before"
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One robot's verdict: ``latency_ms`` from the call of ``stop`` to our receipt, ``facts`` as it sent them."""
+    """One robot's verdict; ``latency_ms`` is from ``stop`` to its receipt here."""
 
     device_id: str
     stopped: bool | None
@@ -66,7 +66,7 @@ class StopReport:
 
     @property
     def ok(self) -> bool:
-        """True when every robot that was expected or answered is known to be still; no answer at all is not ok."""
+        """True when every robot is known to be still; no answer at all is not ok."""
         return bool(self.stopped) and not (self.not_stopped or self.refused or self.silent)
 
 
@@ -85,7 +85,7 @@ OnProgress = Callable[[Progress], None]
 
 
 class SafetyController:
-    """Sends emergency stops and check-ins under its own id and collects what robots answer.
+    """Sender of emergency stops and check-ins that collects the answers.
 
     Args:
         controller_id: the source that robots see; their allowlist must admit it.
@@ -162,7 +162,7 @@ class SafetyController:
         return self._report(run)
 
     def expect(self, estop_id: str, names: Collection[str]) -> None:
-        """Name further robots that must answer the running stop ``estop_id``, as when they are looked up after it."""
+        """Name further robots that must answer the running stop ``estop_id``."""
         with self._changed:
             run = self._stops.get(estop_id)
             if run is not None:

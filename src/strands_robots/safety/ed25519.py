@@ -1,4 +1,4 @@
-"""Ed25519 as the safety plane uses it: canonical bytes, base64url, public keys from settings, key files.
+"""Ed25519: canonical bytes, base64url, public keys from settings, key files.
 
 The only place that imports ``cryptography``, and only when a signature or a key is at hand.
 """
@@ -51,7 +51,7 @@ def decode(text: object, length: int) -> bytes | None:
 
 
 def public_keys(items: Sequence[str], setting: str) -> tuple[bytes, ...]:
-    """The raw 32-byte keys of a comma list; an item that is none is left out with one error in the log."""
+    """Return the 32-byte keys of a comma list; log an item that is none."""
     keys = []
     for item in items:
         key = decode(item, 32)
@@ -105,7 +105,7 @@ def passphrase_error(passphrase: str) -> str | None:
 
 
 def keygen(path: str | os.PathLike[str], passphrase: str) -> str:
-    """Make a key, write it encrypted (PEM PKCS#8, mode 0600, never over a file), and return its public half.
+    """Make a key, write it encrypted to a new file, and return its public half.
 
     Raises:
         ValidationError: a weak passphrase.

@@ -1,4 +1,4 @@
-"""The e-stop listener: one thread of the process that turns emergency stops from the network into halts.
+"""E-stop listener: one thread that turns emergency stops into halts.
 
 It lives from the first registered device to the last, and shares no event loop, queue, lock, executor or session with
 the data plane. A link's thread hands an event to the listener's thread; that one locks every robot and submits each to
@@ -61,10 +61,10 @@ class StopLink(Protocol):
         """True while a peer can be reached."""
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
-        """Receive these events of every device of the tenant. Returns at once; the link comes up when it can."""
+        """Subscribe to these events of the tenant; return before the link is up."""
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
-        """Send as ``source`` now; False when the link is down, and then nothing is kept for later."""
+        """Send as ``source`` now; False, without a later try, when the link is down."""
 
     def close(self) -> None:
         """Close the connection and end the link's thread. Safe to call twice."""
@@ -75,18 +75,18 @@ class RenewableLink(Protocol):
     """A link that can be made anew while it is used."""
 
     def renew(self) -> None:
-        """Open another connection in place of the present one, which carries stops until then; returns at once."""
+        """Open a connection in place of the present one; return at once."""
 
 
 def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:
-    """Encode an event as Device Connect does: a JSON-RPC 2.0 notification with ``event_id`` and ``ts``."""
+    """Encode an event as a JSON-RPC 2.0 notification with ``event_id`` and ``ts``."""
     stamp = {"event_id": event_id or uuid.uuid4().hex, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
     return json.dumps({"jsonrpc": "2.0", "method": event, "params": {**params, **stamp}}).encode()
 
 
 @dataclass(frozen=True, slots=True)
 class StopEvent:
-    """One event from a link: its name, its declared source, its bytes, and our monotonic seconds at receipt."""
+    """Event from a link: name, declared source, bytes, monotonic s at receipt."""
 
     event: str
     source: str
@@ -95,7 +95,7 @@ class StopEvent:
 
 
 class FairQueue:
-    """A bounded queue from the links' threads to the listener's: fair between sources, newest first.
+    """Bounded queue of the listener: fair between sources, newest first.
 
     A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
     are served in turn, one event each, the newest first. What overflows a bucket is its oldest event; a controller
@@ -110,7 +110,7 @@ class FairQueue:
         self._closed = False
 
     def put(self, event: str, source: str, payload: bytes, *, urgent: bool = True) -> None:
-        """Add an event. One that is not urgent is served last, and dropped when its bucket is half full."""
+        """Add an event; one that is not urgent is served last or dropped."""
         received = StopEvent(event, source, payload, time.monotonic())
         bucket = self._buckets[hash((self._salt, source)) % BUCKETS]
         # Appending to a deque and setting an event are atomic; no lock is shared with the listener's thread.
@@ -141,7 +141,7 @@ class FairQueue:
 
 
 class FailureBudget:
-    """Failed signature checks of each source, counted in windows of a second of monotonic time."""
+    """Failed signature checks of each source, counted in windows of a second."""
 
     def __init__(self, per_s: int = 20) -> None:
         self._per_s = per_s
@@ -160,7 +160,7 @@ class FailureBudget:
 
 
 class RefusalLog:
-    """Counts refused messages, and reports each source once in ten seconds, however many it sends."""
+    """Count of refused messages; each source is reported once in ten seconds."""
 
     def __init__(self) -> None:
         self._sources: dict[str, list[float]] = {}
@@ -189,7 +189,7 @@ class RefusalLog:
 
 
 class ListenerRegistration:
-    """One device's registration with the listener; the last one of a link to close closes the link."""
+    """Registration of a device with the listener; the last one closes the link."""
 
     def __init__(self, listener: EstopListener, robot_id: str, key: Hashable, link: StopLink) -> None:
         self.robot_id = robot_id
@@ -231,7 +231,7 @@ class EstopListener:
         return self._registrations
 
     def register(self, robot_id: str, key: Hashable, make: Callable[[], StopLink]) -> ListenerRegistration:
-        """Serve a robot of the plane over the link that ``key`` names; ``make`` it where no device uses it yet."""
+        """Serve a robot over the link of ``key``; ``make`` the link if it is new."""
         with self._registering:
             if self._queue is None:
                 self._start()
@@ -262,7 +262,7 @@ class EstopListener:
             thread.join(2.0)
 
     def accept_params(self, source: str, params: Mapping[str, Any], path: str) -> None:
-        """Act on an emergency stop that came by another path, already parsed; returns at once.
+        """Act on a parsed emergency stop of another path; return at once.
 
         A source whose signatures keep failing is not checked again here for up to a second: its stops arrive at the
         listener's own link as well.

@@ -1,4 +1,4 @@
-"""One robot's motion gate: permits to move, revoked at once by a halt and not given while locked.
+"""Motion gate of one robot: permits, revoked by a halt, refused while locked.
 
 Every motion source (a rollout, a teleoperation session, a single ``send_action``) asks :meth:`MotionGate.permit`
 before it moves and looks at :attr:`Permit.valid` under the same lock as each write to the device. A halt calls
@@ -38,7 +38,7 @@ class MotionRefused(StrandsRobotsError, RuntimeError):  # noqa: N818 - a refusal
 
 
 class PermitVoidError(StrandsRobotsError, RuntimeError):
-    """The permit was void when the write came: the motion was stopped in between, and nothing was written."""
+    """The permit was void at the write, so nothing was written."""
 
 
 REFUSALS = (MotionRefused, PermitVoidError, ValidationError, MissingExtraError)
@@ -68,7 +68,7 @@ def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
 
 
 class Asked:
-    """A call that asks for motion, since when: a halt after it voids what the call begins, and so does giving it up."""
+    """A call for motion and its time; a later halt voids what it begins."""
 
     __slots__ = ("__weakref__", "generation", "given_up")
 
@@ -77,12 +77,12 @@ class Asked:
         self.given_up = False
 
     def give_up(self) -> None:
-        """Nobody waits for the call any more: what it began or may still begin is void, and nothing else is."""
+        """Void what the call began or may still begin, and nothing else."""
         self.given_up = True
 
 
 class Permit:
-    """Leave to move, until the next halt or until the caller that started the motion withdraws it."""
+    """Leave to move until the next halt or until the caller withdraws it."""
 
     __slots__ = ("_asked", "_gate", "_withdrawn", "verb")
 
@@ -99,21 +99,21 @@ class Permit:
 
     @property
     def valid(self) -> bool:
-        """False for ever once the robot was halted or locked, this permit withdrawn, or its call given up."""
+        """False for ever after a halt, a lock, a withdrawal, or its call's end."""
         return not (self._withdrawn or self._asked.given_up or self.revoked)
 
     @property
     def revoked(self) -> bool:
-        """True for ever once the whole robot was halted or locked: that halt also freezes it."""
+        """True for ever once the whole robot was halted or locked."""
         return self._gate.generation != self._asked.generation
 
     def check(self) -> None:
-        """For a motion that had to wait for its turn. Raises :class:`MotionRefused` when this permit is void."""
+        """Raise :class:`MotionRefused` when this permit became void during a wait."""
         if not self.valid:
             raise MotionRefused(error(_LATE.format(self.verb)))
 
     def inside(self) -> AbstractContextManager[None]:
-        """For this thread: what is begun inside is part of this motion, and refused once it was halted."""
+        """Make motions begun inside, on this thread, part of this one."""
         return self._gate.asked_at(self._asked)
 
     def withdraw(self) -> None:
@@ -122,14 +122,14 @@ class Permit:
 
 
 class Waiting:
-    """Motions that were given leave and have not begun, each by a name: a stop of that name alone voids them too."""
+    """Motions with leave that have not begun, by a name that a stop may name."""
 
     def __init__(self) -> None:
         self._permits: dict[Permit, str] = {}
 
     @contextmanager
     def until_begun(self, permit: Permit, name: str = "") -> Iterator[None]:
-        """The time in which a motion loads, connects or stands in line; at its end it runs, or never will."""
+        """Mark the time in which a motion loads, connects or waits."""
         self._permits[permit] = name
         try:
             yield
@@ -144,7 +144,7 @@ class Waiting:
 
 
 class MotionGate:
-    """The gate of one robot. Thread-safe without a lock: the generation is one reference, replaced whole."""
+    """Gate of one robot; thread-safe without a lock."""
 
     def __init__(self, latch: Latch | None = None) -> None:
         self._latches: tuple[Latch, ...] = () if latch is None else (latch,)
@@ -166,7 +166,7 @@ class MotionGate:
         return self._latches
 
     def attach(self, latch: Latch) -> None:
-        """Let ``latch`` decide from now on, beside those there are, whether motion is locked."""
+        """Let ``latch``, beside the present ones, decide whether motion is locked."""
         with self._attaching:
             if latch not in self._latches:
                 self._latches = (*self._latches, latch)
@@ -177,7 +177,7 @@ class MotionGate:
             self._latches = tuple(each for each in self._latches if each is not latch)
 
     def watch(self, begins: Callable[[], None]) -> Callable[[], None]:
-        """Call ``begins`` before each permit is given, and now where one was given before; return what ends that."""
+        """Call ``begins`` before each permit; return a callable that ends that."""
         with self._attaching:
             self._watchers = (*self._watchers, begins)
         if self._given:
@@ -195,7 +195,7 @@ class MotionGate:
 
     @contextmanager
     def asked_at(self, asked: Asked) -> Iterator[None]:
-        """For this thread: motions begun inside were asked for then; a halt since then refuses them.
+        """Date motions begun inside, on this thread; a later halt refuses them.
 
         A call that waited for a thread or a connection is thus older than the stop that came meanwhile. Of two
         around one another the outer one counts, which is the older.
@@ -216,11 +216,11 @@ class MotionGate:
         return None
 
     def refusal(self, verb: str) -> Envelope | None:
-        """The answer to ``verb`` while locked, or when the robot was halted since it was asked for; else None."""
+        """Return the refusal of ``verb`` while locked or halted since, else None."""
         return self._refusal(verb, self._asked_here())
 
     def permit(self, verb: str) -> Permit:
-        """Leave to move. Raises :class:`MotionRefused` while locked, and when halted since it was asked for."""
+        """Return leave to move; raise :class:`MotionRefused` if locked or halted."""
         # The generation is read before the latches, so that a lock engaged in between voids this permit.
         asked = self._asked_here()
         permit = Permit(self, asked, verb)
@@ -237,7 +237,7 @@ class MotionGate:
         self._generation = next(self._numbers)
 
     def renew(self, permit: Permit) -> Permit:
-        """Void every other permit, as a halt does, and go on with a fresh one in the place of this.
+        """Void every other permit, as a halt does, and return a fresh one.
 
         Raises :class:`MotionRefused` where another caller has halted or locked the robot since ``permit`` was given.
         """

@@ -1,4 +1,4 @@
-"""The lockout of one robot: its state, and the latch that keeps its motion gate shut.
+"""Lockout of one robot: its state, and the latch of its motion gate.
 
 A robot is locked while it has at least one *epoch*, the id of the emergency stop that locked it, and each epoch is
 cleared by itself. At most :data:`MAX_EPOCHS` are told apart; stops beyond that share one overflow epoch, which no
@@ -27,7 +27,7 @@ OVERFLOW = "overflow"
 
 @dataclass(frozen=True, slots=True)
 class Lockout:
-    """One epoch that locks a robot: ``at`` in seconds of wall-clock time, ``source`` as the stop declared it."""
+    """One epoch that locks a robot: ``at`` in wall-clock s, declared ``source``."""
 
     epoch: str
     source: str = ""
@@ -37,7 +37,7 @@ class Lockout:
 
 @dataclass(frozen=True, slots=True)
 class LockoutState:
-    """The lockouts of a robot, oldest first. The empty state is a robot that may move."""
+    """Lockouts of a robot, oldest first; with none it may move."""
 
     lockouts: tuple[Lockout, ...] = ()
     overflow: Lockout | None = None
@@ -63,7 +63,7 @@ class LockoutState:
         return tuple(each.epoch for each in self.lockouts)
 
     def engage(self, lockout: Lockout) -> LockoutState:
-        """Return the state after an emergency stop; the same where its epoch locks the robot already."""
+        """Return the state after an emergency stop; a known epoch changes nothing."""
         if lockout.epoch in self.resumable:
             return self
         if lockout.epoch != OVERFLOW and len(self.lockouts) < MAX_EPOCHS:
@@ -71,12 +71,12 @@ class LockoutState:
         return self if self.overflow is not None else replace(self, overflow=replace(lockout, epoch=OVERFLOW))
 
     def resume(self, epoch: str) -> LockoutState:
-        """Return the state after a verified resume of ``epoch``; the same where that does not lock the robot."""
+        """Return the state after a verified resume of ``epoch``."""
         return replace(self, lockouts=tuple(each for each in self.lockouts if each.epoch != epoch))
 
 
 class LockoutLatch:
-    """Lockout of one robot in a running process, with the emergency stops it has seen; a :class:`~.gate.Latch`.
+    """Lockout of one robot in a running process, with the stops it has seen.
 
     Readers take no lock: the state is one reference that is replaced whole. Writers share a lock that no I/O and
     no robot call is ever made under.
@@ -111,7 +111,7 @@ class LockoutLatch:
         return refusal(self._state, self.robot_id, verb)
 
     def engage(self, epoch: str, source: str, reason: str) -> bool:
-        """Lock under ``epoch``; False when this id was seen before, which changes nothing."""
+        """Lock under ``epoch``; False, without a change, when it was seen before."""
         with self._writing:
             if epoch in self._seen:
                 return False
@@ -126,7 +126,7 @@ class LockoutLatch:
             self._state = self._state.resume(epoch)
 
     def clear(self) -> tuple[Lockout, ...]:
-        """Clear every lockout, the overflow included, for an operator at this machine; return what was cleared."""
+        """Clear every lockout, for an operator at this machine; return them."""
         with self._writing:
             cleared, self._state = self._state.all, LockoutState()
             return cleared
@@ -140,7 +140,7 @@ class LockoutLatch:
 
 
 def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
-    """Return a locked robot's answer to ``verb``: the epoch, its source and how to resume; None while free."""
+    """Return a locked robot's refusal of ``verb``; None while free."""
     if not state.locked:
         return None
     first = state.all[0]
@@ -169,7 +169,7 @@ def how_to_resume(state: LockoutState, robot_id: str) -> str:
 
 
 def utc(at: float) -> str:
-    """Return wall-clock seconds as ISO 8601 UTC; a time beyond the calendar as its number."""
+    """Return wall-clock seconds as ISO 8601 UTC, or as a number if too large."""
     try:
         return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(at))
     except (OverflowError, ValueError, OSError):

@@ -1,4 +1,4 @@
-"""Emergency stops as values: the order, the rules by which one counts, and the report of each robot.
+"""Emergency stops as values: order, rules, and each robot's report.
 
 The e-stop listener, the runtime's handler, the mesh and the command line share them with the plane.
 """
@@ -34,7 +34,7 @@ def new_epoch() -> str:
 
 
 def derived_epoch(source: str, distinct: bytes) -> str:
-    """The epoch of a stop that brings no id of its own: 32 hex of SHA-256(source NUL what identifies it)."""
+    """Return the epoch of a stop without an id: 32 hex of a SHA-256."""
     return hashlib.sha256(source.encode("utf-8", "replace") + b"\0" + distinct).hexdigest()[:32]
 
 
@@ -60,7 +60,7 @@ class StopOrder:
     received: float = field(default_factory=time.monotonic)
 
     def timing(self, now: float) -> str:
-        """``on time``, ``late``, ``ahead`` of our clock, or ``untimed``, at wall-clock time ``now``."""
+        """Return ``on time``, ``late``, ``ahead`` or ``untimed`` at wall-clock ``now``."""
         if self.issued is None:
             return "untimed"
         if now - self.issued > LATE_S:
@@ -108,7 +108,7 @@ class RobotReport:
 
 
 def epoch_of(source: str, params: Mapping[str, Any], raw: bytes) -> str:
-    """The epoch of a Device Connect ``emergencyStop``: its ``estop_id``, else one derived from ``event_id``.
+    """Return the epoch of an ``emergencyStop``: ``estop_id``, else a derived one.
 
     Without either it is derived from ``raw``, the bytes that arrived: a stop is never dropped for its shape.
     """
@@ -122,14 +122,14 @@ def epoch_of(source: str, params: Mapping[str, Any], raw: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class StopRefused:
-    """A message of ``source`` that does not count, and the reason for the log and the audit."""
+    """Message of ``source`` that does not count, with the reason."""
 
     source: str
     why: str
 
 
 def signed_fields(estop_id: object, source: str, t: object, nonce: object) -> bytes:
-    """The bytes that an emergency stop or a check-in is signed over: id, source, wall-clock seconds, nonce."""
+    """Return the signed bytes of a stop or check-in: id, source, time, nonce."""
     return ed25519.canonical({"estop_id": estop_id, "nonce": nonce, "source": source, "t": t})
 
 
@@ -140,7 +140,7 @@ def estop_keys() -> tuple[bytes, ...]:
 
 
 class StopRules:
-    """The rules by which an emergency stop counts: its source may stop and, where keys are configured, it is signed.
+    """Rules by which an emergency stop counts: its source and its signature.
 
     Nothing else refuses a stop: not its age, not its shape, not its size. The settings are read when this is made, so
     that a flood meets no environment and no parsing. Each robot asks for itself if it has seen a stop before.
@@ -171,7 +171,7 @@ class StopRules:
         return estop_refusal(source, self._allow)
 
     def order_of(self, source: str, payload: bytes, received: float | None = None) -> StopOrder | StopRefused:
-        """Decide on the bytes of an ``emergencyStop`` event that the e-stop listener received."""
+        """Decide on the bytes of an ``emergencyStop`` event."""
         return self.order(source, params_of(payload), "lane", payload, received)
 
     def order(
@@ -182,7 +182,7 @@ class StopRules:
         raw: bytes | None = None,
         received: float | None = None,
     ) -> StopOrder | StopRefused:
-        """Decide on the parameters of an ``emergencyStop``; ``raw`` identifies it where they do not."""
+        """Decide on the parameters of an ``emergencyStop``; ``raw`` may identify it."""
         why = self.source_refusal(source) or self.signature_refusal(source, params)
         if why is not None:
             return StopRefused(source, why)
@@ -199,7 +199,7 @@ class StopRules:
         )
 
     def signature_refusal(self, source: str, params: Mapping[str, Any]) -> str | None:
-        """Return the reason why the signature is not valid, or None; always None where no key is configured."""
+        """Return the reason why the signature is not valid, or None; None without keys."""
         if not self._keys:
             return None
         estop_id, nonce, t = params.get("estop_id"), params.get("nonce"), params.get("t")

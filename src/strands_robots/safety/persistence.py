@@ -1,4 +1,4 @@
-"""Lockouts on disk: one small file for all robots of this machine, so that a restart unlocks nothing.
+"""Lockouts on disk: one file for all robots of this machine.
 
 A robot is kept under a key that outlives the process (see :func:`hardware_key`); a robot without one, an unnamed
 simulation, is not kept. A file that cannot be read locks: a robot whose record is unreadable comes up
@@ -31,7 +31,7 @@ FILE_MAX_BYTES = 16 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class StoredLockout:
-    """The state a robot starts with: its lockouts, the ids of stops it has seen, and its name on its network."""
+    """State with which a robot starts: lockouts, seen stops, network name."""
 
     state: LockoutState = field(default_factory=LockoutState)
     seen: tuple[str, ...] = ()
@@ -39,7 +39,7 @@ class StoredLockout:
 
 
 def hardware_key(kind: str, stable_id: str) -> str:
-    """The key of real hardware: its kind beside a serial port id, a host, a calibration id or an id on disk."""
+    """Return the key of real hardware: its kind and an id of its own."""
     return f"hardware:{kind}:{stable_id}"
 
 
@@ -49,7 +49,7 @@ def simulation_key(peer_id: str) -> str:
 
 
 class LockoutStore:
-    """The file ``lockouts.json`` in ``directory`` (default: the state directory, asked at each use)."""
+    """File ``lockouts.json`` in ``directory``, by default the state directory."""
 
     def __init__(self, directory: Path | None = None) -> None:
         self._directory = directory
@@ -64,7 +64,7 @@ class LockoutStore:
         return self.path.with_suffix(".unreadable")
 
     def load(self, key: str) -> StoredLockout:
-        """Return the record of ``key``; an empty one where there is none, a locked one where it cannot be read.
+        """Return the record of ``key``: empty if absent, locked if unreadable.
 
         A robot without a record is locked as well while a file that could not be read lies aside.
         """
@@ -95,7 +95,7 @@ class LockoutStore:
             raise ValueError(f"{self.path} holds no record of lockouts: {exc!r}") from exc
 
     def save(self, kept: Mapping[str, StoredLockout]) -> None:
-        """Put these records on the disk beside those of other processes; returns when they are there.
+        """Write these records beside those of other processes, and wait.
 
         Raises:
             OSError: not written; TimeoutError (one of its kinds) when another process holds the file.

@@ -1,4 +1,4 @@
-"""The safety plane of a process: every robot in it, and the one function in which every emergency stop ends."""
+"""Safety plane of a process: its robots, and the end of every emergency stop."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Registered:
         self._plane.unregister(self)
 
     def adopt(self, key: str, kept: StoredLockout) -> None:
-        """Store this robot under ``key`` from now on, and take over the lockouts stored there."""
+        """Store this robot under ``key``, and take over the lockouts stored there."""
         self.key = key
         self.inherit(kept.state)
 
@@ -93,7 +93,7 @@ class Registered:
             self.latch.engage(each.epoch, each.source, each.reason)
 
     def come_up_locked(self) -> None:
-        """Halt motion that began before the robot was known to be locked. Returns at once."""
+        """Halt motion that began before the lock was known; return at once."""
         for gate in self.gates:
             gate.revoke()
         logger.warning("%s comes up locked: epochs %s.", self.robot_id, ", ".join(self.epochs))
@@ -167,7 +167,7 @@ class SafetyPlane:
         return frozenset(self._robots)
 
     def register(self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "") -> Registered:
-        """Put ``robot`` under the plane: its gate refuses motion while it is locked, and every emergency stop halts it.
+        """Put ``robot`` under the plane, which locks and halts it.
 
         Args:
             robot_id: its name in this process.
@@ -210,7 +210,7 @@ class SafetyPlane:
         return entry
 
     def unregister(self, entry: Registered) -> None:
-        """Take a robot out when its last user lets go; the threads end with the last robot."""
+        """Take a robot out with its last user; the threads end with the last robot."""
         with self._registering:
             entry.users -= 1
             if entry.users or self._robots.get(entry.robot_id) is not entry:
@@ -226,7 +226,7 @@ class SafetyPlane:
         entry.leave_executor()
 
     def _inherit(self, entry: Registered) -> None:
-        """Lock the entry by the lockouts with which its robot left the plane, though they are on no disk."""
+        """Lock the entry by lockouts with which its robot left the plane."""
         living = [each.latch for each in self._robots.values()]
         for latch in entry.robot.gate.latches:
             if isinstance(latch, LockoutLatch) and latch is not entry.latch and latch not in living:
@@ -234,7 +234,7 @@ class SafetyPlane:
                 entry.robot.gate.detach(latch)
 
     def _bequeath(self, entry: Registered) -> None:
-        """Keep the lock of a robot that leaves: on the disk, and in the entry of its other name or its gate."""
+        """Store the lockouts of a robot that leaves, on disk and in its gate."""
         if entry.locked and entry.latch.state is not entry.on_disk:
             # Its last stop may not be written yet, and the next registration reads it there.
             self._kept([entry])
@@ -246,7 +246,7 @@ class SafetyPlane:
                 gate.detach(entry.latch)
 
     def begin(self, order: StopOrder, on_report: OnReport = lambda report: None) -> StopRun | None:
-        """Lock every robot at once and set every halt going; returns before any of them has answered.
+        """Lock every robot and start every halt; return before their answers.
 
         A robot that has seen this stop is not halted again; ``on_report`` gets at once its report of then while this
         stop still holds it, and ``stopped`` None once it was resumed. None when no robot had anything to do.
@@ -299,7 +299,7 @@ class SafetyPlane:
         return run
 
     def emergency_stop(self, order: StopOrder, on_report: OnReport = lambda report: None) -> dict[str, RobotReport]:
-        """Lock and halt every robot of the process and wait for their answers, by robot id.
+        """Lock and halt every robot; return their answers by robot id.
 
         Returns within the halt deadline and the time the lockout file takes, whatever the robots do. A robot that
         has seen this stop before answers as in :meth:`begin`.
@@ -316,7 +316,7 @@ class SafetyPlane:
         return dict(answers)
 
     def resume(self, robot_id: str, assertion: object, path: str) -> Envelope:
-        """Check a signed resume for one robot; the wire's answer never says why it was rejected."""
+        """Check a signed resume for one robot; the answer has no reason."""
         entry = self._robots.get(robot_id)
         if entry is None:
             return error(REJECTED)
@@ -341,7 +341,7 @@ class SafetyPlane:
         )
 
     def clear_local(self, who: str, robot_ids: Iterable[str] | None = None) -> dict[str, tuple[Lockout, ...]]:
-        """Clear every lockout of these robots (all by default) for ``who``, an operator at this machine."""
+        """Clear every lockout of these robots, or all, for the operator ``who``."""
         robots = self._robots
         cleared: dict[str, tuple[Lockout, ...]] = {}
         for name in robots.keys() & set(robots if robot_ids is None else robot_ids):

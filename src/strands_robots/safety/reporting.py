@@ -1,4 +1,4 @@
-"""The reports of a stop: collects verdicts, stores the lockouts, reports and records. Never on a stop's way.
+"""Reports of a stop: verdicts, stored lockouts, records; never on its way.
 
 One thread turns three things into reports: a halt's answer, the lockout file being written, and time. It waits for
 nothing else: the file is written by a thread of its own, and the audit has its own.
@@ -68,7 +68,7 @@ class _Kept:
 
 
 class Reporter:
-    """The reporting thread and the one that writes the file. Made with the first robot, closed with the last.
+    """Reporting thread and file writer, made with the first robot.
 
     Args:
         tick: called about every ``tick_s`` seconds on the reporting thread, for what is due by time alone.
@@ -124,7 +124,7 @@ class Reporter:
             self._time_out(run)
 
     def _take(self) -> bool:
-        """Everything that has arrived, so that thirty answers cost one look at the run; False to end."""
+        """Return everything that has arrived; False to end."""
         with contextlib.suppress(queue.Empty):  # all taken, or it is time to look at the clock
             message = self._inbox.get(timeout=self._patience())
             while True:

@@ -1,4 +1,4 @@
-"""The operator's signed resume: made on the operator's machine, checked at each robot.
+"""Operator's signed resume, made on one machine and checked at each robot.
 
 An assertion is exactly ``v``, ``epoch``, ``targets``, ``t``, ``nonce`` and ``sig``, the Ed25519 signature over the
 canonical JSON of the other five. It clears one epoch of the robots it names, once, within a minute. Why one was
@@ -38,7 +38,7 @@ _HEX32 = re.compile(r"[0-9a-f]{32}\Z")
 
 
 class Denial(Enum):
-    """Reasons to refuse an assertion, in the order of the checks; for the local audit only."""
+    """Reasons to refuse an assertion, in the order of the checks."""
 
     BACKING_OFF = "backing off after five refusals"
     NO_KEYS = "no public key is configured"
@@ -68,7 +68,7 @@ def is_epoch(value: object) -> bool:
 def sign(
     signing_key: Any, epoch: str, targets: Iterable[str], *, clock: Callable[[], float] = time.time
 ) -> list[dict[str, Any]]:
-    """Assertions that together clear ``epoch`` for all ``targets``, each small enough to be relayed.
+    """Return assertions that together clear ``epoch`` for all ``targets``.
 
     Raises:
         ValidationError: no targets, a target that is no identifier, or an epoch that is not 32 hex digits.
@@ -115,7 +115,7 @@ class Admitted:
 
 
 class ResumeVerifier:
-    """Checks assertions for one robot; thread-safe. It remembers nonces and counts refusals, nothing else.
+    """Check of assertions for one robot, with nonces and refusals; thread-safe.
 
     Args:
         robot_ids: the names under which this robot may be a target.

@@ -1,4 +1,4 @@
-"""The stop executor: every halt of this process runs here, on a thread that stands ready, within a deadline.
+"""Stop executor: halts of this process, on ready threads, within a deadline.
 
 The safety plane, an RPC ``stop``, the mesh's ``stop``, ``HardwareRobot.halt`` and a departing process submit to it.
 :meth:`StopExecutor.submit` takes no lock that is held during a halt, so a robot that blocks delays no other robot.
@@ -45,7 +45,7 @@ The rest is for the verdict to reach the caller in time."""
 
 @runtime_checkable
 class NotesMotion(Protocol):
-    """A target that notes what moves before its permits are void, so that its verdict can name it."""
+    """Target that notes its motions before its permits are void."""
 
     def halt_ordered(self) -> None:
         """Note what moves. Must not block."""
@@ -53,14 +53,14 @@ class NotesMotion(Protocol):
 
 @runtime_checkable
 class DirectTarget(NotesMotion, Protocol):
-    """A target whose public ``halt`` goes through the executor, which then calls :meth:`halt_here`.
+    """Target whose ``halt`` goes through the executor to :meth:`halt_here`.
 
     It says itself what is known while its halt blocks, and no second thread is started for it meanwhile: whatever
     blocks the first, such as its bus, would block the second.
     """
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
-        """Halt on the calling thread and return by ``deadline`` (monotonic seconds), unless the device blocks."""
+        """Halt on this thread by ``deadline`` (monotonic s), unless the device blocks."""
 
     def unanswered(self, why: str) -> StopVerdict:
         """Return the verdict while :meth:`halt_here` has not returned. Must not block."""
@@ -91,7 +91,7 @@ class _Stop:
         return self.since + part * self.within
 
     def resolve(self, answer: object) -> None:
-        """Hand out the graded answer of the halt, as a late one where the deadline has passed."""
+        """Hand out the graded answer of the halt, marked if it is late."""
         verdict, late = graded(answer, self.name), self.answered
         # Watched until the deadline, an answered stop must not keep its robot alive.
         self.slot = self.target = self.answered = None
@@ -124,7 +124,7 @@ class _Stop:
 
 
 class _Slot:
-    """The halts of one target: those that wait, those that one running halt is for, and the thread that is woken.
+    """Halts of one target: waiting, running, and the thread that is woken.
 
     It does not refer to the target; only its stops do.
     """
@@ -140,7 +140,7 @@ class _Slot:
         self.thread: threading.Thread | None = None
 
     def next(self, done: list[_Stop] | None = None) -> list[_Stop] | None:
-        """Take everything that waits, for one halt; None where nothing does or another thread serves the target.
+        """Take all waiting requests for one halt, or None.
 
         Args:
             done: what the calling thread took before.
@@ -156,7 +156,7 @@ class _Slot:
             return self.running
 
     def give_up(self, stuck: list[_Stop]) -> bool:
-        """Leave the thread that carries out ``stuck`` to itself; False where it has just returned."""
+        """Abandon the thread that carries out ``stuck``; False if it has returned."""
         with self.changing:
             if self.running is not stuck:
                 return False
@@ -169,7 +169,7 @@ _Wake = queue.SimpleQueue[_Slot | None]
 
 
 class StopExecutor:
-    """Halts robots on threads that stand ready. One per process; every method may be called from any thread.
+    """Halts of robots on ready threads; one per process, thread-safe.
 
     A target that was attached owns a thread. All others share :data:`RESERVE` threads, and each that is taken is
     replaced at once, so that blocked halts never use them up. Stops of one target that arrive while a halt of it runs
@@ -208,7 +208,7 @@ class StopExecutor:
             slot.owners += 1
 
     def detach(self, target: Target, wait: float = 0.0) -> None:
-        """End the ready thread with the last detach, after what waits; wait for that for ``wait`` seconds.
+        """End the ready thread with the last detach; wait for ``wait`` seconds.
 
         A thread that is blocked in a halt is left behind as a daemon.
         """
@@ -230,7 +230,7 @@ class StopExecutor:
             thread.join(wait)
 
     def prepare(self) -> None:
-        """Have the reserve stand ready for targets that are not attached. Raises RuntimeError like attach."""
+        """Make the reserve ready for targets that are not attached."""
         with self._attaching:
             self._prepare()
 
@@ -302,7 +302,7 @@ class StopExecutor:
         return inbox, thread
 
     def _end_with(self, target: Target, key: Hashable, slot: _Slot) -> object:
-        """Let the thread end with the target, or keep the target alive where it cannot be watched."""
+        """End the thread with the target, or keep a target that cannot be watched."""
         body = body_of(target)
         if key is body:
             return body
@@ -335,7 +335,7 @@ class StopExecutor:
                 self._idle += 1
 
     def _serve(self, slot: _Slot, nested: list[_Stop] | None = None) -> None:
-        """Carry out what waits at ``slot`` until nothing does, or until another thread has taken over."""
+        """Carry out requests at ``slot`` until none waits or another thread took over."""
         stops = nested or slot.next()
         while stops is not None:
             outer = getattr(self._here, "serving", ())
@@ -387,7 +387,7 @@ class StopExecutor:
                 raise
 
     def _watch(self) -> None:
-        """Answer for every halt that misses its deadline, and keep the reserve full. Never on a stop's way."""
+        """Answer for halts that miss their deadline, and refill the reserve."""
         due: list[tuple[float, int, _Stop]] = []
         while True:
             try:
@@ -443,7 +443,7 @@ class StopExecutor:
 
 
 def _key(target: Target) -> Hashable:
-    """Return what is equal for the same target: a frozen dataclass itself, else the identity of its body."""
+    """Return an identity that is equal for the same target."""
     body = body_of(target)
     params = getattr(type(body), "__dataclass_params__", None)
     by_value = params is not None and params.frozen and params.eq

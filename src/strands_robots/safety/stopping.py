@@ -76,7 +76,7 @@ class StopVerdict:
 
 
 def stop_level() -> Literal["hold", "limp"]:
-    """Return what a halt does to torque: ``hold`` keeps it on, so that an arm does not fall; ``limp`` takes it off.
+    """Return the effect of a halt on torque: ``hold`` keeps it, ``limp`` drops it.
 
     ``STRANDS_ESTOP_TORQUE``; another value is ``hold``, with one line in the log.
     """
@@ -113,7 +113,7 @@ def grade(answer: object) -> Outcome:
 
 
 def explain(answer: object) -> str:
-    """Return the reason why :func:`grade` did not say stopped, in a few words for an operator."""
+    """Return the reason, for an operator, why :func:`grade` did not say stopped."""
     outcome = grade(answer)
     if outcome in (Outcome.RAISED, Outcome.TIMED_OUT):
         return f"{outcome.value}: {type(answer).__name__}: {answer}"
@@ -144,7 +144,7 @@ def verdict_of(stop: Callable[[], object], name: str) -> StopVerdict:
 
 
 def halt_each(sources: Mapping[str, Callable[[], object]]) -> StopVerdict:
-    """Ask every source to stop, in order, whatever the ones before it did, and grade each answer.
+    """Ask every source to stop, in order, and grade each answer.
 
     A source whose callable returns None had nothing to halt and is not listed.
     """
