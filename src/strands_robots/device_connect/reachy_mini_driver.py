@@ -68,7 +68,7 @@ class ReachyMiniDriver(RobotDriver):
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Who this device is; ``model`` names the daemon's host."""
+        """Identity of this device; ``model`` names the daemon's host."""
         connection = self.reachy.connection
         info = connection.info
         return DeviceIdentity(
@@ -88,7 +88,7 @@ class ReachyMiniDriver(RobotDriver):
         return DeviceStatus(availability=UNAVAILABLE, busy_score=0.0, error_state=away)
 
     def heartbeat(self) -> dict[str, Any]:
-        """What every heartbeat carries besides the id and the time."""
+        """Fields of every heartbeat besides the id and the time."""
         told = super().heartbeat()
         return {**told, "availability": UNAVAILABLE} if self.activity.fault else told
 
@@ -145,7 +145,7 @@ class ReachyMiniDriver(RobotDriver):
     async def stateUpdate(
         self, moving: str = "", link: str = "", motor_mode: str = "", data_age_s: float = 0.0
     ) -> None:
-        """What the robot is doing, told at a steady rate while it is available.
+        """Activity of the robot, at a steady rate while it is available.
 
         Args:
             moving: Which motion runs, empty for none

@@ -51,7 +51,7 @@ class RobotDeviceDriver(RobotDriver):
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Who this device is; ``model`` is the robot's own name."""
+        """Identity of this device; ``model`` is the robot's own name."""
         return DeviceIdentity(
             device_type=self.device_type,
             manufacturer="strands-robots",
@@ -99,7 +99,7 @@ class RobotDeviceDriver(RobotDriver):
 
     @emit()
     async def stateUpdate(self, task_status: str = "", instruction: str = "", step_count: int = 0) -> None:
-        """What the robot is doing, told at a steady rate.
+        """Activity of the robot, at a steady rate.
 
         Args:
             task_status: State of the current or last task

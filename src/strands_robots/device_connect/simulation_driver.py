@@ -47,7 +47,7 @@ class SimulationDeviceDriver(RobotDriver):
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Who this device is; ``model`` is the simulation's own name."""
+        """Identity of this device; ``model`` is the simulation's own name."""
         return DeviceIdentity(
             device_type=self.device_type,
             manufacturer="strands-robots",

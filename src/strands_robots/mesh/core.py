@@ -59,7 +59,7 @@ _local_lock = threading.Lock()
 
 @dataclass(slots=True)
 class Parts:
-    """What a peer takes from its process, and a test gives it instead.
+    """Dependencies of a peer that a test replaces.
 
     Attributes:
         acquire: gives the transport, connected, or None; ``release`` gives it back.
@@ -510,7 +510,7 @@ def get_local_robots() -> dict[str, Mesh]:
 
 
 def mesh_disabled_by_env() -> bool:
-    """Whether ``STRANDS_MESH`` forces the mesh off."""
+    """Return True when ``STRANDS_MESH`` forces the mesh off."""
     return mesh_env_request() is False
 
 

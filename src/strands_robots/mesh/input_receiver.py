@@ -101,7 +101,7 @@ class InputReceiver:
 
     @property
     def running(self) -> bool:
-        """Whether a frame may still move the robot; False from the stop on that voids it."""
+        """True while a frame may move the robot; False after the stop that voids it."""
         return self._running and self._permit is not None and self._permit.valid
 
     @property

@@ -109,7 +109,7 @@ class RateLimiter:
         self._due = -math.inf
 
     def admit(self) -> bool:
-        """Whether the next one may go now."""
+        """Return True when the next one may go now."""
         now = self._clock()
         if math.isinf(self._period) or now < self._due:
             return False

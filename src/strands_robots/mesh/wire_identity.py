@@ -201,7 +201,7 @@ class Identity:
 
     @property
     def checks(self) -> bool:
-        """Whether there are roots to check a signature against."""
+        """True when there are roots to check a signature against."""
         return self._verifier is not None
 
 

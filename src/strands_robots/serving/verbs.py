@@ -86,7 +86,7 @@ class Verb:
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
 
     def unfit(self, names: Collection[str]) -> str | None:
-        """Why arguments of these names do not fit the verb, or None."""
+        """Return the reason why arguments of these names do not fit, or None."""
         unknown = [name for name in names if name not in self.by_name]
         missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
         if not unknown and not missing:

@@ -89,7 +89,7 @@ class TlsCredentials:
 
 @dataclass(frozen=True, slots=True)
 class Posture:
-    """What a session is opened with.
+    """Configuration of a session.
 
     Attributes:
         hub: loopback endpoint of the automatic hub; None where endpoints are stated.
@@ -139,7 +139,7 @@ def discovery_timeout(default: float) -> float:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether a Zenoh endpoint such as ``tcp/127.0.0.1:7447`` stays on this machine."""
+    """Return True for an endpoint of this machine, ``tcp/127.0.0.1:7447``."""
     protocol, _, address = endpoint.partition("/")
     if protocol.startswith(("unix", "vsock")):
         return protocol.startswith("unix")
