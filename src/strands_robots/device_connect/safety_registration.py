@@ -59,7 +59,7 @@ class SafetyRegistration:
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
         self._held: Registered | None = self.entry
         try:
-            self._seat: ListenerRegistration = estop_listener().register(
+            self._listener: ListenerRegistration = estop_listener().register(
                 name, ("device-connect", link), lambda: stop_link(link)
             )
         except BaseException:
@@ -68,8 +68,8 @@ class SafetyRegistration:
 
     @property
     def up(self) -> bool:
-        """True while the lane's link of this device reaches somebody."""
-        return self._seat.link.up
+        """True while the e-stop link of this device is connected."""
+        return self._listener.link.up
 
     def runtime_estop(self, source: object, params: object) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
@@ -82,17 +82,17 @@ class SafetyRegistration:
 
     def facts(self) -> dict[str, Any]:
         """Return the lockouts and the check-in of the robot, for ``getStatus``."""
-        holds = self.entry.latch.state.all
+        lockouts = self.entry.latch.state.all
         return {
-            "locked": bool(holds),
-            "lockout": [{"epoch": h.epoch, "source": h.source, "reason": h.reason, "since": h.at} for h in holds],
+            "locked": bool(lockouts),
+            "lockout": [{"epoch": h.epoch, "source": h.source, "reason": h.reason, "since": h.at} for h in lockouts],
             "check_in": plane().checkin.fields(time.monotonic()),
             "stop_lane": self.up,
         }
 
     def leave(self) -> None:
         """Leave listener and plane; block while a link closes. Safe to call twice."""
-        self._seat.close()
+        self._listener.close()
         entry, self._held = self._held, None
         if entry is not None:
             entry.close()
