@@ -221,7 +221,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         return verdict.envelope()
 
     async def stop_answer(self, reason: str) -> Envelope:
-        """Halt and answer within the halt deadline, whoever asks."""
+        """Halt and answer within the halt deadline, for any caller."""
         halting = stop_executor().submit(self.stop_target(), self.peer_id, reason, within=self.stop_within())
         verdict = await asyncio.wrap_future(halting)
         return enveloped("stop", self.stop_envelope(verdict))

@@ -1,4 +1,4 @@
-"""The documented second door to :mod:`strands_robots.drivers.reachy_transport`."""
+"""Second documented path of :mod:`strands_robots.drivers.reachy_transport`."""
 
 from __future__ import annotations
 

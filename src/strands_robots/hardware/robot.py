@@ -435,12 +435,12 @@ class HardwareRobot(TeleopMixin):
         try:
             if self._body.stop_waits:
                 return "A stop waits for the bus; these are the joints of the last read."
-            # Whoever drives it waits meanwhile: for one lost answer, not for three.
+            # The driving loop waits meanwhile: for one lost answer, not for three.
             self._body.get_joints(1 if self._body.driven else READ_TRIES)
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
             problem = f"The joints could not be read: {type(exc).__name__}: {exc}"
             if problem != self._unread:
-                # Somebody may ask fifty times a second.
+                # A caller may ask fifty times a second.
                 logger.warning("%s: %s", self.tool_name_str, problem)
             self._unread = problem
             return problem

@@ -187,7 +187,7 @@ class Mesh(SensorLoopsMixin):
                 self._adapter.open()
                 self._begin(transport)
             except BaseException:
-                # Whoever cannot join holds nothing: neither the session nor half of its subscribers.
+                # A peer that cannot join gives back the session and its subscribers.
                 self._leave()
                 raise
         with _local_lock:
@@ -448,7 +448,7 @@ class Mesh(SensorLoopsMixin):
         Raises:
             RuntimeError: this peer is not on the mesh.
         """
-        # A link that is down for the moment keeps nobody from stopping here, and the fleet hears of it later.
+        # A link that is down must not keep this robot from stopping; the fleet gets the stop later.
         if self._context.transport is None:
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
         return self._safety.emergency_stop()

@@ -47,7 +47,7 @@ class BoundedExecutor:
             self._accepted += 1
             # Counted from here and not from a worker's start: of jobs that come together each gets its own.
             short = len(self._threads) < self._workers and self._accepted - self._done > len(self._threads)
-            # Closed meanwhile, nobody takes the job: a thread made now would wait for ever.
+            # Once closed, no thread takes the job: one made now would wait for ever.
             if self._open and short:
                 self._add()
             return self._open

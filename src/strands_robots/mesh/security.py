@@ -1,6 +1,6 @@
 """Bounds of commands and input frames, checked once at the edge.
 
-Identifiers and :class:`ValidationError` are :mod:`strands_robots.utils`'s; this module is their documented door on
+Identifiers and :class:`ValidationError` are :mod:`strands_robots.utils`'s; this module is their documented path on
 the mesh, and holds the table of a command's fields. A machine reads ``ValidationError.code``.
 """
 
@@ -51,7 +51,7 @@ def validate_command(command: object) -> dict[str, Any]:
     Args:
         command: an object with ``action`` and that action's fields.
 
-    A resume's assertion is passed on as it is: whoever checks it counts what it refuses.
+    A resume's assertion is passed on unchanged: the check of its signature counts refusals.
 
     Raises:
         ValidationError: naming the field, the value and its domain.

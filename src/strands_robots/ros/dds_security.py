@@ -196,7 +196,7 @@ def governance_gap(document: bytes, domain_id: int, topic: str) -> str | None:
     if fitting is None:
         return f"it has no rule for {topic}"
     if not _flag(fitting, "enable_write_access_control"):
-        return f"it lets everybody write {topic}"
+        return f"it lets every participant write {topic}"
     kinds = (_text(rule, "rtps_protection_kind"), _text(fitting, "metadata_protection_kind"))
     if all(kind in ("", "NONE") for kind in (*kinds, _text(fitting, "data_protection_kind"))):
         return f"it neither signs nor encrypts {topic}"

@@ -54,7 +54,7 @@ def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> s
         if not hardware:
             return None
         return (
-            "Nobody may move this robot: DEVICE_CONNECT_RPC_ALLOW is not set. Set it to the callers that may "
+            "No caller may move this robot: DEVICE_CONNECT_RPC_ALLOW is not set. Set it to the callers that may "
             "(names or globs, '*' for every named caller, 'anonymous' for callers without a name)."
         )
     if name is None:
@@ -114,7 +114,7 @@ class Authorization:
         elif not entries(allow) and not self._warned.is_set():
             self._warned.set()
             logger.warning(
-                "%s moves for anybody on its network: it is a simulation and DEVICE_CONNECT_RPC_ALLOW is not set.",
+                "%s moves for any caller on its network: it is a simulation and DEVICE_CONNECT_RPC_ALLOW is not set.",
                 self._robot,
             )
         return refusal

@@ -164,7 +164,7 @@ ASSERTION = Parameter(
     "assertion",
     dict,
     "What the operator's resume key signed: v, epoch, targets, t, nonce and sig",
-    lambda name, value: value,  # whoever checks the signature counts what it refuses
+    lambda name, value: value,  # the check of the signature counts refusals
 )
 
 RESUME = Verb(
