@@ -126,7 +126,7 @@ def test_a_strict_governance_leaves_a_topic_closed(tmp_path: Path) -> None:
     ("laws", "why"),
     [
         (governance(DOMAIN, strangers=True), "allows unauthenticated participants"),
-        (governance(DOMAIN, written_by_all=True), f"lets everybody write {TOPIC}"),
+        (governance(DOMAIN, written_by_all=True), f"lets every participant write {TOPIC}"),
         (governance(DOMAIN, kind="NONE"), f"neither signs nor encrypts {TOPIC}"),
         (governance(DOMAIN + 1), f"no rule for domain {DOMAIN}"),
         (governance(DOMAIN).replace("<topic_expression>*", "<topic_expression>rt/odom"), f"no rule for {TOPIC}"),
@@ -142,7 +142,7 @@ def test_first_matching_topic_rule_applies(tmp_path: Path) -> None:
     laws = governance(DOMAIN)
     start, end = laws.index("<topic_rule>"), laws.index("</topic_access_rules>")
     lax = laws[start:end].replace("<topic_expression>*", "<topic_expression>rt/*_arm/*").replace("true", "false")
-    assert "lets everybody write" in str(
+    assert "lets every participant write" in str(
         governance_gap(signed(tmp_path, laws[:start] + lax + laws[start:]), DOMAIN, TOPIC),
     )
     assert governance_gap(signed(tmp_path, laws[:end] + lax + laws[end:]), DOMAIN, TOPIC) is None

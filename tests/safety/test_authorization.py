@@ -101,7 +101,7 @@ def test_an_open_simulation_says_so_once(caplog: pytest.LogCaptureFixture) -> No
     with caplog.at_level(logging.WARNING):
         assert robot.motion(None, "execute") is None
         assert robot.motion(None, "execute") is None
-    assert sum("moves for anybody" in message for message in caplog.messages) == 1
+    assert sum("moves for any caller" in message for message in caplog.messages) == 1
 
 
 def test_a_refused_caller_is_logged_as_self_declared(caplog: pytest.LogCaptureFixture) -> None:

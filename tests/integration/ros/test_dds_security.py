@@ -258,7 +258,7 @@ def test_bridge_without_permission_for_its_command_topic_is_refused(us: dict[str
     ("laws", "open_because"),
     [
         (governance(DOMAIN, strangers=True), "allows unauthenticated participants"),
-        (governance(DOMAIN, written_by_all=True), "lets everybody write"),
+        (governance(DOMAIN, written_by_all=True), "lets every participant write"),
         (governance(DOMAIN, kind="NONE"), "neither signs nor encrypts"),
         (governance(DOMAIN + 1), f"no rule for domain {DOMAIN}"),
     ],
