@@ -17,6 +17,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from strands_robots.device_connect import base_driver
+from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.telemetry import Throttle, paced
 from strands_robots.envelope import error, success
@@ -299,3 +300,22 @@ async def test_a_foreign_robot_that_tells_nothing_has_its_tasks_told_all_the_sam
         done = bench.of("taskComplete")[0]
         assert (done["instruction"], done["steps"], done["state"]) == ("wave", 4, "stopped")
         assert len(bench.of("taskStarted")) == len(bench.of("taskComplete")) == 1
+
+
+async def test_rpc_that_a_subclass_overrides_is_the_one_that_is_called(robot: ToyRobot) -> None:
+    called: list[str] = []
+
+    class Careful(RobotDeviceDriver):
+        @rpc()
+        async def stop(self) -> dict[str, Any]:
+            """Stop, and ring."""
+            called.append("stop")
+            return await self.stop_answer("stop")
+
+    class Heir(Careful):
+        """Adds nothing."""
+
+    for driver in (Careful(robot), Heir(robot)):
+        async with DriverBench(driver) as bench:
+            assert (await bench.call("stop"))["stopped"] is True
+    assert called == ["stop", "stop"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from typing import Any
@@ -119,6 +120,21 @@ async def test_a_policy_that_hangs_does_not_hold_up_the_stop_of_the_others(world
         world.before["stop_policy"] = lambda: waited.append(any(permit.valid for permit in permits))
         assert (await bench.call("stop"))["status"] == "success"
     assert waited == [False, False], "every permit is void before anybody waits for a rollout"
+
+
+async def test_halt_that_hangs_leaves_the_rollouts_their_own_stops(
+    world: ToyWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.5")
+    let_go = threading.Event()
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        await bench.call("execute", instruction="wave")
+        world.before["halt"] = let_go.wait
+        answer = await bench.call("stop")
+        assert not world.rollouts["left"].running
+        assert answer["stopped"] == ["left"]
+        assert "no answer" in answer["reason"]
+        let_go.set()
 
 
 async def test_a_world_torn_down_under_a_stop_is_an_error_and_not_an_exception(

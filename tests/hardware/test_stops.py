@@ -266,6 +266,22 @@ def test_a_halt_reaches_what_stands_in_line_behind_a_loading_policy(
     assert len(robot.device.writes) == written
 
 
+def test_stop_task_reaches_a_run_task_that_waits_behind_a_loading_policy(robot: HardwareRobot, loading: Any) -> None:
+    given = line_of(robot)
+    first, _ = on_a_thread(lambda: robot.start_task("wave"))
+    assert loading.asked.wait(20)
+    assert given.acquire(timeout=20)
+    second, answers = on_a_thread(lambda: robot.run_task("wave", duration=0.5))
+    assert given.acquire(timeout=20), "it waits for the robot"
+    assert robot.stop_task()["stopped"] is True
+    written = len(robot.device.writes)
+    loading.set()
+    first.join(20)
+    second.join(20)
+    assert answers[0]["status"] == "error"
+    assert len(robot.device.writes) == written
+
+
 def test_a_leader_that_stands_in_line_is_stopped_by_its_own_stop(robot: HardwareRobot, loading: Any) -> None:
     robot.attach_teleop(ScriptedLeader(WAVES))
     first, _ = on_a_thread(lambda: robot.start_task("wave"))

@@ -12,11 +12,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
+from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
 from strands_robots.contract import AdaptedRobot
+from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.stop_executor import RESERVE, StopExecutor, stop_executor
+from strands_robots.safety.stop_executor import RESERVE, StopExecutor, stop_executor, through_executor
 from strands_robots.safety.stopping import StopVerdict
 
 
@@ -50,6 +52,7 @@ class DirectWedged(Wedged):
     def unanswered(self, why: str) -> StopVerdict:
         return StopVerdict(not_stopped={"bus": why})
 
+    @through_executor
     def halt(self, reason: str = "") -> StopVerdict:
         return stop_executor().halt(self, "direct", reason)
 
@@ -319,3 +322,70 @@ def test_under_load_every_stop_is_answered_and_followed_by_a_halt() -> None:
         assert stop.result(20) is not None
         eventually(lambda robot=robot, at=at: robot.began[-1] >= at, what="a halt that began after the stop")
     eventually(lambda: not threads("load"))
+
+
+def test_robot_that_is_an_unhashable_dataclass_is_halted(executor: StopExecutor) -> None:
+    @dataclass
+    class Plain:
+        name: str = "plain"
+        halts: int = 0
+
+        def halt(self, reason: str = "") -> StopVerdict:
+            self.halts += 1
+            return StopVerdict((self.name,))
+
+    @dataclass(frozen=True)
+    class Part:
+        world: Plain
+        name: str
+
+        def halt(self, reason: str = "") -> StopVerdict:
+            return self.world.halt(reason)
+
+    world = Plain()
+    assert executor.halt(world, "plain", "test", within=20).stopped
+    assert executor.halt(Part(world, "left"), "left", "test", within=20).stopped
+    assert world.halts == 2
+
+
+def test_overridden_halt_of_a_direct_robot_is_the_one_that_is_called() -> None:
+    braked: list[str] = []
+
+    class Braked(HardwareRobot):
+        def halt(self, reason: str = "") -> StopVerdict:
+            braked.append(reason)
+            return super().halt(reason)
+
+    device = RecordingDevice()
+    robot = Braked(device, "braked")
+    robot.connect()
+    assert stop_executor().halt(robot, "braked", "test", within=20).stopped
+    assert braked == ["test"]
+    robot.cleanup()
+
+
+def test_second_stop_of_a_slow_robot_has_its_own_time(executor: StopExecutor) -> None:
+    begun = threading.Semaphore(0)
+
+    class Slow:
+        def halt(self, reason: str = "") -> StopVerdict:
+            begun.release()
+            time.sleep(0.6)
+            return StopVerdict(("slow",))
+
+    slow = Slow()
+    first = executor.submit(slow, "slow", "first", within=1.0)
+    assert begun.acquire(timeout=20)
+    second = executor.submit(slow, "slow", "second", within=1.0)
+    assert [first.result(20).stopped, second.result(20).stopped] == [True, True]
+
+
+def test_robot_that_cannot_note_its_motion_is_halted_all_the_same(executor: StopExecutor) -> None:
+    class Confused:
+        def halt_ordered(self) -> None:
+            raise RuntimeError("no idea")
+
+        def halt(self, reason: str = "") -> StopVerdict:
+            return StopVerdict(("confused",))
+
+    assert executor.halt(Confused(), "confused", "test", within=20).stopped

@@ -97,3 +97,26 @@ def free(share: Share) -> bool:
         return share.call(lambda: True).result(20)
     except ShareFullError:
         return False
+
+
+def test_call_that_no_thread_can_be_started_for_runs_here_and_gives_its_turn_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    share = Share(1, 1, WorkerPool(idle_s=0.05))
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    for _ in range(3):
+        assert share.call(threading.get_ident).result(0) == threading.get_ident()
+
+
+def test_call_that_ends_in_a_panic_gives_its_turn_back() -> None:
+    share = Share(1, 0, WorkerPool(idle_s=0.05))
+
+    def panic() -> None:
+        raise SystemExit
+
+    for _ in range(3):
+        share.submit(panic)
+        eventually(lambda: free(share))

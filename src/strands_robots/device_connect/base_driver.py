@@ -32,6 +32,7 @@ from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
+from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called
 from strands_robots.utils import shown
@@ -62,7 +63,9 @@ def rpc_method(verb: Verb) -> Callable[..., Any]:
 
     async def method(self: RobotDriver, *values: object, **named: object) -> dict[str, Any]:
         arguments = {**dict(zip(verb.by_name, values, strict=False)), **named}
-        return await self.answer(verb, arguments, get_rpc_source_device())
+        caller = get_rpc_source_device()
+        answer: Envelope = await self.invoke(verb.name, False, **arguments, source_device=caller)
+        return answer
 
     empty = inspect.Parameter.empty
     method.__name__ = verb.name
@@ -114,11 +117,17 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
     verbs: ClassVar[Mapping[str, Verb]] = {}
     """The verbs of the device, by name; each becomes an RPC method."""
 
+    made: ClassVar[Mapping[str, Verb]] = {}
+    """Those of :attr:`verbs` whose RPC method was made from them and not overridden."""
+
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        made = {name: verb for name, verb in cls.made.items() if name not in vars(cls)}
         for name, verb in cls.verbs.items():
-            if name not in vars(cls):
+            if not hasattr(cls, name) or made.get(name, verb) is not verb:
                 setattr(cls, name, rpc_method(verb))
+                made[name] = verb
+        cls.made = made
 
     def __init__(
         self,
@@ -150,21 +159,26 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     # Commands.
 
-    async def invoke(self, function_name: str, /, **params: Any) -> Any:
-        """Call an RPC by name, without spans and log lines that nothing records."""
+    async def invoke(self, function_name: str, observable: bool = True, /, **params: Any) -> Any:
+        """Serve one call of a verb. Never raises for what the caller or the robot did.
+
+        The framework's spans and log lines are left out while nothing takes them.
+
+        Args:
+            function_name: the RPC's name.
+            observable: False in a call that the framework's own wrapper makes.
+            params: arguments, and ``source_device``, the caller's declared name.
+        """
         verb = self.verbs.get(function_name)
-        if verb is None or observed(self):
+        if verb is None or function_name not in self.made or (observable and observed(self)):
             problem = verb and verb.unfit(params.keys() - {"source_device"})
             return error(problem) if problem else await super().invoke(function_name, **params)
-        return await self.answer(verb, params, params.pop("source_device", None))
-
-    async def answer(self, verb: Verb, arguments: Mapping[str, Any], caller: object) -> Envelope:
-        """Serve one call of a verb. Never raises for what the caller or the robot did."""
+        caller = params.pop("source_device", None)
         if verb.kind is Kind.STOP:
-            problem = verb.unfit(arguments)
+            problem = verb.unfit(params)
             return error(problem) if problem else await self.stop_answer(verb.name)
         moves = verb.kind is Kind.MOTION
-        command = Command(verb, arguments, caller, self.pipeline.pending.arrive() if moves else None)
+        command = Command(verb, params, caller, self.pipeline.pending.arrive() if moves else None)
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[Result] = loop.create_future()
         try:
@@ -212,17 +226,14 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         """Return what ``stop`` halts: everything that moves."""
         return self.robot
 
-    def stop_within(self) -> float | None:
-        """Return the seconds in which ``stop`` is answered; None for the halt deadline."""
-        return None
-
     def stop_envelope(self, verdict: StopVerdict) -> Envelope:
         """Return the answer to ``stop`` for a verdict."""
         return verdict.envelope()
 
     async def stop_answer(self, reason: str) -> Envelope:
         """Halt and answer within the halt deadline, for any caller."""
-        halting = stop_executor().submit(self.stop_target(), self.peer_id, reason, within=self.stop_within())
+        target = self.stop_target()
+        halting = stop_executor().submit(target, self.peer_id, reason, within=stop_within(target))
         verdict = await asyncio.wrap_future(halting)
         return enveloped("stop", self.stop_envelope(verdict))
 

@@ -20,7 +20,7 @@ from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
 from strands_robots.serving.verbs import Verb
-from strands_robots.serving.workers import Share, ShareFullError, called
+from strands_robots.serving.workers import Share, called
 from strands_robots.utils import flag
 
 logger = logging.getLogger(__name__)
@@ -123,7 +123,8 @@ class ReachyMiniDriver(RobotDriver):
             told = await called(
                 self._emergencies, lambda: self.reachy.emergency_stop(reason, release=self._release), within
             )
-        except (ShareFullError, TimeoutError):
+        except Exception as exc:  # noqa: BLE001 - the fleet is told, whatever this robot's own stop did
+            logger.critical("%s: its own emergency stop failed: %s: %s", self.peer_id, type(exc).__name__, exc)
             self.robot.gate.revoke()
             told = error(f"the robot did not answer within {within:g} s.")
         level = logging.WARNING if told.get("stopped") else logging.CRITICAL

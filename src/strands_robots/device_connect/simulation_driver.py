@@ -59,10 +59,6 @@ class SimulationDeviceDriver(RobotDriver):
         """Return what ``stop`` halts: the world, and each rollout by its own word."""
         return WorldStop(self.world)
 
-    def stop_within(self) -> float | None:
-        """Return the time of a halt and then of the rollouts' own stops."""
-        return 2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0
-
     def stop_envelope(self, verdict: StopVerdict) -> Envelope:
         """Return the names of what stopped and of what did not."""
         return world_stop_answer(verdict)

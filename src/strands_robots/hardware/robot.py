@@ -14,7 +14,7 @@ from typing import Any, cast
 from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
-from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
 from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
 from strands_robots.policies import create_policy, resolve_provider
@@ -32,7 +32,7 @@ from strands_robots.safety.gate import (
     refusal_envelope,
 )
 from strands_robots.safety.persistence import hardware_key
-from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_executor import stop_executor, through_executor
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.safety.stopping import stop_level as configured_level
 from strands_robots.teleop_mixin import TeleopMixin
@@ -236,24 +236,7 @@ class HardwareRobot(TeleopMixin):
                 and ``n_steps`` (actions after which it ends).
         """
         try:
-            options = {"policy_port": policy_port, **policy}
-            chosen = rollout_options(instruction, duration, options, self.control_hz)
-            name = resolve_provider(policy_provider)
-            # Before the wait for the robot: a stop that comes while this waits, connects or loads is newer.
-            permit = self.gate.permit("start_task")
-            with self._waiting.until_begun(permit), self.starting:
-                permit.check()
-                self._stand_by()
-                self._free()
-                self._reconnect()
-                if not self._body.is_connected:
-                    raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
-                loaded = create_policy(name, **options)
-                permit.check()
-                task = self._task = Rollout(
-                    self._body, loaded, permit=permit, policy_name=name, observers=self.observers, **chosen
-                )
-                task.start()
+            task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
         except REFUSALS as refused:
             return refusal_envelope("start_task", refused)
         return success(
@@ -274,11 +257,7 @@ class HardwareRobot(TeleopMixin):
         **policy: Any,
     ) -> Envelope:
         """Run a task to its end; an error when the policy failed or ran too long."""
-        with self.gate.asked_at(self.gate.asked()), self.starting:
-            started = self.start_task(instruction, policy_provider, duration, policy_port, **policy)
-            task = self._task
-        if is_error(started) or task is None:
-            return started
+        task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
         if not task.join((task.duration or 0.0) + WIND_DOWN_S):
             task.request_stop()
             return error(f"The task was still running {WIND_DOWN_S:g} s after its time.", **self._task_fields())
@@ -310,6 +289,7 @@ class HardwareRobot(TeleopMixin):
         task = self._task
         return f"the task {task.instruction!r}" if task is not None and task.running else ""
 
+    @through_executor
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop every motion and freeze, within ``STRANDS_HALT_DEADLINE_S``.
 
@@ -389,6 +369,26 @@ class HardwareRobot(TeleopMixin):
             task.request_stop()
             ends["task"] = partial(task.ended_by, deadline)
         return ends | self.teleop_stops(deadline)
+
+    def _start(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
+        chosen = rollout_options(instruction, duration, options, self.control_hz)
+        name = resolve_provider(provider)
+        # Before the wait for the robot: a stop that comes while this waits, connects or loads is newer.
+        permit = self.gate.permit("start_task")
+        with self._waiting.until_begun(permit), self.starting:
+            permit.check()
+            self._stand_by()
+            self._free()
+            self._reconnect()
+            if not self._body.is_connected:
+                raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
+            policy = create_policy(name, **options)
+            permit.check()
+            task = self._task = Rollout(
+                self._body, policy, permit=permit, policy_name=name, observers=self.observers, **chosen
+            )
+            task.start()
+            return task
 
     def _reconnect(self) -> None:
         """Connect again before a motion, if the port is back."""

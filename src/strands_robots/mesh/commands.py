@@ -18,7 +18,7 @@ from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
-from strands_robots.serving.robot_verbs import PEER_VERBS, RobotStop, peer_stop_answer, run_to_end
+from strands_robots.serving.robot_verbs import PEER_VERBS, RobotStop, peer_stop_answer, run_to_end, stop_within
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
@@ -209,7 +209,7 @@ class CommandReceiver:
         if target is None:
             self._answer_stops(StopVerdict(), [asker])
         else:
-            self.stops.add(target, name or self._context.peer_id, HALT, asker)
+            self.stops.add(target, name or self._context.peer_id, HALT, asker, within=stop_within(target))
 
     def _answer_stops(self, verdict: StopVerdict, requests: list[StopRequest]) -> None:
         self._after_stop()

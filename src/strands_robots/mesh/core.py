@@ -145,7 +145,7 @@ class Mesh(SensorLoopsMixin):
             context, self._pipeline, before_stop=self._teleop.void, after_stop=self._teleop.reap
         )
         self._safety = FleetSafety(
-            context, self._adapter, self._requester, self._pipeline.shares.resume, robot=robot is not None
+            context, self._adapter, self._requester, self._pipeline.shares.urgent, robot=robot is not None
         )
         self.children: Children | None = None
         if isinstance(robot, WorldRobot):

@@ -23,7 +23,7 @@ from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.reporting import OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
-from strands_robots.safety.stop_executor import NotesMotion, StopExecutor, stop_executor
+from strands_robots.safety.stop_executor import StopExecutor, note_motion, stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, identifier, shown
 
@@ -255,8 +255,7 @@ class SafetyPlane:
         fresh: list[Registered] = []
         for entry in robots:
             if entry.latch.engage(order.epoch, order.source, order.reason):
-                if isinstance(entry.robot, NotesMotion):
-                    entry.robot.halt_ordered()
+                note_motion(entry.robot)
                 for gate in entry.gates:
                     gate.revoke()
                 fresh.append(entry)

@@ -18,8 +18,8 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, InvalidStateError
-from dataclasses import dataclass, field, replace
-from typing import Protocol, cast, runtime_checkable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, body_of
@@ -36,6 +36,9 @@ WAITING_MAX = 4096
 
 STUCK_MAX = 8
 """Threads that one target may keep blocked in its halts before no further thread is given to it."""
+
+ENDING_S = 2.0
+"""Seconds besides the longest deadline after which a halt without an answer is given up: the process is ending."""
 
 DIRECT_SHARE, RETURN_SHARE = 0.9, 0.85
 """Parts of the deadline after which a direct target is answered for, and by which its halt should return.
@@ -67,6 +70,35 @@ class DirectTarget(NotesMotion, Protocol):
 
 
 Target = Haltable | DirectTarget
+H = TypeVar("H", bound=Callable[..., StopVerdict])
+
+
+def through_executor(halt: H) -> H:
+    """Mark a public ``halt`` that only submits its target.
+
+    A subclass that overrides it loses the mark, and is halted by its own.
+    """
+    vars(halt)["through_executor"] = True
+    return halt
+
+
+def note_motion(target: object) -> None:
+    """Let a target note what moves, before its permits are void.
+
+    Never raises: a stop follows.
+    """
+    if isinstance(target, NotesMotion):
+        try:
+            target.halt_ordered()
+        except Exception:
+            logger.exception("A robot could not note what moves before its stop.")
+
+
+def _is_direct(target: object) -> bool:
+    halt = getattr(type(target), "halt", None)
+    return isinstance(target, DirectTarget) and (halt is None or getattr(halt, "through_executor", False))
+
+
 Answered = Callable[[StopVerdict], None]
 
 
@@ -82,6 +114,8 @@ class _Stop:
     since: float
     answered: Answered | None
     direct: bool = False
+    extended: bool = False
+    begun: float | None = None
     submitted: float = field(default_factory=time.monotonic)
     future: Future[StopVerdict] = field(default_factory=Future)
     answering: threading.Lock = field(default_factory=threading.Lock)
@@ -98,6 +132,20 @@ class _Stop:
         if not self._set(verdict) and late is not None:
             late(verdict)
 
+    def extend(self) -> float | None:
+        """Return the later deadline of a stop that waited behind another's halt.
+
+        None where it has had it, or did not wait.
+        """
+        slot = self.slot
+        running = None if slot is None else slot.running
+        if self.direct or self.extended or not running or self.future.done():
+            return None
+        self.extended = True
+        if self.begun is not None:
+            return self.begun + self.within
+        return None if any(each.future.done() for each in running) else self.moment(2.0)
+
     def expire(self) -> bool:
         """Answer for the target that did not; False where it has answered."""
         target = self.target
@@ -105,9 +153,9 @@ class _Stop:
             return False
         why = f"no answer in {self.within:g} s"
         verdict = StopVerdict(not_stopped={self.name: why})
-        if isinstance(target, DirectTarget):
+        if self.direct and isinstance(target, DirectTarget):
             try:
-                verdict = target.unanswered(why)
+                verdict = graded(target.unanswered(why), self.name)
             except Exception:
                 logger.exception("%s could not say what it does while its halt blocks.", self.name)
         return self._set(verdict)
@@ -147,11 +195,14 @@ class _Slot:
         """
         with self.changing:
             if self.running is not done:
-                self.stuck -= done is not None
-                return None
+                self.stuck -= 1
+                if self.running is not None:
+                    return None
+                # It was given up as stuck and is back; what could have no further thread goes on with it.
             taken = []
             while self.waiting:
                 taken.append(self.waiting.popleft())
+                taken[-1].begun = time.monotonic()
             self.running = taken or None
             return self.running
 
@@ -259,12 +310,11 @@ class StopExecutor:
         limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
         slot = self._slot(target, name)
         stop = _Stop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
-        stop.direct = isinstance(target, DirectTarget)
+        stop.direct = _is_direct(target)
         stop.future.set_running_or_notify_cancel()
         if answered is not None:
             stop.future.add_done_callback(lambda future: answered(future.result()))
-        if isinstance(target, NotesMotion):
-            target.halt_ordered()
+        note_motion(target)
         gate = getattr(target, "gate", None)
         if isinstance(gate, MotionGate) and (stop.direct or slot.running is not None):
             # The halt of any other target voids permits itself, after it has seen what moves, unless it has to wait.
@@ -283,7 +333,13 @@ class StopExecutor:
 
     def halt(self, target: Target, name: str, reason: str, *, within: float | None = None) -> StopVerdict:
         """Halt ``target`` and return its verdict, at the latest when ``within`` is over."""
-        return self.submit(target, name, reason, within=within).result()
+        limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
+        halting = self.submit(target, name, reason, within=limit)
+        try:
+            return halting.result(2 * limit + ENDING_S)
+        except TimeoutError:
+            # No thread runs any more while the interpreter ends.
+            return StopVerdict(unknown={name: "the process is ending, and no thread answers"})
 
     def _slot(self, target: Target, name: str) -> _Slot:
         key = _key(target)
@@ -304,7 +360,7 @@ class StopExecutor:
     def _end_with(self, target: Target, key: Hashable, slot: _Slot) -> object:
         """End the thread with the target, or keep a target that cannot be watched."""
         body = body_of(target)
-        if key is body:
+        if isinstance(key, tuple):
             return body
         try:
             end = weakref.finalize(body, _end, self._attached, key, slot, self._reserve)
@@ -343,10 +399,11 @@ class StopExecutor:
             answer: object = None
             try:
                 reason, target = stops[0].reason, stops[0].target
-                if isinstance(target, DirectTarget):
+                # Nested, an overridden halt has called the one of its class.
+                if isinstance(target, DirectTarget) and (stops[0].direct or nested):
                     answer = target.halt_here(reason, max(each.moment(RETURN_SHARE) for each in stops))
                 elif target is not None:
-                    answer = target.halt(reason)
+                    answer = cast(Haltable, target).halt(reason)
             except BaseException as exc:  # noqa: BLE001 - a stop that raises is a robot that may be moving
                 answer = exc
             finally:
@@ -395,10 +452,15 @@ class StopExecutor:
                 self._refill()
             except RuntimeError as exc:
                 logger.critical("No thread can be started for stops of robots that block their halts: %s.", exc)
+            except Exception:
+                logger.critical("The deadlines of stops could not be read.", exc_info=True)
             late = []
             while due and due[0][0] <= time.monotonic():
                 stop = heapq.heappop(due)[2]
-                if stop.expire():
+                later = stop.extend()
+                if later is not None and later > time.monotonic():
+                    heapq.heappush(due, (later, next(self._numbers), stop))
+                elif stop.expire():
                     late.append(stop)
             for stop in late:
                 self._renew(stop)
@@ -446,8 +508,11 @@ def _key(target: Target) -> Hashable:
     """Return an identity that is equal for the same target."""
     body = body_of(target)
     params = getattr(type(body), "__dataclass_params__", None)
-    by_value = params is not None and params.frozen and params.eq
-    return cast(Hashable, body) if by_value else id(body)
+    if params is None or not (params.frozen and params.eq):
+        return id(body)
+    # By the identity of its parts, which may be robots without a hash, and by the value of a name.
+    parts = (getattr(body, each.name) for each in fields(cast(Any, body)))
+    return (type(body), *(part if isinstance(part, str) else id(part) for part in parts))
 
 
 def _end(attached: dict[Hashable, tuple[_Slot, object]], key: Hashable, slot: _Slot, reserve: _Wake) -> None:

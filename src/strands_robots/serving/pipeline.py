@@ -176,9 +176,11 @@ class Pipeline:
 
     def share(self, verb: Verb) -> Share:
         """Return the share of threads for a verb; only motions wait for motions."""
-        if verb.kind is Kind.RESUME:
-            return self.shares.resume
-        return self.shares.motion if verb.kind is Kind.MOTION else self.shares.read
+        if verb.urgent:
+            return self.shares.urgent
+        if verb.kind is Kind.MOTION:
+            return self.shares.lasting if verb.lasts else self.shares.motion
+        return self.shares.read
 
     def serve(self, command: Command, answered: Answered) -> None:
         """Carry ``command`` out on this thread and hand its answer to ``answered``."""
@@ -205,7 +207,8 @@ class Pipeline:
             refusal, result = refused, refused.envelope
         except (ValidationError, MotionRefused) as exc:
             result = exc.envelope if isinstance(exc, MotionRefused) else error(str(exc))
-        except Exception:
+        except BaseException:
+            # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)
             refusal = Refused(RefusalReason.FAILED, f"{verb.name} failed inside the device; its log has the details.")
             result = refusal.envelope
@@ -247,7 +250,8 @@ class Pipeline:
         if self.robot is not None:
             locked = self.robot.gate.lockout(verb.name)
             if locked is not None:
-                raise Refused(RefusalReason.LOCKOUT, str(locked.get("reason", "locked")), envelope=locked)
+                text = str(locked.get("reason", "locked"))
+                raise Refused(RefusalReason.LOCKOUT, text, reason="locked by an emergency stop", envelope=locked)
             # Halted since the command arrived: refused before a grant is spent on it.
             self.robot.gate.permit(verb.name)
         if not self.hardware:

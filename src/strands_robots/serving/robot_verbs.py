@@ -11,9 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from strands_robots import settings
 from strands_robots.bus_access import read_joints
 from strands_robots.contract import RUNNING, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt
 from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
 from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.verbs import (
@@ -103,7 +105,8 @@ class WorldStop:
         except Exception as exc:  # noqa: BLE001 - a world that changes under the stop is halted as a whole below
             unlisted = {"rollouts": explain(exc)}
         # The halt comes first: a policy that hangs would have the others move on while its own stop waits for it.
-        rest = verdict_of(lambda: world.halt(reason), world.tool_name_str)
+        # It has its own deadline, so that one that hangs leaves the rollouts their own stops.
+        rest = stop_executor().halt(world, world.tool_name_str, reason)
         asked = [name for name in running if name not in rest.not_stopped]
         rollouts = halt_each({name: RobotStop(world, name).stop for name in asked})
         return StopVerdict(
@@ -128,6 +131,15 @@ class RobotStop:
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop the robot's rollout and grade the answer."""
         return verdict_of(self.stop, self.name)
+
+
+def stop_within(target: object) -> float | None:
+    """Return the seconds for a stop; None for the halt deadline.
+
+    A stop of a world or of one of its robots waits for the rollouts' own answers besides.
+    """
+    own_word = isinstance(target, WorldStop | RobotStop)
+    return 2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0 if own_word else None
 
 
 def world_stop_answer(verdict: StopVerdict) -> Envelope:
@@ -385,7 +397,7 @@ PEER_VERBS = table(
         _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
         _peer_verb("features", Kind.READ, GET_FEATURES.summary, method="get_features"),
         _peer_verb("state", Kind.READ, GET_STATE.summary, method="get_state"),
-        _peer_verb("execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY),
+        _peer_verb("execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True),
         _peer_verb("start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start),
         _peer_verb(
             "step",
@@ -402,8 +414,9 @@ PEER_VERBS = table(
             Kind.READ,
             "Close the named input stream, or all of them.",
             (_optional("source_peer_id", str, _SOURCE.meaning, identifier), _DEVICE),
+            urgent=True,
         ),
-        _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,)),
+        _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
     ]
 )

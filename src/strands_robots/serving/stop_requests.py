@@ -54,7 +54,7 @@ class StopRequests:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def add(self, target: Haltable, name: str, reason: str, request: Request) -> None:
+    def add(self, target: Haltable, name: str, reason: str, request: Request, *, within: float | None = None) -> None:
         """Have ``target`` halted and ``request`` answered; return at once."""
         with self._lock:
             if request not in self._waiting:
@@ -64,7 +64,7 @@ class StopRequests:
                 self._forget(request[0])
             elif len(self._waiting) > TOTAL_MAX:
                 self._forget(self._by_caller.most_common(1)[0][0])
-        self._executor().submit(target, name, reason).add_done_callback(partial(self._halted, request))
+        self._executor().submit(target, name, reason, within=within).add_done_callback(partial(self._halted, request))
 
     def _halted(self, request: Request, halted: Future[StopVerdict]) -> None:
         with self._lock:

@@ -69,6 +69,8 @@ class Verb:
         critical: False for a motion that no bystander has to fear.
         drops_unknown: arguments that it does not have, or that are None, are left out instead of refused, and an
             optional one that was not given stays out: the mesh's wire has it so.
+        lasts: it is answered when the motion has ended, so it takes no turn from motions that are only started.
+        urgent: it takes energy away, and waits for no read and no motion.
     """
 
     name: str
@@ -80,6 +82,8 @@ class Verb:
     run: Run | None = None
     critical: bool = True
     drops_unknown: bool = False
+    lasts: bool = False
+    urgent: bool = False
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -173,4 +177,5 @@ RESUME = Verb(
     "Free the robot of one emergency stop with an assertion of the operator's key; nothing starts to move by it.",
     (ASSERTION,),
     returns="epoch, locked, epochs",
+    urgent=True,
 )

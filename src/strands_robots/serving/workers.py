@@ -56,15 +56,17 @@ class WorkerPool:
         """Threads without work."""
         return self._idle
 
-    def _work(self, job: Job, share: Share) -> None:
+    def _work(self, job: Job, share: Share, *, stays: bool = True) -> None:
         while True:
             due: Job | None = job
             while due is not None:
                 try:
                     due()
-                except Exception:
+                except BaseException:
                     logger.exception("A robot call failed outside its verb.")
                 due = share._next()
+            if not stays:
+                return
             del job
             with self._lock:
                 self._idle += 1
@@ -121,8 +123,8 @@ class Share:
         try:
             thread.start()
         except RuntimeError:
-            # The interpreter is ending and starts no more threads.
-            job()
+            # No thread can be started; the caller's carries it out.
+            pool._work(job, self, stays=False)
 
     def call(self, call: Callable[[], T]) -> Future[T]:
         """Run ``call`` likewise; the future has what it returns or raises.
@@ -148,12 +150,17 @@ UNBOUNDED = Share(sys.maxsize)
 
 
 class Shares:
-    """Shares of one robot: motions, reads, resumes; no kind waits for another."""
+    """Shares of one robot; none waits for another.
+
+    ``motion`` starts motions, ``lasting`` waits for their end, ``read`` answers, ``urgent`` resumes and takes energy
+    away.
+    """
 
     def __init__(self, pool: WorkerPool = POOL) -> None:
         self.motion = Share(pool=pool)
+        self.lasting = Share(pool=pool)
         self.read = Share(pool=pool)
-        self.resume = Share(pool=pool)
+        self.urgent = Share(pool=pool)
 
 
 _SHARES: WeakKeyDictionary[Any, Shares] = WeakKeyDictionary()
