@@ -185,14 +185,23 @@ def test_permits_are_void_when_the_stop_was_submitted_though_its_halt_waits(
     executor.detach(robot)
 
 
-def test_a_hundred_idle_robots_own_no_threads_and_all_halt(executor: StopExecutor) -> None:
-    before = set(threading.enumerate())
+def test_a_hundred_idle_robots_own_no_threads_and_all_halt() -> None:
+    started: list[threading.Thread] = []
+
+    def start(thread: threading.Thread) -> None:
+        started.append(thread)
+        thread.start()
+
+    def alive() -> int:
+        return sum(thread.is_alive() for thread in started)
+
+    executor = StopExecutor(start)
     executor.prepare()
     robots = [Wedged(times=0) for _ in range(100)]
-    assert len(set(threading.enumerate()) - before) == RESERVE + 1, "and the thread that watches the deadlines"
+    assert alive() == RESERVE + 1, "and the thread that watches the deadlines"
     stops = [executor.submit(each, f"idle-{n}", "stop", within=20) for n, each in enumerate(robots)]
     assert all(stop.result(20).stopped for stop in stops)
-    eventually(lambda: len(set(threading.enumerate()) - before) <= RESERVE + 1)
+    eventually(lambda: alive() <= RESERVE + 1)
 
 
 def test_wedged_robots_never_use_up_the_reserve(executor: StopExecutor) -> None:

@@ -240,7 +240,11 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
     def handle_estop(self, device_id: object, payload: object) -> StopVerdict | None:
         """Act on an emergency stop; return the verdict, None when it does not count."""
         halting = self._begin_estop(device_id, payload)
-        return None if halting is None else halting.result()
+        if halting is None:
+            return None
+        verdict = halting.result()
+        self._log_estop(device_id, verdict)
+        return verdict
 
     @emit(labels={"safety": "critical"})
     async def emergencyStop(self, reason: str = "") -> None:
@@ -259,8 +263,10 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         """Act on an emergency stop of the runtime, in the safety plane if registered."""
         if device_id != self.peer_id and self.registration is not None:
             self.registration.runtime_estop(device_id, payload)
-        else:
-            self._begin_estop(device_id, payload)
+            return
+        halting = self._begin_estop(device_id, payload)
+        if halting is not None:
+            halting.add_done_callback(lambda halted: self._log_estop(device_id, halted.result()))
 
     def _begin_estop(self, device_id: object, payload: object) -> Future[StopVerdict] | None:
         if device_id == self.peer_id:
@@ -270,9 +276,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             logger.warning("%s: emergency stop ignored: %s.", self.peer_id, refusal)
             return None
         why = payload.get("reason", "") if isinstance(payload, Mapping) else ""
-        halting = stop_executor().submit(self.robot, self.peer_id, f"emergency stop of {device_id}: {shown(why)}")
-        halting.add_done_callback(lambda halted: self._log_estop(device_id, halted.result()))
-        return halting
+        return stop_executor().submit(self.robot, self.peer_id, f"emergency stop of {device_id}: {shown(why)}")
 
     def _log_estop(self, device_id: object, verdict: StopVerdict) -> None:
         answer = verdict.envelope()

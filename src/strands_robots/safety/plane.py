@@ -59,8 +59,9 @@ class Registered:
         self._plane = plane
         self._ready, self._readying = False, threading.Lock()
         # A world that has not moved yet shares the threads of the reserve: a hundred of them need no hundred threads.
-        plane.executor.prepare()
-        if not isinstance(robot, WorldRobot):
+        if isinstance(robot, WorldRobot):
+            plane.executor.prepare()
+        else:
             self._stand_by()
         self._unwatch = robot.gate.watch(self._stand_by)
 

@@ -237,6 +237,7 @@ class StopExecutor:
         self._creating, self._attaching, self._counting = threading.Lock(), threading.Lock(), threading.Lock()
         self._reserve: _Wake = queue.SimpleQueue()
         self._idle = 0
+        self._reserved = False
         self._watched: queue.SimpleQueue[_Stop | None] = queue.SimpleQueue()
         self._watcher: threading.Thread | None = None
         self._here = threading.local()
@@ -249,7 +250,7 @@ class StopExecutor:
             RuntimeError: no thread can be started.
         """
         with self._attaching:
-            self._prepare()
+            self._watch_deadlines()
             slot, key = self._slot(target, name), _key(target)
             if slot.owners == 0:
                 slot.wake, slot.thread = self._ready_thread(name)
@@ -277,13 +278,23 @@ class StopExecutor:
             slot.wake, slot.thread = self._reserve, None
             self._reserve.put(slot)
             inbox.put(None)
+            if slot.running is not None or slot.waiting:
+                # What waits behind a halt under way may fall to the reserve, which the watcher fills.
+                self._reserved = True
+                self._watched.put(None)
         if wait and thread is not None and thread is not threading.current_thread():
             thread.join(wait)
 
     def prepare(self) -> None:
         """Make the reserve ready for targets that are not attached."""
         with self._attaching:
-            self._prepare()
+            self._watch_deadlines()
+            self._reserved = True
+            try:
+                self._refill()
+            except RuntimeError:
+                self._reserved = self._idle > 0
+                raise
 
     def submit(
         self,
@@ -324,11 +335,14 @@ class StopExecutor:
             self._serve(slot, [stop])
             return stop.future
         slot.waiting.append(stop)
-        if self._watcher is None and not self._prepared(name):
+        if not (self._reserved or slot.owners) and not self._prepared(name):
             self._serve(slot)
             return stop.future
         slot.wake.put(slot)
         self._watched.put(stop)
+        if not (self._reserved or slot.owners) and not self._prepared(name):
+            # The target was detached meanwhile, and its thread may have ended.
+            self._serve(slot)
         return stop.future
 
     def halt(self, target: Target, name: str, reason: str, *, within: float | None = None) -> StopVerdict:
@@ -421,9 +435,8 @@ class StopExecutor:
             return False
         return True
 
-    def _prepare(self) -> None:
+    def _watch_deadlines(self) -> None:
         if self._watcher is None:
-            self._refill()
             watcher = threading.Thread(target=self._watch, name="halt-deadlines", daemon=True)
             self._start_thread(watcher)
             self._watcher = watcher
@@ -432,7 +445,7 @@ class StopExecutor:
         while True:
             # Counted first: a thread that has served a target meanwhile must not stay as one too many.
             with self._counting:
-                if self._idle >= RESERVE:
+                if self._idle >= RESERVE or not self._reserved:
                     return
                 self._idle += 1
             name = f"halt-reserve-{next(self._numbers)}"
