@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Protocol, TypeGuard, TypeVar, cast, runtime_checkable
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, body_of
@@ -36,6 +36,9 @@ WAITING_MAX = 4096
 
 STUCK_MAX = 8
 """Threads that one target may keep blocked in its halts before no further thread is given to it."""
+
+WATCH_S = 0.05
+"""Seconds between two looks for new stops; a deadline that is further away is kept to the millisecond."""
 
 ENDING_S = 2.0
 """Seconds besides the longest deadline after which a halt without an answer is given up: the process is ending."""
@@ -87,16 +90,19 @@ def note_motion(target: object) -> None:
 
     Never raises: a stop follows.
     """
-    if isinstance(target, NotesMotion):
+    # A check of a protocol costs more than a stop may.
+    note = getattr(target, "halt_ordered", None)
+    if note is not None:
         try:
-            target.halt_ordered()
+            note()
         except Exception:
             logger.exception("A robot could not note what moves before its stop.")
 
 
-def _is_direct(target: object) -> bool:
-    halt = getattr(type(target), "halt", None)
-    return isinstance(target, DirectTarget) and (halt is None or getattr(halt, "through_executor", False))
+def _is_direct(target: object) -> TypeGuard[DirectTarget]:
+    kind = type(target)
+    halt = getattr(kind, "halt", None)
+    return hasattr(kind, "halt_here") and (halt is None or getattr(halt, "through_executor", False))
 
 
 Answered = Callable[[StopVerdict], None]
@@ -153,7 +159,7 @@ class _Stop:
             return False
         why = f"no answer in {self.within:g} s"
         verdict = StopVerdict(not_stopped={self.name: why})
-        if self.direct and isinstance(target, DirectTarget):
+        if _is_direct(target):
             try:
                 verdict = graded(target.unanswered(why), self.name)
             except Exception:
@@ -238,7 +244,8 @@ class StopExecutor:
         self._reserve: _Wake = queue.SimpleQueue()
         self._idle = 0
         self._reserved = False
-        self._watched: queue.SimpleQueue[_Stop | None] = queue.SimpleQueue()
+        self._watched: deque[_Stop] = deque()
+        self._watch_now: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._watcher: threading.Thread | None = None
         self._here = threading.local()
         self._numbers = itertools.count()
@@ -281,7 +288,7 @@ class StopExecutor:
             if slot.running is not None or slot.waiting:
                 # What waits behind a halt under way may fall to the reserve, which the watcher fills.
                 self._reserved = True
-                self._watched.put(None)
+                self._watch_now.put(None)
         if wait and thread is not None and thread is not threading.current_thread():
             thread.join(wait)
 
@@ -339,7 +346,8 @@ class StopExecutor:
             self._serve(slot)
             return stop.future
         slot.wake.put(slot)
-        self._watched.put(stop)
+        # Not woken for it: the watcher looks often enough, and a thread that wakes takes time from the stop's own.
+        self._watched.append(stop)
         if not (self._reserved or slot.owners) and not self._prepared(name):
             # The target was detached meanwhile, and its thread may have ended.
             self._serve(slot)
@@ -395,7 +403,7 @@ class StopExecutor:
             slot = self._reserve.get()
             with self._counting:
                 self._idle -= 1
-            self._watched.put(None)
+            self._watch_now.put(None)
             if slot is not None:
                 self._serve(slot)
             del slot
@@ -414,7 +422,7 @@ class StopExecutor:
             try:
                 reason, target = stops[0].reason, stops[0].target
                 # Nested, an overridden halt has called the one of its class.
-                if isinstance(target, DirectTarget) and (stops[0].direct or nested):
+                if _is_direct(target) or (nested and isinstance(target, DirectTarget)):
                     answer = target.halt_here(reason, max(each.moment(RETURN_SHARE) for each in stops))
                 elif target is not None:
                     answer = cast(Haltable, target).halt(reason)
@@ -480,14 +488,13 @@ class StopExecutor:
 
     def _take_new(self, due: list[tuple[float, int, _Stop]]) -> None:
         """Wait for a stop, a taken thread of the reserve or the next deadline."""
-        timeout = max(0.0, due[0][0] - time.monotonic()) if due else None
+        timeout = WATCH_S if not due else min(WATCH_S, max(0.0, due[0][0] - time.monotonic()))
         with contextlib.suppress(queue.Empty):
-            stop = self._watched.get(timeout=timeout)
-            for _ in range(self._watched.qsize() + 1):
-                if stop is not None:
-                    at = stop.moment(DIRECT_SHARE if stop.direct else 1.0)
-                    heapq.heappush(due, (at, next(self._numbers), stop))
-                stop = self._watched.get_nowait()
+            self._watch_now.get(timeout=timeout)
+        while self._watched:
+            stop = self._watched.popleft()
+            at = stop.moment(DIRECT_SHARE if stop.direct else 1.0)
+            heapq.heappush(due, (at, next(self._numbers), stop))
 
     def _renew(self, stop: _Stop) -> None:
         """Let a fresh thread take over what waits behind a halt that missed its deadline."""
