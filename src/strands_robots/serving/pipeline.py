@@ -253,7 +253,9 @@ class Pipeline:
                 text = str(locked.get("reason", "locked"))
                 raise Refused(RefusalReason.LOCKOUT, text, reason="locked by an emergency stop", envelope=locked)
             # Halted since the command arrived: refused before a grant is spent on it.
-            self.robot.gate.permit(verb.name)
+            late = self.robot.gate.refusal(verb.name)
+            if late is not None:
+                raise MotionRefused(late)
         if not self.hardware:
             return Claim()
         claim = self.approval.claim(verb.name, self.peer_id())
