@@ -7,7 +7,6 @@ answer into an envelope that JSON can carry. Robot calls run on threads, never o
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import inspect
 import logging
 from collections.abc import Callable, Mapping
@@ -34,7 +33,7 @@ from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
-from strands_robots.serving.workers import ShareFullError, called
+from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -84,16 +83,6 @@ def rpc_method(verb: Verb) -> Callable[..., Any]:
     itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     vars(method)["__signature__"] = inspect.Signature([itself, *parameters], return_annotation=dict[str, Any])
     return rpc(labels=_labels(verb))(method)
-
-
-def _hand_over(loop: asyncio.AbstractEventLoop, answered: asyncio.Future[Result], result: Result) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop closed while the robot was still busy
-        loop.call_soon_threadsafe(_settle, answered, result)
-
-
-def _settle(answered: asyncio.Future[Result], result: Result) -> None:
-    if not answered.done():
-        answered.set_result(result)
 
 
 def enveloped(verb: str, answer: object) -> Envelope:
@@ -179,13 +168,12 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             return error(problem) if problem else await self.stop_answer(verb.name)
         moves = verb.kind is Kind.MOTION
         command = Command(verb, params, caller, self.pipeline.pending.arrive() if moves else None)
-        loop = asyncio.get_running_loop()
-        answered: asyncio.Future[Result] = loop.create_future()
+        answered, hand_over = loop_future()
         try:
-            self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, partial(_hand_over, loop, answered)))
+            self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
             async with asyncio.timeout(START_DEADLINE_S if moves else READ_DEADLINE_S):
-                result = await answered
+                result: Result = await answered
         except ShareFullError:
             result = busy(command)
         except TimeoutError:

@@ -175,27 +175,20 @@ def shares_of(robot: object) -> Shares:
         return Shares()
 
 
-async def awaited(start: Callable[[Callable[[T], None]], None], within: float) -> T:
-    """Return the value that ``start`` gives to its callback, from any thread.
-
-    Raises:
-        TimeoutError: nothing came within ``within`` seconds.
-    """
+def loop_future() -> tuple[asyncio.Future[Any], Callable[[Any], None]]:
+    """Return a future of the running loop, and what sets it from any thread."""
     loop = asyncio.get_running_loop()
-    answer: asyncio.Future[T] = loop.create_future()
+    future: asyncio.Future[Any] = loop.create_future()
 
-    def settle(value: T) -> None:
-        if not answer.done():
-            answer.set_result(value)
+    def settle(value: object) -> None:
+        if not future.done():
+            future.set_result(value)
 
-    def hand_over(value: T) -> None:
+    def hand_over(value: object) -> None:
         with contextlib.suppress(RuntimeError):  # the loop closed while the robot was still busy
             loop.call_soon_threadsafe(settle, value)
 
-    start(hand_over)
-    # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
-    async with asyncio.timeout(within):
-        return await answer
+    return future, hand_over
 
 
 async def called(share: Share, call: Callable[[], T], within: float) -> T:
@@ -205,11 +198,12 @@ async def called(share: Share, call: Callable[[], T], within: float) -> T:
         ShareFullError: the share is full.
         TimeoutError: no answer within ``within`` seconds; the call goes on and keeps its turn until it returns.
     """
-
-    def start(hand_over: Callable[[Future[T]], None]) -> None:
-        share.call(call).add_done_callback(hand_over)
-
-    return (await awaited(start, within)).result()
+    answered, hand_over = loop_future()
+    share.call(call).add_done_callback(hand_over)
+    # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
+    async with asyncio.timeout(within):
+        done: Future[T] = await answered
+    return done.result()
 
 
 def _settle(done: Future[T], call: Callable[[], T]) -> None:
