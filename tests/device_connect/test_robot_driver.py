@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from strands_robots.device_connect import base_driver
 from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
-from strands_robots.device_connect.telemetry import Throttle, paced
+from strands_robots.device_connect.telemetry import paced, step_limiter
 from strands_robots.envelope import error, success
 from strands_robots.safety.approval import Grants, state_dir
 from strands_robots.utils import ValidationError
@@ -191,8 +191,8 @@ async def test_a_faster_loop_is_told_at_50_hz(robot: ToyRobot) -> None:
         await bench.call("execute", instruction="wave", duration=1.0)
         await bench.until(lambda: bench.of("taskComplete"))
         clock = iter(robot.writes)
-        throttle = Throttle(50.0, lambda: next(clock))
-        passing = sum(throttle.passes("toy") for _ in robot.writes)
+        limiter = step_limiter(50.0, lambda: next(clock))
+        passing = sum(limiter.admit("toy") for _ in robot.writes)
         # Between a step's own time and its telling the machine may put a pause.
         assert abs(len(bench.of("streamStep")) - passing) <= 3
 

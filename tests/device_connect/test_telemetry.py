@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.device_connect import telemetry
-from strands_robots.device_connect.telemetry import CATCH_UP, RolloutPump, Throttle, numbers, paced
+from strands_robots.device_connect.telemetry import CATCH_UP, RolloutPump, numbers, paced, step_limiter
 
 
 class Clock:
@@ -30,36 +30,36 @@ def event(kind: str, step: int = 0, robot: str = "arm") -> RolloutEvent:
 
 
 @given(st.lists(st.floats(0, 0.5), max_size=200), st.floats(1, 200))
-def test_throttle_passes_the_rate_and_one_catch_up(gaps: list[float], hz: float) -> None:
+def test_step_limiter_admits_the_rate_and_one_catch_up(gaps: list[float], hz: float) -> None:
     clock = Clock()
-    throttle = Throttle(hz, clock)
+    limiter = step_limiter(hz, clock)
     passed = 0
     for gap in gaps:
         clock.now += gap
-        passed += throttle.passes("arm")
+        passed += limiter.admit("arm")
     assert passed <= CATCH_UP + clock.now * hz + 1
 
 
 def test_steady_loop_that_was_held_up_loses_no_step() -> None:
     clock = Clock()
-    throttle = Throttle(50.0, clock)
+    limiter = step_limiter(50.0, clock)
     passed = 0
     for step in range(1000):
         due = step / 50
         # Held up 0.3 s every 2 s, then catching up at once.
         held = due >= 1 and due % 2 < 0.3
         clock.now = max(clock.now, due if not held else due - due % 2 + 0.3)
-        passed += throttle.passes("arm")
+        passed += limiter.admit("arm")
     assert passed == 1000
 
 
 def test_fast_loop_passes_at_the_rate_from_its_start() -> None:
     clock = Clock()
-    throttle = Throttle(50.0, clock)
+    limiter = step_limiter(50.0, clock)
     passed = 0
     for step in range(1000):
         clock.now = step / 1000
-        passed += throttle.passes("arm")
+        passed += limiter.admit("arm")
     assert 50 <= passed <= 53
 
 

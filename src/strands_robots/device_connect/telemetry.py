@@ -12,6 +12,7 @@ from collections.abc import Awaitable, Callable, Mapping
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.policies import base
+from strands_robots.serving.rate_limiter import RateLimiter
 
 logger = logging.getLogger(__name__)
 
@@ -34,26 +35,9 @@ def numbers(values: object) -> dict[str, float]:
     )
 
 
-class Throttle:
-    """At most ``hz`` passes a second for each key, :data:`CATCH_UP` after a pause."""
-
-    def __init__(self, hz: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self._hz = hz
-        self._clock = clock
-        self._tokens: dict[str, tuple[float, float]] = {}
-
-    def passes(self, key: str) -> bool:
-        """Return True when one more may pass now."""
-        now = self._clock()
-        tokens, since = self._tokens.get(key, (CATCH_UP_AT_START, now))
-        tokens = min(CATCH_UP, tokens + (now - since) * self._hz)
-        passing = tokens >= 1.0
-        self._tokens[key] = (tokens - 1.0 if passing else tokens, now)
-        return passing
-
-    def forget(self, key: str) -> None:
-        """Start over with ``key``."""
-        self._tokens.pop(key, None)
+def step_limiter(hz: float, clock: Callable[[], float] = time.monotonic) -> RateLimiter:
+    """Return the limit on the steps of each robot, ``hz`` a second."""
+    return RateLimiter(hz, burst=CATCH_UP, at_start=CATCH_UP_AT_START, clock=clock)
 
 
 class RolloutPump:
@@ -66,7 +50,7 @@ class RolloutPump:
 
     def __init__(self, deliver: Callable[[RolloutEvent], Awaitable[None]], stream_hz: float) -> None:
         self._deliver = deliver
-        self._throttle = Throttle(stream_hz)
+        self._limiter = step_limiter(stream_hz)
         self._waiting: deque[RolloutEvent] = deque()
         self._lock = threading.Lock()
         self._loop = asyncio.get_running_loop()
@@ -77,13 +61,13 @@ class RolloutPump:
         """Queue an event. Control thread; returns at once and never raises."""
         with self._lock:
             if event.kind == "step":
-                if not self._throttle.passes(event.robot):
+                if not self._limiter.admit(event.robot):
                     return
                 if len(self._waiting) >= PENDING_MAX:
                     self._dropped += 1
                     return
             elif event.kind == "finished":
-                self._throttle.forget(event.robot)
+                self._limiter.forget(event.robot)
             self._waiting.append(event)
         with contextlib.suppress(RuntimeError):  # the loop closed before the robot noticed
             self._loop.call_soon_threadsafe(self._some.set)

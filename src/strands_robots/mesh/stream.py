@@ -11,9 +11,9 @@ from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
-from strands_robots.mesh.throttle import RateLimiter
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
+from strands_robots.serving.rate_limiter import RateLimiter
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class StepPublisher:
         self._robot = robot
         self._hz = hz
         self._handed_in = RateLimiter(hz)
-        self._limits: dict[str, RateLimiter] = {}
+        self._rollouts = RateLimiter(hz)
         self._executor = BoundedExecutor(f"{context.peer_id}-stream", 1, WAITING, drop_oldest=True)
         self._unsubscribe: Unsubscribe | None = None
         self._several = False
@@ -66,9 +66,8 @@ class StepPublisher:
             return
         if event.kind == "started":
             self._several = isinstance(self._robot, WorldRobot) and len(self._robot.list_robots()) > 1
-            self._limits[event.robot] = RateLimiter(self._hz)
-        limit = self._limits.setdefault(event.robot, RateLimiter(self._hz))
-        if event.kind == "step" and self._context.running() and limit.admit():
+            self._rollouts.forget(event.robot)
+        if event.kind == "step" and self._context.running() and self._rollouts.admit(event.robot):
             stamp, prefix = self._context.clock(), f"{event.robot}/" if self._several else ""
 
             def publish() -> None:

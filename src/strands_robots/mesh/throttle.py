@@ -1,9 +1,8 @@
-"""Bounds on repetition: audit events, log lines, messages above a rate, replays."""
+"""Bounds on repetition: audit events, log lines, replays."""
 
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Hashable
@@ -98,24 +97,6 @@ class TroubleLog:
         if kind and kind != self._kinds.get(subject):
             self._logger.log(level, message, *args)
         self._kinds[subject] = kind
-
-
-class RateLimiter:
-    """Admits at most ``hz`` a second; 0 or less admits none."""
-
-    def __init__(self, hz: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self._period = 1.0 / hz if hz > 0 else math.inf
-        self._clock = clock
-        self._due = -math.inf
-
-    def admit(self) -> bool:
-        """Return True when the next one may go now."""
-        now = self._clock()
-        if math.isinf(self._period) or now < self._due:
-            return False
-        # Half a period from now at least: a source at just this rate loses nothing, a burst is thinned out.
-        self._due = max(self._due + self._period, now + self._period / 2)
-        return True
 
 
 class RecentKeys:
