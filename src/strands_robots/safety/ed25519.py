@@ -86,6 +86,15 @@ def _verifier(key: bytes) -> Callable[[bytes, bytes], bool]:
     return verify
 
 
+def signing_key(seed: bytes) -> Any:
+    """Return the private key of a 32-byte seed."""
+    try:
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey  # noqa: PLC0415 - optional, loaded when used
+    except ImportError:
+        raise missing_extra("Using a key", "device-connect") from None
+    return Ed25519PrivateKey.from_private_bytes(seed)
+
+
 def public_half(signing_key: Any) -> bytes:
     """The raw 32 bytes that others check this key's signatures with."""
     raw: bytes = signing_key.public_key().public_bytes_raw()
