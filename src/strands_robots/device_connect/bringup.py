@@ -315,7 +315,7 @@ async def refuse_duplicate(name: str, link: LinkConfig, messaging: Any) -> None:
     Raises:
         DuplicateDeviceError: a device with this id answered a probe. One that crashed does not answer.
     """
-    taken = await (_announced(name, link, messaging) if link.authenticated else _answers(name, link, messaging))
+    taken = await (_announced(name, link, messaging) if link.identified else _answers(name, link, messaging))
     if taken:
         raise DuplicateDeviceError(
             f"A device {name!r} is live in tenant {link.tenant!r} and answered; give this one another peer_id."
@@ -325,7 +325,7 @@ async def refuse_duplicate(name: str, link: LinkConfig, messaging: Any) -> None:
 async def _announced(name: str, link: LinkConfig, messaging: Any) -> bool:
     """Return True when a device of this id announces itself on a probe.
 
-    On an authenticated link access rules let no device call another one, or itself.
+    Where devices prove who they are, access rules let no device call another one, or itself.
     """
     present = asyncio.Event()
 

@@ -99,8 +99,9 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
     opted_in = settings.boolean("DEVICE_CONNECT_ALLOW_INSECURE") if allow_insecure is None else allow_insecure
     if opted_in:
         logger.warning(
-            "INSECURE TRANSPORT: no peer is authenticated and nothing is encrypted. Anyone who reaches %s can drive "
+            "INSECURE TRANSPORT: no peer is authenticated and %s. Anyone who reaches %s can drive "
             "and read this robot. Not for production.",
+            "only the server proves who it is" if link.encrypted else "nothing is encrypted",
             ", ".join(link.connect) or ("the local network" if link.uses_multicast else "this machine"),
         )
         return True
@@ -113,6 +114,7 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
     raise ValidationError(
         "This transport is not authenticated: either opt in with allow_insecure=True "
         "(or DEVICE_CONNECT_ALLOW_INSECURE=true), or give certificates (MESSAGING_TLS_CA_FILE, "
-        "MESSAGING_TLS_CERT_FILE, MESSAGING_TLS_KEY_FILE) or credentials (MESSAGING_CREDENTIALS_FILE).",
+        "MESSAGING_TLS_CERT_FILE, MESSAGING_TLS_KEY_FILE) or, to a NATS server, TLS (tls://host:port) and "
+        "credentials (MESSAGING_CREDENTIALS_FILE).",
         "INSECURE_TRANSPORT",
     )

@@ -121,10 +121,21 @@ def test_link_that_cannot_work_is_refused(fields):
         LinkConfig(**fields)
 
 
-def test_nats_link_is_authenticated_by_what_its_server_checks():
+def test_nats_link_is_authenticated_by_tls_and_credentials_together():
     assert not LinkConfig("nats", connect=("nats://h:4222",)).authenticated
-    assert LinkConfig("nats", connect=("nats://user:word@h:4222",)).authenticated
-    assert LinkConfig("nats", jwt="x", nkey_seed="y").authenticated
+    assert not LinkConfig("nats", connect=("nats://user:word@h:4222",)).authenticated
+    assert not LinkConfig("nats", jwt="x", nkey_seed="y").authenticated
+    assert not LinkConfig("nats", connect=("tls://h:4222",)).authenticated
+    assert not LinkConfig("nats", connect=("tls://user:word@h:4222", "tls://other:4222")).authenticated
+    assert LinkConfig("nats", connect=("tls://user:word@h:4222",)).authenticated
+    assert LinkConfig("nats", connect=("nats://user:word@h:4222",), ca="ca.pem").authenticated
+    assert LinkConfig("nats", connect=("wss://h:443",), jwt="x", nkey_seed="y").authenticated
+    assert LinkConfig("nats", ca="ca.pem", cert="c.pem", key="k.pem").authenticated
+
+
+def test_name_of_a_server_is_checked_from_the_environment_too(monkeypatch):
+    monkeypatch.setenv("NATS_URL", "tls://h:4222")
+    assert link_from_environment().verify_hostname
 
 
 def test_repr_hides_secrets():

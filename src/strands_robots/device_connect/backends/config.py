@@ -52,7 +52,9 @@ class LinkConfig:
         listen: Zenoh peers only: endpoints to listen on.
         meet_port: Zenoh peers only: the loopback port where local peers meet; see ``loopback_config``.
         multicast: Zenoh peers only: find peers by multicast. None: only where no endpoint is given.
-        ca, cert, key: PEM text, or the path of a PEM file. With all three a link is mutually authenticated.
+        ca, cert, key: PEM text, or the path of a PEM file. With ``ca``, or a NATS URL ``tls://`` or ``wss://``, a link
+            speaks TLS alone; ``ca`` takes the place of the system's authorities. With all three it is mutually
+            authenticated.
         verify_hostname: check the server's name in its certificate.
         jwt, nkey_seed: NATS credentials.
         tenant: links of two tenants never share a session.
@@ -98,11 +100,23 @@ class LinkConfig:
         return self.transport == "zenoh" and (self.mode == "peer" or (self.mode == "auto" and not self.connect))
 
     @property
-    def authenticated(self) -> bool:
-        """True with mutual TLS, or with credentials that a NATS server checks."""
+    def encrypted(self) -> bool:
+        """True when nothing is sent without TLS."""
         if self.transport == "nats":
-            return bool(self.jwt or self.cert or any("@" in url for url in self.connect))
-        return bool(self.ca and self.cert)
+            return bool(self.ca) or any(urlsplit(url).scheme in ("tls", "wss") for url in self.connect)
+        return bool(self.ca)
+
+    @property
+    def identified(self) -> bool:
+        """True when this side has a certificate, or credentials for a NATS server."""
+        if self.transport == "nats" and not self.cert:
+            return bool(self.jwt) or (bool(self.connect) and all(urlsplit(url).username for url in self.connect))
+        return bool(self.cert)
+
+    @property
+    def authenticated(self) -> bool:
+        """True when both sides prove who they are."""
+        return self.encrypted and self.identified
 
     @property
     def loopback_only(self) -> bool:
@@ -283,8 +297,6 @@ def link_from_environment(tenant: str = "default", transport: str | None = None)
         multicast=True if backend == "zenoh" and not urls else None,
         jwt=section.get("jwt", ""),
         nkey_seed=section.get("nkey_seed", ""),
-        # The framework does not check the name in a NATS server's certificate; many of those carry none.
-        verify_hostname=backend == "zenoh",
         tenant=tenant if tenant != "default" else str(credentials.get("tenant", tenant)),
         ca=tls["ca"],
         cert=tls["cert"],

@@ -30,6 +30,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from . import jsonrpc
+from ._compat import EncryptedClient
 from .base import Backend, NoResponderError, Undo
 from .config import LinkConfig
 from .dispatch import REPLY_SUBJECT, CommandServer, OrderedFeed, Throttled
@@ -71,7 +72,8 @@ class NatsBackend(Backend):
         if link.jwt:
             options["user_jwt_cb"] = lambda: bytearray(link.jwt.encode())
             options["signature_cb"] = (credentials or {}).get("signature_cb") or partial(_signed, link.nkey_seed)
-        if link.ca:
+        if link.encrypted:
+            self._client = EncryptedClient()
             options["tls"] = _tls_context(link)
         refused: list[str] = []
         failed: list[str] = []
@@ -237,11 +239,9 @@ def _signed(seed: str, nonce: str | bytes) -> bytes:
 
 
 def _tls_context(link: LinkConfig) -> ssl.SSLContext:
-    context = ssl.create_default_context(ssl.Purpose.SERVER_AUTH, cafile=None)
-    if link.ca.lstrip().startswith("-----BEGIN"):
-        context.load_verify_locations(cadata=link.ca)
-    else:
-        context.load_verify_locations(cafile=link.ca)
+    """Return a context that trusts the stated authority alone, else the system's."""
+    stated = {"cadata" if link.ca.lstrip().startswith("-----BEGIN") else "cafile": link.ca} if link.ca else {}
+    context = ssl.create_default_context(**stated)  # type: ignore[arg-type]  # both keys take text
     context.check_hostname = link.verify_hostname
     if link.cert:
         _load_identity(context, link.cert, link.key)
