@@ -24,6 +24,7 @@ PARTS = {
     "rpc": "Calls and events over Zenoh and NATS",
     "device": "Bring-up, import and fleets in one process",
     "simulation": "Physics",
+    "reach": "Arms that reach and grasp",
     "safety": "From the controller's call to the last write",
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",

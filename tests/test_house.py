@@ -23,7 +23,7 @@ LINES_MAX = 700
 FLOORS: list[set[str]] = [
     {"envelope", "errors", "settings", "utils", "agent_tool", "_mesh_switch"},
     {"safety", "audit", "contract"},
-    {"policies", "teleop_mixin", "teleoperators", "recording"},
+    {"kinematics", "policies", "teleop_mixin", "teleoperators", "recording"},
     {
         "hardware",
         "simulation",

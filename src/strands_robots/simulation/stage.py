@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from strands_robots.kinematics.chain import tip_site
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
 from strands_robots.utils import ValidationError
@@ -233,7 +234,7 @@ def _map_robot(model: Any, name: str, label: str) -> RobotParts:
         bounds = round(float(low), 12), round(float(high), 12)
         actuators[key] = Actuator(key, index, *bounds, _is_servo(model, index))
     cameras = tuple(n for n in (model.camera(i).name for i in range(model.ncam)) if n.startswith(prefix))
-    return RobotParts(name, label, joints, actuators, cameras, _tip(model, prefix), _root(model, prefix), base)
+    return RobotParts(name, label, joints, actuators, cameras, tip_site(model, prefix), _root(model, prefix), base)
 
 
 def _is_servo(model: Any, index: int) -> bool:
@@ -244,13 +245,6 @@ def _is_servo(model: Any, index: int) -> bool:
 def _root(model: Any, prefix: str) -> str:
     """Return the robot's first body."""
     return next((n for n in (str(model.body(i).name) for i in range(model.nbody)) if n.startswith(prefix)), "world")
-
-
-def _tip(model: Any, prefix: str) -> str:
-    """Return the site of the hand: gripper_tip, else the last one, else none."""
-    sites = [n for n in (str(model.site(i).name) for i in range(model.nsite)) if n.startswith(prefix)]
-    named = [n for n in sites if n.endswith("gripper_tip")]
-    return (named or sites[-1:] or [""])[0]
 
 
 def _furnish(spec: Any, *, floor: bool, lights: bool) -> None:

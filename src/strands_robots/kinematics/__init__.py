@@ -1,0 +1,1 @@
+"""Arms from their MJCF: tip poses, joints for a pose, contacts, checked paths."""

@@ -1,0 +1,188 @@
+"""Paths of an arm to joints, to a point and along a line, checked first.
+
+Every method raises :class:`~strands_robots.utils.ValidationError`, which names the joint, the contact or the nearest
+reachable point. Positions are metres in the base frame, angles of the caller degrees, joints radians of the model.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from strands_robots.kinematics.chain import ArmJoint, Chain, Floats
+from strands_robots.kinematics.contacts import ContactCheck, new_contact
+from strands_robots.kinematics.inverse import TipGoal, nearest, rolled, solve
+from strands_robots.utils import ValidationError
+
+APPROACH_STEP_DEG = 5.0
+APPROACH_LOWEST_DEG = -45.0
+"""Approaches are tried from straight down in these steps to this one, which points up."""
+
+_LINE_STEP_M = 0.005
+_LINE_JUMP_RAD = 0.35
+"""Largest turn of a joint within one step of a line; a larger one is another posture of the arm."""
+
+_RETREAT_M = (0.06, 0.12)
+"""Heights above start and goal by which a path that would touch something is led."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """Joints at a point, and their approach in degrees below the horizontal."""
+
+    joints: Floats
+    approach_deg: float
+
+
+class Planner:
+    """Plans from one state of the arm; for one thread.
+
+    Args:
+        chain: the arm.
+        start: its joint positions (rad).
+        gripper: position of its gripper's joint; None for that of the home pose.
+    """
+
+    def __init__(self, chain: Chain, start: Floats, gripper: float | None = None) -> None:
+        self.chain = chain
+        self.start = np.clip(start, chain.lows, chain.highs)
+        self._check = ContactCheck(chain, gripper)
+        self._touching = self._check.at(self.start)
+
+    def joints(self, targets: Mapping[str, float]) -> Floats:
+        """Return the present joints with some replaced, by name (rad).
+
+        Raises:
+            ValidationError: a joint that the arm has not, or a position outside its range.
+        """
+        by_name = {joint.name: index for index, joint in enumerate(self.chain.joints)}
+        wanted = self.start.copy()
+        for name, value in targets.items():
+            if name not in by_name:
+                raise ValidationError(f"joints must be of {', '.join(by_name)}; there is no {name}.")
+            joint = self.chain.joints[by_name[name]]
+            if not joint.low <= value <= joint.high:
+                raise ValidationError(f"{name} must be {_range(joint)}, not {_shown(joint, value)}.")
+            wanted[by_name[name]] = value
+        return wanted
+
+    def reach(self, position: Floats, approach_deg: float | None = None, near: Floats | None = None) -> Reached:
+        """Return joints whose tip is at ``position``.
+
+        Args:
+            position: metres in the base frame.
+            approach_deg: degrees below the horizontal; None for the steepest reachable.
+            near: joints to stay near to; the present ones by default.
+        """
+        start = self.start if near is None else near
+        if approach_deg is not None:
+            direction = self._direction(position, approach_deg)
+            found = solve(self.chain, TipGoal(position, direction), start, accept=self._free)
+            if found is None:
+                raise self._unreachable(TipGoal(position, direction), start, approach_deg)
+            return Reached(found.joints, approach_deg)
+        anyhow = solve(self.chain, TipGoal(position), start, accept=self._free)
+        if anyhow is None:
+            raise self._unreachable(TipGoal(position), start, None)
+        for degrees in np.arange(90.0, APPROACH_LOWEST_DEG - 1, -APPROACH_STEP_DEG):
+            direction = self._direction(position, float(degrees))
+            for from_joints in (start, anyhow.joints):
+                found = solve(self.chain, TipGoal(position, direction), from_joints, starts=4, accept=self._free)
+                if found is not None:
+                    return Reached(found.joints, float(degrees))
+        return Reached(anyhow.joints, self.chain.forward(anyhow.joints).approach_deg)
+
+    def turned(self, joints: Floats, closing: Floats) -> Floats | None:
+        """Return ``joints`` rolled to close along ``closing``, as :func:`rolled`."""
+        found = rolled(self.chain, joints, closing)
+        return found if found is not None and self._free(found) else None
+
+    def path(self, goal: Floats, start: Floats | None = None) -> list[Floats]:
+        """Return joint paths to ``goal``, one after another, without contact.
+
+        One path where that is free, else up, across and down again.
+        """
+        begin = self.start if start is None else start
+        direct = np.array([begin, goal])
+        problem = self._check.along(direct, self._touching)
+        if not problem:
+            return [direct]
+        for height in _RETREAT_M:
+            stops = [begin, self._above(begin, height), self._above(goal, height), goal]
+            known = [stop for stop in stops if stop is not None]
+            legs = [np.array(pair) for pair in itertools.pairwise(known)]
+            if len(legs) > 1 and not any(self._check.along(leg, self._touching) for leg in legs):
+                return legs
+        raise ValidationError(f"the way there is blocked: {problem}.")
+
+    def line(self, goal: Floats, start: Floats | None = None, direction: Floats | None = None) -> Floats:
+        """Return a joint path (n, joints) with the tip on a line to ``goal`` (m).
+
+        Args:
+            goal: position in the base frame.
+            start: joints to begin with; the present ones by default.
+            direction: approach along the way; by default as steep as at the start, where that can be kept.
+        """
+        joints = self.start if start is None else start
+        pose = self.chain.forward(joints)
+        offset = goal - pose.position
+        count = max(1, int(np.ceil(float(np.linalg.norm(offset)) / _LINE_STEP_M)))
+        path = [joints]
+        for index in range(1, count + 1):
+            point = pose.position + offset * (index / count)
+            joints = self._next(point, joints, pose.approach_deg, direction)
+            path.append(joints)
+        points = np.array(path)
+        problem = self._check.along(points, self._touching)
+        if problem:
+            raise ValidationError(f"the line there is blocked: {problem}.")
+        return points
+
+    def _next(self, point: Floats, joints: Floats, approach_deg: float, direction: Floats | None) -> Floats:
+        wanted = self._direction(point, approach_deg) if direction is None else direction
+        goals = [TipGoal(point, wanted)] if direction is not None else [TipGoal(point, wanted), TipGoal(point)]
+        for goal in goals:
+            found = solve(self.chain, goal, joints, starts=1)
+            if found is not None and float(np.abs(found.joints - joints).max()) <= _LINE_JUMP_RAD:
+                return found.joints
+        raise self._unreachable(goals[-1], joints, None)
+
+    def _above(self, joints: Floats, height: float) -> Floats | None:
+        """Return joints with the tip ``height`` metres higher, None where that cannot be."""
+        point = self.chain.forward(joints).position + np.array([0.0, 0.0, height])
+        found = solve(self.chain, TipGoal(point), joints, starts=4, accept=self._free)
+        return None if found is None else found.joints
+
+    def _free(self, joints: Floats) -> bool:
+        return not new_contact(self._check.at(joints), self._touching)
+
+    def _direction(self, position: Floats, degrees: float) -> Floats:
+        """Return the approach away from the shoulder, ``degrees`` below level."""
+        away = position - self.chain.shoulder
+        azimuth, below = np.arctan2(away[1], away[0]), np.radians(degrees)
+        return np.array([np.cos(below) * np.cos(azimuth), np.cos(below) * np.sin(azimuth), -np.sin(below)])
+
+    def _unreachable(self, goal: TipGoal, start: Floats, approach_deg: float | None) -> ValidationError:
+        best = nearest(self.chain, goal, start)
+        wanted = f"({', '.join(f'{v:.3f}' for v in goal.position)}) m"
+        how = "" if approach_deg is None else f" with an approach of {approach_deg:g} degrees"
+        if best.reached:
+            contact = new_contact(self._check.at(best.joints), self._touching)
+            if contact:
+                return ValidationError(f"the tip cannot be at {wanted}{how}: there {contact}.")
+        at = self.chain.forward(best.joints).position
+        near = f"({', '.join(f'{v:.3f}' for v in at)}) m, {best.position_error * 1000:.0f} mm away"
+        return ValidationError(f"{wanted} is out of reach{how}; the nearest reachable point is {near}.")
+
+
+def _range(joint: ArmJoint) -> str:
+    if joint.turns:
+        return f"from {np.degrees(joint.low):.1f} to {np.degrees(joint.high):.1f} degrees"
+    return f"from {joint.low:.3f} to {joint.high:.3f} m"
+
+
+def _shown(joint: ArmJoint, value: float) -> str:
+    return f"{np.degrees(value):.1f}" if joint.turns else f"{value:.3f}"
