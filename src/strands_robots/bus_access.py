@@ -71,7 +71,7 @@ def read_joints(device: Any) -> dict[str, float]:
         answer = own() if callable(own) else None
         if answer is not None and "status" not in answer:
             return numbers(answer)
-        buses = _buses(source)
+        buses = motor_buses(source)
         if not buses:
             return numbers(source.get_observation())
         joints: dict[str, float] = {}
@@ -122,7 +122,7 @@ def _motors(device: Any) -> Mapping[str, Any] | None:
     return motors
 
 
-def _buses(device: Any) -> list[tuple[str, Any]]:
+def motor_buses(device: Any) -> list[tuple[str, Any]]:
     """Return the buses, with key prefixes, that give every observed number, if any."""
     if _motors(device) is not None:
         return [("", device.bus)]

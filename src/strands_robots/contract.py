@@ -22,6 +22,9 @@ from strands_robots.utils import ValidationError, shown
 
 Joints = dict[str, float]
 
+SETTLE = "settle"
+"""The ``policy`` of a robot's way to its rest pose after a stop, in its events."""
+
 RUNNING = frozenset({"running", "starting", "connecting", "busy"})
 """Values of ``task_status`` of a task that may move its robot."""
 

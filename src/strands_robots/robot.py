@@ -20,6 +20,8 @@ from strands_robots.utils import ValidationError, choice, device_id, identifier,
 
 logger = logging.getLogger(__name__)
 
+HARDWARE_OPTIONS = ("control_hz", "joint_ranges", "stop_level", "rest_pose")
+
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
 """Error code for a simulated robot whose model is unknown or cannot be loaded."""
 
@@ -63,7 +65,7 @@ def Robot(  # the factory reads as the class it stands for
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
         options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``). ``real``:
-            ``control_hz``, ``joint_ranges``, ``stop_level``, and every other one goes to the LeRobot
+            ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, and every other one goes to the LeRobot
             configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
             dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
             ``reachy_mini``: ``host`` (by default searched on the local network) and the arguments of
@@ -118,8 +120,8 @@ def run(
         device_id("peer_id", peer_id)
     if not {"messaging_url", "messaging_backend", "link"} & network.keys():
         network["link"] = usual_link(network.get("tenant"))
-    body = robot if callable(getattr(robot, "halt", None)) else adapt(robot)
-    verdict = StopVerdict()
+    body: Any = robot if callable(getattr(robot, "halt", None)) else adapt(robot)
+    verdict: StopVerdict = StopVerdict()
     # A user who waits for Ctrl-C reads the terminal, whatever the program does about logging.
     report: Callable[[str], None] = _print_to_terminal if until is None else logger.info
     with device_connect.StopSignal() if until is None else nullcontext(until) as stop:
@@ -135,6 +137,9 @@ def run(
                 report(summary)
             else:
                 logger.critical("%s", summary)
+            if verdict.settling:
+                # On the network, so that a stop still reaches it.
+                report(body.wait_settled())
             device_connect.stop_device_connect(runtime)
             free()
     return verdict
@@ -162,7 +167,7 @@ def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
     from strands_robots.hardware import HardwareRobot  # noqa: PLC0415 - real hardware only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - as above
 
-    own = {key: options.pop(key) for key in ("control_hz", "joint_ranges", "stop_level") if key in options}
+    own = {key: options.pop(key) for key in HARDWARE_OPTIONS if key in options}
     device = make_device(name, options)
     robot = _construct(_networked(HardwareRobot), device, tool_name=tool_name or _label(name), **own)
     try:

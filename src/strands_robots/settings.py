@@ -175,7 +175,12 @@ _declare(
         0.05,
         60,
     ),
-    Setting("STRANDS_ESTOP_TORQUE", "text", "hold", "Torque after a stop: hold (stiff) or limp (off)."),
+    Setting(
+        "STRANDS_ESTOP_TORQUE",
+        "text",
+        "hold",
+        "After a stop: hold (stiff), limp, or settle (rest pose, then limp).",
+    ),
     Setting(
         "STRANDS_CHECKIN_TIMEOUT_S",
         "number",

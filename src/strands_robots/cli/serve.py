@@ -231,9 +231,12 @@ def _halt(screen: Screen, body: Any) -> bool:
     halt = getattr(body, "halt", None)
     if not callable(halt):
         halt = adapt(body).halt
-    answer = halt("the operator ended serve").envelope()
+    verdict = halt("the operator ended serve")
+    answer = verdict.envelope()
     screen.data({"event": "stopped", **{key: answer[key] for key in ("status", "stopped", "halted") if key in answer}})
     screen.say(text_of(answer), "green" if answer["status"] == "success" else "bold red")
+    if verdict.settling:
+        screen.say(body.wait_settled())
     return answer.get("stopped") is True
 
 

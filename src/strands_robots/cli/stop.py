@@ -239,7 +239,8 @@ def _watch(screen: Screen, running: RunningStop) -> StopReport:
 
 def _row(name: str, answer: Answer) -> tuple[Any, ...]:
     slow = "bold red" if answer.latency_ms > SLOW_MS else ""
-    mark = label("stopped", slow or "green") if answer.stopped else label("DID NOT STOP", "bold red")
+    still = "stopped, settling" if answer.facts.get("settling") is True else "stopped"
+    mark = label(still, slow or "green") if answer.stopped else label("DID NOT STOP", "bold red")
     if answer.stopped is None:
         mark = label("UNKNOWN", "bold red")
     return name, mark, label(f"{answer.latency_ms:.1f}", slow), answer.why or _halted(answer.facts)

@@ -234,6 +234,8 @@ def _stop(screen: Screen, robot: Any) -> StopVerdict:
     verdict: StopVerdict = robot.halt("teleop ended")
     if verdict.stopped:
         screen.say("The follower stands still.", "green")
+    if verdict.settling:
+        screen.say(robot.wait_settled())
     return verdict
 
 

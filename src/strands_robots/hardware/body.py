@@ -5,20 +5,18 @@ from __future__ import annotations
 import inspect
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, Literal
+from typing import Any
 
-from strands_robots.bus_access import action_ranges, bus_lock, read_joints
+from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
 from strands_robots.hardware.device_facts import require_port
 from strands_robots.policies.base import Action, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.stopping import StopLevel
 from strands_robots.utils import ValidationError, number, shown
-
-StopLevel = Literal["hold", "release"]
-STOP_LEVELS = ("hold", "release")
 
 READ_TRIES = 3
 """Joint reads that fail before a motor counts as silent; LeRobot waits 50 ms for each answer."""
@@ -42,7 +40,7 @@ class DeviceBody:
         name: what it is called in events and refusals.
         device: the device.
         joint_ranges: lowest and highest target by action key; what is not named is asked of the device.
-        stop_level: hold (freeze with torque on) or release (torque off: an arm falls).
+        stop_level: hold (freeze with torque on), limp (torque off: an arm falls) or settle, whose stop freezes too.
 
     Raises:
         ValidationError: the device lacks a part of the interface, a range is none, or it cannot release torque.
@@ -61,11 +59,13 @@ class DeviceBody:
         missing += [name for name in ("observation_features", "action_features") if not hasattr(device, name)]
         if missing:
             raise ValidationError(f"device must have LeRobot's robot interface; {shown(device)} lacks {missing}.")
-        if stop_level == "release" and not callable(getattr(getattr(device, "bus", None), "disable_torque", None)):
+        self._torque = _torque_buses(device)
+        if stop_level != "hold" and not self._torque:
             raise ValidationError(
                 f"stop_level (or STRANDS_ESTOP_TORQUE) must be hold: {shown(device)} has no bus.disable_torque()."
             )
         self.stop_level = stop_level
+        self._limp: set[str] = set()
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         self._latest: tuple[float, dict[str, float]] | None = None
@@ -105,6 +105,8 @@ class DeviceBody:
                 return
             self.bring_up(self.device)
             self._lost = False
+            # A driver that connects switches the torque on.
+            self._limp = set()
 
     @staticmethod
     def bring_up(device: Any) -> None:
@@ -143,6 +145,8 @@ class DeviceBody:
         with self.lock:
             if not permit.valid:
                 raise PermitVoidError(f"{self.name} was stopped")
+            if self._limp:
+                self._stiffen()
             self.driven = True
             sent = self.device.send_action(dict(action))
             return sent if isinstance(sent, Mapping) else dict(action)
@@ -152,6 +156,40 @@ class DeviceBody:
             if permit is None or not permit.revoked:
                 self._hold()
                 self.driven = False
+
+    def let_go(self, permit: Permit) -> None:
+        """Switch the torque off at the end of a motion."""
+        with self.lock:
+            if not permit.valid:
+                raise PermitVoidError(f"{self.name} was stopped")
+            self._release()
+            self.driven = False
+
+    @property
+    def motors(self) -> tuple[str, ...]:
+        """Motors whose torque can be switched off by name."""
+        return tuple(motor for motor in self._torque if motor)
+
+    @property
+    def limp_motors(self) -> tuple[str, ...]:
+        """Motors whose torque was switched off here, and not on again."""
+        return tuple(motor or "bus" for motor in self._torque if motor in self._limp)
+
+    def release(self, motors: Collection[str] = ()) -> None:
+        """Freeze the robot and switch the torque of ``motors`` off, or of all.
+
+        Raises:
+            ConnectionError: the port is gone, or some motors did not confirm that they let go.
+            Exception: what else the device raises.
+        """
+        with self.stopping():
+            if self.lost or not self.is_connected:
+                raise ConnectionError("its port is gone" if self.lost else "it is not connected")
+            # What is to let go does so first: it may be squeezing a person.
+            self._release(motors)
+            if motors:
+                self._hold(urgent=True)
+            self.driven = False
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
@@ -187,7 +225,7 @@ class DeviceBody:
                 if not self.driven:
                     return
                 raise ConnectionError("it is not connected; what it was told last goes on")
-            if self.stop_level == "release":
+            if self.stop_level == "limp":
                 self._release()
             else:
                 self._hold(urgent=True)
@@ -220,7 +258,7 @@ class DeviceBody:
         if callable(own):
             own()
             return
-        still = {key: 0.0 for key in self.bounds if _is_velocity(key)}
+        still = {key: 0.0 for key in self.bounds if is_velocity(key)}
         if len(still) == len(self.bounds):
             self.device.send_action(still)
             return
@@ -239,23 +277,63 @@ class DeviceBody:
         self._joints(READ_TRIES, urgent=urgent)
 
     def _targets(self, present: Mapping[str, float]) -> dict[str, float]:
-        return {key: present[key] for key in self.bounds if key in present and not _is_velocity(key)}
+        """Return what freezes the robot; a motor without torque gets no target."""
+        return {
+            key: present[key]
+            for key in self.bounds
+            if key in present and not is_velocity(key) and self._limp.isdisjoint({"", key.removesuffix(".pos")})
+        }
 
-    def _release(self) -> None:
+    def _release(self, motors: Collection[str] = ()) -> None:
         """Switch torque off motor by motor, so that a silent one delays no other."""
-        bus = self.device.bus
         silent = {}
-        for motor in getattr(bus, "motors", None) or (None,):
+        for motor, (bus, own) in self._torque.items():
+            if motors and motor not in motors:
+                continue
             try:
-                bus.disable_torque(motor) if motor is not None else bus.disable_torque()
+                bus.disable_torque(own) if own is not None else bus.disable_torque()
             except Exception as exc:  # noqa: BLE001 - a bus may raise anything; the halt reports it
                 silent[motor or "bus"] = f"{type(exc).__name__}: {exc}"
+            else:
+                self._limp.add(motor)
         if silent:
             raise ConnectionError(f"torque not confirmed off of {', '.join(silent)} ({next(iter(silent.values()))})")
 
+    def _stiffen(self) -> None:
+        """Switch the torque on again for a motion, with the present position as target."""
+        present, limp = self._joints(READ_TRIES), self._limp
+        self._limp = set()
+        try:
+            targets = self._targets(present)
+            if targets:
+                self.device.send_action(targets)
+            for motor in limp:
+                bus, own = self._torque[motor]
+                enable = getattr(bus, "enable_torque", None)
+                if callable(enable):
+                    enable(own) if own is not None else enable()
+        except BaseException:
+            self._limp = limp
+            raise
 
-def _is_velocity(key: str) -> bool:
+
+def is_velocity(key: str) -> bool:
+    """True for an action key that is a velocity."""
     return key.endswith((".vel", "_vel", ".velocity"))
+
+
+def _torque_buses(device: Any) -> dict[str, tuple[Any, str | None]]:
+    """Return bus, and name on it, of each motor whose torque can be switched off.
+
+    A bus that names no motors is one entry without a name.
+    """
+    buses = motor_buses(device) or [("", getattr(device, "bus", None))]
+    found: dict[str, tuple[Any, str | None]] = {}
+    for prefix, bus in buses:
+        if callable(getattr(bus, "disable_torque", None)):
+            motors = getattr(bus, "motors", None)
+            found |= {f"{prefix}{motor}": (bus, motor) for motor in motors} if motors else {prefix: (bus, None)}
+    return found
 
 
 def _checked(ranges: Mapping[str, tuple[float, float]], device: Any) -> dict[str, tuple[float, float]]:

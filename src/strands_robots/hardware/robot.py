@@ -7,16 +7,17 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from strands_robots import settings
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.hardware.body import READ_TRIES, STOP_LEVELS, DeviceBody, StopLevel
+from strands_robots.hardware.body import READ_TRIES, DeviceBody, is_velocity
 from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
+from strands_robots.hardware.settling import Settling, checked_rest_pose
 from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
@@ -33,7 +34,7 @@ from strands_robots.safety.gate import (
 )
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor, through_executor
-from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.safety.stopping import STOP_LEVELS, StopLevel, StopVerdict, halt_each
 from strands_robots.safety.stopping import stop_level as configured_level
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
@@ -42,6 +43,9 @@ logger = logging.getLogger(__name__)
 
 WIND_DOWN_S = 5.0
 """Seconds beyond its duration that :meth:`HardwareRobot.run_task` waits for a task."""
+
+OLD_LEVELS = {"release": "limp"}
+"""Earlier names of stop levels."""
 
 IDLE_WAIT_S = 1.0
 """Seconds that a read of the state waits for the bus while nothing drives the robot."""
@@ -57,8 +61,10 @@ class HardwareRobot(TeleopMixin):
         control_hz: control rate, 1 to 2000; ``STRANDS_CONTROL_HZ`` by default.
         joint_ranges: lowest and highest target by action key, in the device's unit; what is not named is asked of
             the device, and unbounded where it does not know.
-        stop_level: what a halt leaves: ``hold`` (frozen, torque on) or ``release`` (torque off: an arm falls); by
-            default as ``STRANDS_ESTOP_TORQUE`` says.
+        stop_level: what a halt leaves: ``hold`` (frozen, torque on), ``limp`` (torque off: an arm falls; also
+            ``release``) or ``settle`` (frozen, then to ``rest_pose`` at bounded speed, then limp); by default as
+            ``STRANDS_ESTOP_TORQUE`` says.
+        rest_pose: where a robot that settles goes: a target for every action key that is a position.
 
     Raises:
         ValidationError: an argument outside its domain, or a device that lacks a part of the interface.
@@ -71,11 +77,12 @@ class HardwareRobot(TeleopMixin):
         control_hz: float | None = None,
         *,
         joint_ranges: Mapping[str, tuple[float, float]] | None = None,
-        stop_level: StopLevel | None = None,
+        stop_level: StopLevel | Literal["release"] | None = None,
+        rest_pose: Mapping[str, float] | None = None,
     ) -> None:
         name = text("tool_name", tool_name, longest=128)
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
-        asked = ("release" if configured_level() == "limp" else "hold") if stop_level is None else stop_level
+        asked = configured_level() if stop_level is None else OLD_LEVELS.get(stop_level, stop_level)
         level = cast(StopLevel, choice("stop_level", asked, STOP_LEVELS))
         self.tool_name_str = name
         self.control_hz = number("control_hz", rate, low=1, high=2000)
@@ -84,6 +91,7 @@ class HardwareRobot(TeleopMixin):
         self.starting = threading.RLock()
         self.observers = RolloutObservers()
         self._body = DeviceBody(name, device, joint_ranges, level)
+        self._settling = self._made_to_settle(level, rest_pose)
         self._task: Rollout | None = None
         self._waiting = Waiting()
         self._sends: set[Permit] = set()
@@ -110,7 +118,9 @@ class HardwareRobot(TeleopMixin):
         self._body.connect()
         self._stand_by()
         if self.gate.refusal("connect") is not None:
-            # The halt found no port: a servo that is back goes on to its last goal.
+            # The halt found no port: a servo that is back goes on to its last goal. Whoever plugged it in is near it.
+            if self._settling is not None:
+                self._settling.take()
             verdict = self.halt("it is locked and connected again")
             if not verdict.stopped:
                 raise ConnectionError(f"{self.tool_name_str} is locked: {verdict.envelope()['reason']}")
@@ -306,6 +316,9 @@ class HardwareRobot(TeleopMixin):
     def halt_here(self, reason: str, deadline: float) -> StopVerdict:
         """Halt on the stop executor's thread; return by ``deadline`` if the bus does."""
         ordered = self.gate.generation
+        if self._settling is not None and self._settling.running and ordered == self._frozen_at:
+            # Ordered before the halt that began to settle had frozen the robot: the two are one stop.
+            return StopVerdict(settling=True)
         moved = self._halting = dict.fromkeys([*self._moved, *self._moving()])
         self._moved = {}
         self.gate.revoke()
@@ -320,7 +333,7 @@ class HardwareRobot(TeleopMixin):
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
             verdict = _unfrozen(_failure(self.tool_name_str, exc), moved)
         else:
-            verdict = halt_each({**dict.fromkeys(moved, _stopped), **ends})
+            verdict = self._settled_after(halt_each({**dict.fromkeys(moved, _stopped), **ends}))
         finally:
             self._halting = {}
         logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
@@ -332,11 +345,38 @@ class HardwareRobot(TeleopMixin):
             return halt_each(self._ends(time.monotonic()))
         return _unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
 
+    def _settled_after(self, verdict: StopVerdict) -> StopVerdict:
+        """Let a robot that was just frozen settle, if it does so."""
+        settling = self._settling
+        if settling is None or not settling.take() or not verdict.stopped:
+            return verdict
+        return replace(verdict, settling=settling.begin(self._frozen_at))
+
+    def wait_settled(self) -> str:
+        """Wait for the end of a settling, at most 6 s; return a sentence on it."""
+        if self._settling is None:
+            return ""
+        state = self._settling.wait()
+        ends = {
+            "settled": "is at its rest pose, and limp",
+            "stopped": "was stopped again while it settled, and holds its position",
+            "failed": f"did not settle, and keeps its position with torque: {self._settling.error}",
+        }
+        end = ends.get(state, "")
+        return end and f"{self.tool_name_str} {end}."
+
     def cleanup(self) -> Envelope:
-        """Halt and disconnect; a robot that did not stop stays connected."""
+        """Halt and disconnect; a robot that did not stop or settle stays connected.
+
+        A settling under way ends first.
+        """
+        self.wait_settled()
         verdict = self.halt("cleanup")
         if not verdict.stopped:
             return verdict.envelope()
+        unsettled = self.wait_settled()
+        if self._settling is not None and self._settling.state == "failed":
+            return error(unsettled, stopped=True)
         with self._readying:
             if self._ready:
                 stop_executor().detach(self)
@@ -357,8 +397,18 @@ class HardwareRobot(TeleopMixin):
                 stop_executor().attach(self, self.tool_name_str)
                 self._ready = True
 
+    def _made_to_settle(self, level: StopLevel, rest_pose: object) -> Settling | None:
+        if level != "settle" and rest_pose is None:
+            return None
+        if rest_pose is None:
+            raise ValidationError("stop_level (or STRANDS_ESTOP_TORQUE) settle needs a rest_pose.")
+        ranges = {key: each for key, each in self._body.bounds.items() if not is_velocity(key)}
+        pose = checked_rest_pose(rest_pose, ranges)
+        return Settling(self._body, self.gate, pose, ranges, self.observers) if level == "settle" else None
+
     def _moving(self) -> list[str]:
         task = ["task"] if self.occupied(self.tool_name_str) else []
+        task += ["settling"] if self._settling is not None and self._settling.running else []
         return task + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
 
     def _ends(self, deadline: float) -> dict[str, Callable[[], object]]:
@@ -417,6 +467,7 @@ class HardwareRobot(TeleopMixin):
             "step_count": 0 if task is None else task.step_count,
             "duration": 0.0 if task is None else round(task.elapsed_s, 3),
             "error": "" if task is None else task.error,
+            **({} if self._settling is None else {"settling": self._settling.state}),
         }
 
     def _refresh(self) -> str:

@@ -236,6 +236,13 @@ class MotionGate:
         """Void every permit given so far."""
         self._generation = next(self._numbers)
 
+    def settling(self, generation: int) -> Permit:
+        """Return leave for the motion that is a part of the halt of ``generation``.
+
+        No latch is asked, for the robot is locked. Only a robot's own halt may call this; the next halt voids it.
+        """
+        return Permit(self, Asked(generation), "settle")
+
     def renew(self, permit: Permit) -> Permit:
         """Void every other permit, as a halt does, and return a fresh one.
 

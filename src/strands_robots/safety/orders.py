@@ -104,6 +104,7 @@ class RobotReport:
             "persisted": self.persisted,
             "repeated": self.repeated,
             "late": self.late,
+            **({"settling": True} if self.verdict.settling else {}),
         }
 
 

@@ -12,13 +12,16 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal
+from typing import Literal, cast
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
+
+StopLevel = Literal["hold", "limp", "settle"]
+STOP_LEVELS = ("hold", "limp", "settle")
 
 
 class Outcome(Enum):
@@ -44,12 +47,14 @@ class StopVerdict:
 
     ``halted`` names every motion source that was moving and is still now, ``not_stopped`` and ``unknown`` map a
     source to the reason. A verdict with nothing in any of them is a robot that was standing still: stopped.
+    ``settling``: it was frozen, and now goes to its rest pose at bounded speed, until it is limp or stopped again.
     """
 
     halted: tuple[str, ...] = ()
     not_stopped: Mapping[str, str] = field(default_factory=dict)
     unknown: Mapping[str, str] = field(default_factory=dict)
     elapsed_ms: float = 0.0
+    settling: bool = False
 
     @property
     def stopped(self) -> bool | None:
@@ -66,26 +71,26 @@ class StopVerdict:
             "not_stopped": dict(self.not_stopped),
             "unknown": dict(self.unknown),
             "elapsed_ms": round(self.elapsed_ms, 3),
+            **({"settling": True} if self.settling else {}),
         }
         if self.stopped:
             what = f"Stopped {', '.join(self.halted)}." if self.halted else "Nothing was moving."
-            return success(what, **fields)
+            return success(f"{what} It settles to its rest pose." if self.settling else what, **fields)
         doubts = [f"{name} did not stop: {why}" for name, why in self.not_stopped.items()]
         doubts += [f"{name}: {why}" for name, why in self.unknown.items()]
         return error("; ".join(doubts), **fields)
 
 
-def stop_level() -> Literal["hold", "limp"]:
-    """Return the effect of a halt on torque: ``hold`` keeps it, ``limp`` drops it.
+def stop_level() -> StopLevel:
+    """Return what a halt leaves: ``hold``, ``limp``, or ``settle`` and then limp.
 
     ``STRANDS_ESTOP_TORQUE``; another value is ``hold``, with one line in the log.
     """
     level = settings.raw("STRANDS_ESTOP_TORQUE").lower()
-    if level == "limp":
-        return "limp"
-    if level != "hold":
-        logger.warning("STRANDS_ESTOP_TORQUE=%s is neither hold nor limp; hold is used.", shown(level))
-    return "hold"
+    if level not in STOP_LEVELS:
+        logger.warning("STRANDS_ESTOP_TORQUE=%s is none of %s; hold is used.", shown(level), ", ".join(STOP_LEVELS))
+        return "hold"
+    return cast(StopLevel, level)
 
 
 def grade(answer: object) -> Outcome:

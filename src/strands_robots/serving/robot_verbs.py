@@ -13,7 +13,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import RUNNING, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt
+from strands_robots.contract import RUNNING, SETTLE, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
@@ -160,6 +160,7 @@ def peer_stop_answer(verdict: StopVerdict) -> dict[str, Any]:
         "stopped": list(verdict.halted),
         "not_stopped": list(doubts),
         "results": {**dict.fromkeys(verdict.halted, "stopped"), **doubts},
+        **({"settling": True} if verdict.settling else {}),
     }
     if doubts:
         result["error"] = "; ".join(f"{name}: {why}" for name, why in doubts.items())
@@ -217,7 +218,7 @@ def run_to_end(robot: Robot, arguments: Arguments, closing: Callable[[], bool]) 
     ends: list[RolloutEvent] = []
 
     def observe(event: RolloutEvent) -> None:
-        if event.kind == "finished" and name in (None, event.robot):
+        if event.kind == "finished" and event.policy != SETTLE and name in (None, event.robot):
             ends.append(event)
 
     unsubscribe = robot.subscribe(observe)

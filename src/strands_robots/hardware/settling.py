@@ -1,0 +1,221 @@
+"""Settling: the slow way of a stopped arm to its rest pose, then limp.
+
+It is the second half of a halt, and the only motion of a locked robot. The halt alone begins it; its permit is void at
+the next halt, which freezes the arm; while it runs every other motion is refused.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
+
+from strands_robots.audit import log_safety_event
+from strands_robots.contract import SETTLE, RolloutEvent
+from strands_robots.envelope import Envelope, error
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.policies.base import Action, Ranges
+from strands_robots.policies.rollout import RolloutObservers
+from strands_robots.safety.gate import MotionGate, Permit, PermitVoidError
+from strands_robots.utils import ValidationError, mapping, number, shown
+
+if TYPE_CHECKING:
+    from strands_robots.hardware.body import DeviceBody
+
+logger = logging.getLogger(__name__)
+
+SETTLE_S = 5.0
+"""Longest time that an arm may take to its rest pose, in seconds."""
+
+RANGES_PER_S = 0.25
+"""Speed: the joint with the longest way crosses a quarter of its range in a second."""
+
+LAG_SHARE = 0.1
+"""Part of its range that a joint may be behind its target; one that is further behind is blocked."""
+
+ARRIVED_SHARE = 0.02
+"""Part of its range by which a joint may miss the rest pose."""
+
+SETTLE_HZ = 50.0
+
+State = Literal["", "settling", "settled", "stopped", "failed"]
+
+
+class SettleError(StrandsRobotsError, RuntimeError):
+    """The arm did not come to its rest pose."""
+
+
+def checked_rest_pose(pose: object, ranges: Ranges) -> Action:
+    """Return a rest pose that names every position key of a robot.
+
+    Raises:
+        ValidationError: no pose, a key that is missing or unknown, a target outside its range, a joint without one.
+    """
+    named = mapping("rest_pose", pose)
+    unknown = [key for key in named if key not in ranges]
+    missing = [key for key in ranges if key not in named]
+    if unknown or missing:
+        wrong = f"it lacks {', '.join(missing)}" if missing else f"there is no {', '.join(map(shown, unknown))}"
+        raise ValidationError(f"rest_pose must have a target for each of {', '.join(ranges)}: {wrong}.")
+    unbounded = [key for key, (low, high) in ranges.items() if not math.isfinite(high - low)]
+    if unbounded:
+        raise ValidationError(f"rest_pose needs joint_ranges for {', '.join(unbounded)}: its speed is a part of them.")
+    return {key: number(f"rest_pose[{key!r}]", named[key], low=low, high=high) for key, (low, high) in ranges.items()}
+
+
+class Settling:
+    """The settling of one arm; :meth:`begin` belongs to its halt.
+
+    Args:
+        body: goes to its rest pose.
+        gate: of the robot; this is one of its latches while the arm settles.
+        rest_pose: targets, as :func:`checked_rest_pose` returns them.
+        ranges: of the keys of ``rest_pose``.
+        observers: called with the beginning and the end, as of a task with the policy ``settle``.
+    """
+
+    def __init__(
+        self, body: DeviceBody, gate: MotionGate, rest_pose: Action, ranges: Ranges, observers: RolloutObservers
+    ) -> None:
+        self._body, self._gate, self._observers = body, gate, observers
+        self._rest = rest_pose
+        self._width = {key: ranges[key][1] - ranges[key][0] for key in rest_pose}
+        self._due = False
+        self._ended = threading.Event()
+        self._ended.set()
+        self.state: State = ""
+        self.error = ""
+        gate.watch(self._note_motion)
+
+    @property
+    def running(self) -> bool:
+        """True until the arm is limp, was stopped again or failed."""
+        return not self._ended.is_set()
+
+    def refusal(self, verb: str) -> Envelope | None:
+        """Return the refusal of ``verb`` while the arm settles."""
+        if not self.running:
+            return None
+        return error(f"{verb} is refused: {self._body.name} settles to its rest pose after a stop.", settling=True)
+
+    def take(self) -> bool:
+        """Return whether the halt that asks may settle the arm: once after each motion.
+
+        A halt of an arm that has not moved since the one before only freezes it: neither a second stop nor a robot
+        that comes up locked starts a motion.
+        """
+        due, self._due = self._due, False
+        return due
+
+    def begin(self, generation: int) -> bool:
+        """Start, for the halt of this ``generation``; False if no thread starts."""
+        permit = self._gate.settling(generation)
+        self.state, self.error = "settling", ""
+        self._ended.clear()
+        # After the lockout, whose refusal says more.
+        self._gate.attach(self)
+        try:
+            threading.Thread(target=self._run, args=(permit,), name=f"settle-{self._body.name}", daemon=True).start()
+        except RuntimeError as exc:
+            self._end(permit, "failed", str(exc))
+            return False
+        return True
+
+    def wait(self) -> State:
+        """Wait for the end of a settling under way; return how the last one ended."""
+        self._ended.wait(SETTLE_S + 1)
+        return self.state
+
+    def _note_motion(self) -> None:
+        self._due = True
+
+    def _run(self, permit: Permit) -> None:
+        began = time.monotonic()
+        self._notify("started")
+        try:
+            self._travel(permit, began + SETTLE_S)
+            self._body.let_go(permit)
+        except PermitVoidError:
+            self._end(permit, "stopped", "another stop froze it", began)
+        except BaseException as exc:  # noqa: BLE001 - a device may raise anything; the arm is held and the event says what
+            problem = str(exc) if isinstance(exc, SettleError) else f"{type(exc).__name__}: {exc}"
+            self._end(permit, "failed" if permit.valid else "stopped", problem, began)
+        else:
+            self._end(permit, "settled", "", began)
+
+    def _travel(self, permit: Permit, deadline: float) -> None:
+        """Go along a straight line in joint space, all joints at once."""
+        present = self._read(permit)
+        start = {key: present[key] for key in self._rest}
+        way = max(abs(self._rest[key] - start[key]) / self._width[key] for key in self._rest)
+        steps = math.ceil(way / RANGES_PER_S * SETTLE_HZ)
+        for step in range(1, steps + 1):
+            share = step / steps
+            target = {key: start[key] + share * (self._rest[key] - start[key]) for key in self._rest}
+            due = time.monotonic() + 1 / SETTLE_HZ
+            self._body.send_action(target, permit)
+            present = self._read(permit)
+            behind = self._off(target, present, LAG_SHARE)
+            if behind:
+                raise SettleError(f"{behind} of its target on the way to the rest pose: something is in its way")
+            if time.monotonic() > deadline:
+                raise SettleError(f"it was not at its rest pose in {SETTLE_S:g} s")
+            # A late step delays the next one; catching up would be faster than the bound.
+            time.sleep(max(0.0, due - time.monotonic()))
+        while off := self._off(self._rest, present, ARRIVED_SHARE):
+            if time.monotonic() > deadline:
+                raise SettleError(f"{off} of the rest pose after {SETTLE_S:g} s")
+            time.sleep(1 / SETTLE_HZ)
+            present = self._read(permit)
+
+    def _read(self, permit: Permit) -> dict[str, float]:
+        if not permit.valid:
+            raise PermitVoidError(f"{self._body.name} was stopped")
+        joints = self._body.get_joints()
+        missing = [key for key in self._rest if key not in joints]
+        if missing:
+            raise SettleError(f"{', '.join(missing)} cannot be read")
+        return joints
+
+    def _off(self, target: Mapping[str, float], present: Mapping[str, float], share: float) -> str:
+        """Return the joint furthest off, if beyond ``share`` of its range."""
+        worst = max(target, key=lambda key: abs(target[key] - present[key]) / self._width[key])
+        short = abs(target[worst] - present[worst])
+        return f"{worst} is {short:.1f} short" if short > share * self._width[worst] else ""
+
+    def _end(self, permit: Permit, state: State, problem: str, began: float | None = None) -> None:
+        """Hold the arm unless it is limp or another halt froze it; record the end."""
+        if state == "failed":
+            try:
+                self._body.hold(permit)
+            except Exception as exc:  # noqa: BLE001 - as in _run; without a bus a servo keeps its last target
+                problem = f"{problem}; {type(exc).__name__}: {exc}"
+        self.state, self.error = state, problem
+        self._gate.detach(self)
+        self._ended.set()
+        name = self._body.name
+        if state == "failed":
+            logger.critical("%s did not settle, and keeps its last position with torque: %s.", name, problem)
+        else:
+            logger.info("%s %s.", name, "settled and is limp" if state == "settled" else "was stopped while it settled")
+        took = 0.0 if began is None else time.monotonic() - began
+        log_safety_event("settle_" + state, name, {"why": problem, "elapsed_s": round(took, 3)})
+        self._notify("finished", took, {"settled": "completed", "stopped": "stopped"}.get(state, "error"), problem)
+
+    def _notify(
+        self, kind: Literal["started", "finished"], took: float = 0.0, state: str = "running", problem: str = ""
+    ) -> None:
+        self._observers.notify(
+            RolloutEvent(
+                kind,
+                self._body.name,
+                instruction="settle to the rest pose",
+                policy=SETTLE,
+                elapsed_s=took,
+                state=state,
+                error=problem if state == "error" else "",
+            )
+        )
