@@ -13,22 +13,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli.command import Timeout, command
+from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network, call_device, describe
+from strands_robots.cli.network import Network, call_device, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
+from strands_robots.cli.resume_mesh import ask_peers, lockable_peers, resume_peers
 from strands_robots.envelope import text_of
 from strands_robots.safety.approval import GRANT_S, Grants, state_dir
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.lockout import OVERFLOW, Lockout, utc
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
+from strands_robots.tools.networks import discover
 from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
 
 PARALLEL_CALLS = 8
+THEN = "They move again when they get a new command."
 
 
 def register(app: typer.Typer) -> None:
@@ -50,6 +53,7 @@ def resume(
     passphrase_file: PassphraseFile = None,
     local: Annotated[bool, typer.Option("--local", help="Robots of this machine, without a key; audited.")] = False,
     timeout: Timeout = 5.0,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Free locked robots: by the operator's key over the network, or here by --local. It starts no motion."""
     if local == (key is not None):
@@ -61,12 +65,16 @@ def resume(
         return
     seconds = number("--timeout", timeout, above=0, high=60)
     signer = signing_key(key, passphrase_file)
+    if on_mesh:
+        network.use_mesh()
+        _report(screen, _resume_on_mesh(wanted, signer, seconds), THEN)
+        return
     with network.fleet() as fleet:
         found = ask_robots(fleet, wanted or lockable_robots(fleet), seconds)
         if not found:
             raise CliError(f"No robot answered. {describe(fleet.link)}", Exit.SILENT, devices={})
         outcome = _resume_all(fleet, found, signer, seconds)
-    _report(screen, outcome, "They move again when they get a new command.")
+    _report(screen, outcome, THEN)
 
 
 def lockout(
@@ -75,14 +83,18 @@ def lockout(
     *,
     local: Annotated[bool, typer.Option("--local", help="Only this machine's lockout file.")] = False,
     timeout: Timeout = 2.0,
+    on_mesh: OnMesh = False,
 ) -> None:
     """List locked robots, since when and by whom: live ones, and those in this machine's lockout file."""
     seconds = number("--timeout", timeout, above=0, high=60)
     stored, live, note = _stored_lockouts(), list[LockoutReport](), ""
     if not local:
         try:
-            with network.fleet() as fleet:
-                live = ask_robots(fleet, lockable_robots(fleet, seconds), seconds)
+            if on_mesh:
+                live = _ask_mesh(network, seconds)
+            else:
+                with network.fleet() as fleet:
+                    live = ask_robots(fleet, lockable_robots(fleet, seconds), seconds)
             note = "" if live else "No robot answered on the network. "
         except CliError as failure:
             if failure.code is Exit.USAGE:
@@ -99,11 +111,11 @@ def lockout(
             "live": {
                 each.name: {
                     "locked": None if each.problem else bool(each.lockouts),
-                    "holds": [_fields(lockout) for lockout in each.lockouts],
+                    "holds": [lockout.fields() for lockout in each.lockouts],
                 }
                 for each in live
             },
-            "kept": {name: [_fields(lockout) for lockout in lockouts] for name, lockouts in stored.items()},
+            "kept": {name: [lockout.fields() for lockout in lockouts] for name, lockouts in stored.items()},
         }
     )
     if cells:
@@ -158,6 +170,25 @@ def ask_robots(fleet: FleetClient, names: Iterable[str], seconds: float) -> list
         return list(pool.map(lambda name: _ask(fleet, name, seconds), wanted))
 
 
+def _ask_mesh(network: Network, seconds: float) -> list[LockoutReport]:
+    network.use_mesh()
+    with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
+        discover(mesh)
+        answers = ask_peers(mesh, lockable_peers(mesh), seconds)
+    return [LockoutReport(name, lockouts, problem) for name, (lockouts, problem) in answers.items()]
+
+
+def _resume_on_mesh(wanted: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
+    with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
+        discover(mesh)
+        answers = ask_peers(mesh, wanted or lockable_peers(mesh), seconds)
+        if not answers:
+            raise CliError("No robot answered on the mesh of this machine.", Exit.SILENT, devices={})
+        silent = {name: (False, problem) for name, (_, problem) in answers.items() if problem}
+        found = {name: lockouts for name, (lockouts, problem) in answers.items() if not problem}
+        return resume_peers(mesh, found, signer, seconds) | silent
+
+
 def operator() -> str:
     """Return the login name of the operator at this machine."""
     try:
@@ -189,14 +220,8 @@ def _ask(fleet: FleetClient, name: str, seconds: float) -> LockoutReport:
     if "locked" not in answer:
         return LockoutReport(name, problem="it does not report lockouts", facts=answer, round_trip_ms=took_ms)
     rows = answer.get("lockout")
-    lockouts = tuple(_lockout(each) for each in rows if isinstance(each, Mapping)) if isinstance(rows, list) else ()
+    lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping)) if isinstance(rows, list) else ()
     return LockoutReport(name, lockouts, facts=answer, round_trip_ms=took_ms)
-
-
-def _lockout(row: Mapping[str, Any]) -> Lockout:
-    since = row.get("since")
-    at = float(since) if isinstance(since, int | float) else 0.0
-    return Lockout(str(row.get("epoch", "")), str(row.get("source", "")), str(row.get("reason", "")), at)
 
 
 def _lockout_rows(name: str, lockouts: Iterable[Lockout]) -> list[tuple[str, str]]:
@@ -206,10 +231,6 @@ def _lockout_rows(name: str, lockouts: Iterable[Lockout]) -> list[tuple[str, str
         why = f": {each.reason}" if each.reason else ""
         cells += [("" if cells else name, f"since {utc(each.at)} by {each.source}{why}"), ("", f"epoch {each.epoch}")]
     return cells
-
-
-def _fields(lockout: Lockout) -> dict[str, Any]:
-    return {"epoch": lockout.epoch, "source": lockout.source, "reason": lockout.reason, "since": lockout.at}
 
 
 def _clear_locally(screen: Screen, wanted: list[str]) -> None:

@@ -28,6 +28,9 @@ SLOW_MS = 100.0
 """An answer that took longer is shown in red."""
 
 LOCKED = "They are locked until they are resumed: strands-robots resume."
+LOCKED_MESH = (
+    "They are locked until they are resumed: strands-robots resume --mesh --key FILE, or resume --local where they run."
+)
 LINK_WAIT_S = 2.0
 
 
@@ -97,7 +100,7 @@ def estop(
         if devices or key is not None:
             raise CliError("estop --mesh stops every robot, and takes neither DEVICE nor --key.", Exit.USAGE)
         network.use_mesh()
-        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason), f" {LOCKED}")
+        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason), f" {LOCKED_MESH}")
         return
     expected = [device_id("DEVICE", each) for each in devices or []]
     seconds = number("--deadline", deadline, above=0, high=600)

@@ -85,7 +85,7 @@ class SafetyRegistration:
         lockouts = self.entry.latch.state.all
         return {
             "locked": bool(lockouts),
-            "lockout": [{"epoch": h.epoch, "source": h.source, "reason": h.reason, "since": h.at} for h in lockouts],
+            "lockout": [each.fields() for each in lockouts],
             "check_in": plane().checkin.fields(time.monotonic()),
             "stop_lane": self.up,
         }

@@ -24,7 +24,7 @@ from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Requester
-from strands_robots.mesh.safety import FleetSafety, SafetyAdapter
+from strands_robots.mesh.safety import FleetSafety, SafetyAdapter, status_of
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
@@ -49,6 +49,7 @@ LOOP_JOIN_TIMEOUT_S = 2.0
 """Seconds that :meth:`Mesh.stop` waits, in all, for what it started."""
 
 PRUNE_HZ = 1.0
+LATE_HZ = 2.0
 TOKENS_HZ = 5.0
 DELIVERIES_MAX = 1024
 """Messages of the user's subscriptions that wait for their callbacks."""
@@ -124,7 +125,7 @@ class Mesh(SensorLoopsMixin):
         self._requester = Requester(context)
         self._teleop = TeleopReceivers(lambda source, device: InputReceiver(self, body_of(robot), source, device))
         self._description = Description(peer, robot)
-        self._presence = PresencePublisher(context, self.peer_type, self._describe)
+        self._presence = PresencePublisher(context, self.peer_type, self._describe, self._adapter.facts)
         self._state = StateReader(peer, robot, parts.clock)
         self._steps = StepPublisher(context, robot, settings.number("STRANDS_MESH_STREAM_HZ"))
         self._delivery = BoundedExecutor(f"{peer}-delivery", 1, DELIVERIES_MAX, drop_oldest=True)
@@ -137,6 +138,7 @@ class Mesh(SensorLoopsMixin):
             "resume": lambda arguments: self._safety.on_resume_command(arguments.get("assertion")),
         }
         if robot is not None:
+            own["status"] = status_of(robot, self._adapter)
             own["execute"] = execute_on(robot, context, lambda: self._pipeline.closed)
         self._pipeline = Pipeline.of(
             robot, lambda: peer, hardware=hardware, authorize=SenderCheck(context, hardware=hardware), own=own
@@ -155,6 +157,7 @@ class Mesh(SensorLoopsMixin):
                 robot,
                 self._pipeline,
                 kind=self.peer_type,
+                adapter=self._adapter,
                 own=answered_here,
                 teleop=self._teleop,
                 audit=parts.recorder,
@@ -235,6 +238,7 @@ class Mesh(SensorLoopsMixin):
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
         every("tokens", TOKENS_HZ, self._presence.judge_tokens, quick=True)
         every("prune", PRUNE_HZ, self._prune, quick=True)
+        every("late peers", LATE_HZ, self._safety.late.look, quick=True)
         frames = frames_of(self.robot)
         if frames is not None:
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), CameraPublisher(context, frames).publish)
@@ -274,7 +278,7 @@ class Mesh(SensorLoopsMixin):
     def _publish_state(self) -> None:
         body = self._state.read()
         if body is not None:
-            self._context.put(topics.state(self.peer_id), body)
+            self._context.put(topics.state(self.peer_id), body | self._adapter.facts())
 
     def _prune(self) -> None:
         self._context.registry.prune()

@@ -34,12 +34,20 @@ class PresencePublisher:
     Args:
         describe: returns the fields of a heartbeat besides id, type, host and time. It may read the robot slowly, so
             :meth:`refresh` calls it, and :meth:`announce` sends its last result.
+        safety: returns the fields of lockout and check-in at once, for each heartbeat anew.
     """
 
-    def __init__(self, context: Context, peer_type: str, describe: Callable[[], Mapping[str, Any]]) -> None:
+    def __init__(
+        self,
+        context: Context,
+        peer_type: str,
+        describe: Callable[[], Mapping[str, Any]],
+        safety: Callable[[], Mapping[str, Any]] = dict,
+    ) -> None:
         self._context = context
         self._type = peer_type
         self._describe = describe
+        self._safety = safety
         self._facts: dict[str, Any] = {}
         self._troubles = TroubleLog(logger)
         self.described = threading.Event()
@@ -86,6 +94,7 @@ class PresencePublisher:
         context = self._context
         body = {
             **self._facts,
+            **self._safety(),
             "robot_id": context.peer_id,
             "robot_type": self._type,
             "hostname": self._host,

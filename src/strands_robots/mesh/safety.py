@@ -12,21 +12,25 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from strands_robots.contract import Robot
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
+from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
-from strands_robots.safety.resume import REJECTED, configured_keys, sign
+from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain
-from strands_robots.serving.robot_verbs import peer_stop_answer
+from strands_robots.serving.pipeline import Own
+from strands_robots.serving.robot_verbs import PEER_VERBS, peer_stop_answer
+from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.utils import ValidationError, identifier, shown
 
@@ -48,8 +52,8 @@ RETRY_ANSWER_S = 1.0
 UNANSWERED_MAX = 10
 """Repeats to a peer that is in reach and does not answer; access rules may keep it from us."""
 
-KNOWN_S = 600.0
-"""A peer that sent a heartbeat within these seconds gets the stop when it comes back; a newcomer does not."""
+ASK_S = 1.0
+"""Seconds in which peers report the epochs that a resume is signed for."""
 
 Verdict = Callable[[], StopVerdict | None]
 
@@ -99,6 +103,17 @@ class SafetyAdapter:
         """The epochs that lock this robot, oldest first; empty while it may move."""
         return self._entry.epochs if self._entry is not None else ()
 
+    def facts(self) -> dict[str, Any]:
+        """Return ``locked`` and ``epochs``; nothing without a robot."""
+        if isinstance(self._robot, NoRobot):
+            return {}
+        epochs = self.epochs()
+        return {"locked": bool(epochs), "epochs": list(epochs)}
+
+    def lockouts(self) -> list[dict[str, Any]]:
+        """Return each lockout with its source, reason and time."""
+        return [each.fields() for each in self._entry.latch.state.all] if self._entry is not None else []
+
     def source_refusal(self, source: str) -> str | None:
         """The reason why an e-stop of ``source`` does not count, or None."""
         return self._decision.source_refusal(source)
@@ -130,6 +145,17 @@ class SafetyAdapter:
         entry, self._entry = self._entry, None
         if entry is not None:
             entry.close()
+
+
+def status_of(robot: Robot, adapter: SafetyAdapter) -> Own:
+    """Make the ``status`` of a peer: what the robot answers, with its lockouts."""
+
+    def status(arguments: Arguments) -> object:
+        run = PEER_VERBS["status"].run
+        answer = run(robot, arguments) if run is not None else None
+        return {**answer, **adapter.facts(), "lockout": adapter.lockouts()} if isinstance(answer, Mapping) else answer
+
+    return status
 
 
 class EstopRetry:
@@ -211,6 +237,7 @@ class FleetSafety:
         self._resumes = resumes
         self._robot = robot
         self._retry = EstopRetry(context, requester)
+        self.late = LatePeers(context, adapter.epochs)
         self._recent: deque[str] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
@@ -310,6 +337,7 @@ class FleetSafety:
             return
         epoch = notice.estop_id or derived_epoch(notice.peer_id, json.dumps(body["t"]).encode())
         if epoch in self._recent:
+            self.late.heard(epoch)
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
             return
         if sample.retained and epoch in self._resumed:
@@ -323,7 +351,15 @@ class FleetSafety:
             return
         if order.timing(context.clock()) == "ahead":
             context.audit("estop_clock_skew", notice.peer_id, estop_id=epoch)
+        self.late.stopped(epoch, lambda: self._repeat_estop({**body, "estop_id": epoch}))
         self._publish_event("emergency_stop", epoch)
+
+    def _repeat_estop(self, body: dict[str, Any]) -> None:
+        """Publish a stop of another issuer again, from our session."""
+        session = self._context.session_id()
+        bare = {key: value for key, value in body.items() if key != "source_zid"}
+        again = {**bare, "t": self._context.clock()} | ({} if session is None else {"source_zid": session})
+        self._publish(topics.estop(), again, f"Emergency stop {body['estop_id']}", logging.CRITICAL)
 
     def _publish_event(self, event: str, epoch: str) -> None:
         """Publish the redacted event for dashboards: its code, without the reason."""
@@ -347,25 +383,53 @@ class FleetSafety:
     # Resume.
 
     def resume(self, signing_key: Any, targets: Sequence[str] | None) -> dict[str, Any]:
-        """Sign for every epoch here, admit each assertion and relay it."""
-        context = self._context
-        wanted = [row["peer_id"] for row in context.registry.all() if row["reachable"]] if targets is None else targets
-        epochs = self._adapter.epochs()
-        if not epochs:
-            return self._denied("no epoch is held")
+        """Sign for every epoch here and at the targets, and relay the assertions."""
+        context, own = self._context, self._adapter.epochs()
         try:
-            names = {context.peer_id, *(identifier("target", name) for name in wanted)}
-            signed = [each for epoch in epochs for each in sign(signing_key, epoch, names)]
+            names = [identifier("target", name) for name in targets] if targets is not None else None
+            wanted = (
+                {row["peer_id"] for row in context.registry.all() if row["reachable"]} if names is None else {*names}
+            )
+            epochs = dict.fromkeys([*own, *self._reported(wanted)])
+            if not epochs:
+                return self._denied("no epoch is held")
+            known = configured_keys()
+            if known and ed25519.public_half(signing_key) not in known:
+                return self._denied("no configured key is this one")
+            late = wanted | (context.registry.seen_within(KNOWN_S) if names is None else set())
+            signed = {
+                each: sign(signing_key, each, wanted | ({context.peer_id} if each in own else set())) for each in epochs
+            }
         except (ValidationError, AttributeError, TypeError) as exc:
             return self._denied(str(exc))
-        for index, assertion in enumerate(signed):
-            rejected = self._adapter.resume(assertion) if context.peer_id in assertion["targets"] else None
-            if rejected is not None:
-                return {"status": "error", "error": rejected}
-            if index:
-                time.sleep(SPACING_S)
-            self._relay(assertion)
+        relayed = 0
+        for epoch, assertions in signed.items():
+            for assertion in assertions:
+                ours = epoch in own and context.peer_id in assertion["targets"]
+                rejected = self._adapter.resume(assertion) if ours else None
+                if rejected is not None:
+                    return {"status": "error", "error": rejected}
+                if relayed:
+                    time.sleep(SPACING_S)
+                self._relay(assertion)
+                relayed += 1
+            self.late.renewable(epoch, late, lambda epoch, peers: self._relay_all(sign(signing_key, epoch, peers)))
         return {"status": "ok"}
+
+    def _reported(self, peers: Iterable[str]) -> list[str]:
+        """Ask peers that report lockouts for their epochs; return all of them."""
+        registry = self._context.registry
+        waited = {peer for peer in peers if "locked" in (registry.get(peer) or {})} - {self._context.peer_id}
+        if not waited:
+            return []
+
+        def missing(replies: list[dict[str, Any]]) -> set[str]:
+            return waited - {str(reply["responder_id"]) for reply in replies}
+
+        replies = self._requester.broadcast({"action": "status"}, ASK_S, missing)
+        results = [reply["result"] for reply in replies if reply["responder_id"] in waited and "result" in reply]
+        held = [result.get("epochs") for result in results if isinstance(result, Mapping)]
+        return [each for epochs in held if isinstance(epochs, list) for each in epochs if is_epoch(each)]
 
     def on_resume_command(self, assertion: object) -> dict[str, Any]:
         """Admit and relay a resume that came as a command, or return the one rejection."""
@@ -373,6 +437,7 @@ class FleetSafety:
         if rejected is not None:
             return {"status": "error", "error": rejected}
         self._relay(assertion)
+        self._note_admitted(assertion)
         return {"status": "ok"}
 
     def on_resume(self, sample: Sample) -> None:
@@ -420,9 +485,18 @@ class FleetSafety:
         nonce = str(relay.assertion.get("nonce"))
         if self._adapter.resume(relay.assertion) is None:
             self._admitted.append(nonce)
+            self._note_admitted(relay.assertion)
             self._context.audit.always("remote_resume_applied", about=relay.peer_id)
         elif nonce in self._admitted:
             self._context.audit("resume_replay_rejected", relay.peer_id)
+
+    def _note_admitted(self, assertion: Any) -> None:
+        """Pass an admitted resume on to targets that are back within its minute."""
+        self.late.resumed(str(assertion["epoch"]), assertion["targets"], lambda: self._relay(assertion))
+
+    def _relay_all(self, assertions: Iterable[Any]) -> None:
+        for assertion in assertions:
+            self._relay(assertion)
 
     def _relay(self, assertion: Any) -> None:
         context = self._context

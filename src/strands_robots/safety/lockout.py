@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.utils import shown
@@ -33,6 +34,17 @@ class Lockout:
     source: str = ""
     reason: str = ""
     at: float = 0.0
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> Lockout:
+        """Read a lockout that a robot reported, whatever its fields hold."""
+        since = row.get("since")
+        at = float(since) if isinstance(since, int | float) else 0.0
+        return cls(str(row.get("epoch", "")), str(row.get("source", "")), str(row.get("reason", "")), at)
+
+    def fields(self) -> dict[str, Any]:
+        """Return the lockout as a robot reports it."""
+        return {"epoch": self.epoch, "source": self.source, "reason": self.reason, "since": self.at}
 
 
 @dataclass(frozen=True, slots=True)

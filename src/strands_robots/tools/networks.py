@@ -100,7 +100,7 @@ class NativeMesh:
         """List every peer in reach, with its type and state."""
 
         def listed(mesh: Mesh) -> Envelope:
-            _discover(mesh)
+            discover(mesh)
             return _peer_list(
                 [
                     {"id": row["peer_id"], "type": row["type"], "status": row.get("task_status", "")}
@@ -176,7 +176,7 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
         return any(not answers.get(name, {}).get("stopped") for name in seen)
 
     send()
-    _discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
+    discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
     if unconfirmed():
         send()
     silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in seen}
@@ -196,7 +196,7 @@ def _in_reach(mesh: Mesh) -> list[str]:
     return [row["peer_id"] for row in mesh.peers if row["reachable"]]
 
 
-def _discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None:
+def discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None:
     """Wait until the peers in reach are known, calling ``meanwhile`` repeatedly.
 
     A link to a stated endpoint that failed is retried with back-off, so such a peer may be silent for up to 8 s.

@@ -13,6 +13,7 @@ from fixtures.waiting import eventually
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
+from strands_robots.mesh.resume_authority import keygen
 
 
 @pytest.fixture
@@ -77,3 +78,30 @@ def test_keys_are_made_issued_and_named_for_the_environment(tmp_path: Path, monk
     assert run("acl", "--robot", "arm-1", "--operator", "console")[0] == 0
     assert json.loads(Path("mesh-acl.json5").read_text())["default_permission"] == "deny"
     assert run("acl")[0] == 1
+
+
+def test_lockout_set_by_a_console_that_is_gone_is_listed_and_resumed_from_another_terminal(
+    tmp_path: Path, machine: Machine
+) -> None:
+    key, secret = tmp_path / "operator.pem", tmp_path / "passphrase"
+    secret.write_text("Correct-Horse-7-Battery\n")
+    public = keygen(key, "Correct-Horse-7-Battery")
+    machine.environment["STRANDS_MESH_RESUME_PUBLIC_KEY"] = public
+    signed = ("resume", "--mesh", "--key", str(key), "--passphrase-file", str(secret))
+    with machine.serving("arm-1", "--mesh"):
+        epoch = machine.json("estop", "--mesh")[1]["estop_id"]
+        listed = machine.json("lockout", "--mesh")[1]["live"]["arm-1"]
+        assert (listed["locked"], epoch in [each["epoch"] for each in listed["holds"]]) == (True, True)
+        code, answer = machine.json(*signed)
+        assert (code, answer["devices"]) == (0, {"arm-1": {"free": True, "said": "free to move when told to"}})
+        assert machine.json("lockout", "--mesh")[1]["live"] == {"arm-1": {"locked": False, "holds": []}}
+
+
+def test_resume_of_a_silent_peer_of_the_mesh_is_no_success(tmp_path: Path, machine: Machine) -> None:
+    key, secret = tmp_path / "operator.pem", tmp_path / "passphrase"
+    secret.write_text("Correct-Horse-7-Battery\n")
+    keygen(key, "Correct-Horse-7-Battery")
+    signed = ("resume", "--mesh", "--key", str(key), "--passphrase-file", str(secret))
+    assert machine.json(*signed)[0] == 3
+    code, answer = machine.json(*signed, "--targets", "arm-9", "--timeout", "0.5")
+    assert (code, answer["devices"]["arm-9"]["free"]) == (1, False)

@@ -1,0 +1,104 @@
+"""The native mesh's side of ``lockout --mesh`` and ``resume --mesh``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.safety.lockout import OVERFLOW, Lockout
+from strands_robots.safety.resume import sign
+from strands_robots.utils import shown
+
+if TYPE_CHECKING:
+    from strands_robots.mesh import Mesh
+
+PARALLEL_REQUESTS = 8
+RELAYED_S = 1.0
+"""Seconds in which a resume reaches all robots from the first one, before each is asked by itself."""
+
+
+def lockable_peers(mesh: Mesh) -> list[str]:
+    """Return the peers in reach that have a robot, without a world's children."""
+    rows = {row["peer_id"]: row for row in mesh.peers if row["reachable"]}
+    return [
+        name
+        for name, row in rows.items()
+        if ("locked" in row or "tool_name" in row) and name.rpartition("__")[0] not in rows
+    ]
+
+
+def ask_peers(mesh: Mesh, names: Iterable[str], seconds: float) -> dict[str, tuple[tuple[Lockout, ...], str]]:
+    """Return each peer's lockouts by name, and the reason where it reports none."""
+    wanted = list(dict.fromkeys(names))
+    with ThreadPoolExecutor(PARALLEL_REQUESTS) as pool:
+        return dict(zip(wanted, pool.map(lambda name: _ask(mesh, name, seconds), wanted), strict=True))
+
+
+def resume_peers(
+    mesh: Mesh, locked: Mapping[str, tuple[Lockout, ...]], signer: Any, seconds: float
+) -> dict[str, tuple[bool, str]]:
+    """Resume every epoch of these peers; return each one's outcome.
+
+    A resume is sent to one of its targets, which relays it. A robot that is still locked then gets a resume of its own.
+    """
+    names: dict[str, list[str]] = {}
+    for name, lockouts in locked.items():
+        for each in lockouts:
+            names.setdefault(each.epoch, []).append(name)
+    said: dict[str, str] = {}
+    for epoch in names.keys() - {OVERFLOW}:
+        for assertion in sign(signer, epoch, names[epoch]):
+            first = assertion["targets"][0]
+            said[first] = _send(mesh, first, assertion, seconds)
+    left = _still_locked(mesh, locked, RELAYED_S)
+    for name, lockouts in left.items():
+        for each in lockouts:
+            for assertion in sign(signer, each.epoch, [name]) if each.epoch != OVERFLOW else ():
+                said[name] = _send(mesh, name, assertion, seconds)
+    left = _still_locked(mesh, left, seconds) if left else left
+    return {
+        name: (name not in left, _outcome(lockouts, left.get(name), said.get(name, "")))
+        for name, lockouts in locked.items()
+    }
+
+
+def _still_locked(
+    mesh: Mesh, locked: Mapping[str, tuple[Lockout, ...]], within: float
+) -> dict[str, tuple[Lockout, ...]]:
+    """Ask until all are free, at most ``within`` seconds; return those that are not."""
+    left = {name: lockouts for name, lockouts in locked.items() if lockouts}
+    deadline = time.monotonic() + within
+    while left:
+        answers = ask_peers(mesh, left, within)
+        left = {name: lockouts or left[name] for name, (lockouts, problem) in answers.items() if lockouts or problem}
+        if time.monotonic() >= deadline:
+            break
+        time.sleep(0.05)
+    return left
+
+
+def _outcome(before: tuple[Lockout, ...], left: tuple[Lockout, ...] | None, said: str) -> str:
+    if left is None:
+        return "free to move when told to" if before else "was not locked"
+    if any(each.epoch == OVERFLOW for each in left):
+        return "more stops than it can keep apart; resume --local at its own machine"
+    return f"{said or 'it did not confirm'}: its own audit says why"
+
+
+def _ask(mesh: Mesh, name: str, seconds: float) -> tuple[tuple[Lockout, ...], str]:
+    reply = mesh.send(name, {"action": "status"}, seconds)
+    result = reply.get("result")
+    if reply.get("type") != "response" or not isinstance(result, Mapping):
+        return (), shown(reply.get("error")) if reply.get("error") else "no answer"
+    rows = result.get("lockout")
+    if not isinstance(rows, list):
+        return (), "it does not report lockouts"
+    return tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping)), ""
+
+
+def _send(mesh: Mesh, name: str, assertion: Mapping[str, Any], seconds: float) -> str:
+    reply = mesh.send(name, {"action": "resume", "assertion": assertion}, seconds)
+    result = reply.get("result")
+    return str(result.get("error", "")) if isinstance(result, Mapping) else str(reply.get("error") or "no answer")
