@@ -74,7 +74,7 @@ def test_hardware_lockout_is_stored_under_its_own_key(peers: Fleet, tmp_path: Pa
     peers.join(arm, "arm-1").emergency_stop()
 
     def stored() -> list[list[str]]:
-        return [list(LockoutStore(path.parent).load_all()) for path in tmp_path.rglob("lockouts.json")]
+        return [list(LockoutStore(path.parent).load_all()) for path in tmp_path.rglob("lockouts")]
 
     # A stop waits for no disk.
     eventually(lambda: stored() == [["hardware:so101:left"]])

@@ -16,6 +16,8 @@ from fixtures.waiting import eventually
 from strands_robots.audit import read_audit_log
 from strands_robots.contract import AdaptedRobot
 from strands_robots.envelope import is_error
+from strands_robots.safety import plane as plane_module
+from strands_robots.safety import reporting
 from strands_robots.safety.orders import RobotReport, StopOrder, derived_epoch, epoch_of, new_epoch
 from strands_robots.safety.persistence import LockoutStore, hardware_key
 from strands_robots.safety.plane import SafetyPlane
@@ -231,6 +233,56 @@ def test_a_lockout_that_cannot_be_written_is_still_reported(
     assert (report.stopped, report.persisted) == (True, False)
     assert robot.refuses()
     assert "not on the disk" in caplog.text
+
+
+def test_lockout_and_clearing_that_could_not_be_written_are_written_when_they_can(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(plane_module, "KEEP_AGAIN_S", 0.0)
+    add(key="k")
+    save, full = plane.store.save, threading.Event()
+
+    def limited(kept: Any) -> None:
+        if full.is_set():
+            raise OSError(28, "No space left on device")
+        save(kept)
+
+    monkeypatch.setattr(plane.store, "save", limited)
+    for locked in (True, False):
+        full.set()
+        if locked:
+            assert plane.emergency_stop(order())["arm-1"].persisted is False
+        else:
+            plane.clear_local("ann")
+        assert LockoutStore().load("k").state.locked is not locked
+        full.clear()
+        eventually(lambda locked=locked: LockoutStore().load("k").state.locked is locked)
+    kept = eventually(
+        lambda: len(all_ := [each for each in read_audit_log() if each["event"] == "lockout_kept"]) == 2 and all_
+    )
+    assert [bool(each["payload"]["epochs"]) for each in kept] == [True, False]
+    assert "is written now" in caplog.text
+
+
+def test_lockout_that_a_slow_disk_keeps_after_the_report_is_reported_again(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "KEEP_S", 0.05)
+    add(key="k")
+    save, slow = plane.store.save, threading.Event()
+
+    def waiting(kept: Any) -> None:
+        assert slow.wait(60)
+        save(kept)
+
+    monkeypatch.setattr(plane.store, "save", waiting)
+    epoch, seen = new_epoch(), list[RobotReport]()
+    plane.emergency_stop(order(epoch), seen.append)
+    slow.set()
+    eventually(lambda: len(seen) == 2)
+    assert [(each.persisted, each.late) for each in seen] == [(False, False), (True, True)]
+    plane.begin(order(epoch), seen.append)
+    assert (seen[-1].persisted, seen[-1].repeated) == (True, True)
 
 
 def test_a_stop_that_was_resumed_and_comes_again_is_not_said_to_have_stopped(plane: SafetyPlane, add: Add) -> None:

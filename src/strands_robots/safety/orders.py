@@ -73,7 +73,8 @@ class RobotReport:
     """Answer of one robot to one emergency stop.
 
     ``elapsed_ms`` is from receipt to the halt's answer. ``persisted`` is None for a robot whose lockout is not
-    kept. ``repeated``: this stop was known already; ``late``: the halt answered after it was reported missing.
+    kept. ``repeated``: this stop was known already; ``late``: reported again, because the halt answered, or the
+    lockout was kept, after that was reported missing.
     """
 
     robot_id: str

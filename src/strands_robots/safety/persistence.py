@@ -1,19 +1,22 @@
-"""Lockouts on disk: one file for all robots of this machine.
+"""Lockouts on disk: one file for each robot of this machine.
 
 A robot is kept under a key that outlives the process (see :func:`hardware_key`); a robot without one, an unnamed
-simulation, is not kept. A file that cannot be read locks: a robot whose record is unreadable comes up
-under the overflow epoch, which an operator at the machine clears.
+simulation, is not kept. Files of different robots never wait for one another, whichever processes write them. A file
+that cannot be read locks: its robot comes up under the overflow epoch, which an operator at the machine clears.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import hashlib
 import json
 import logging
 import os
+import re
+import threading
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,8 +27,10 @@ from strands_robots.safety.resume import is_epoch
 
 logger = logging.getLogger(__name__)
 
-VERSION = 1
-LOCK_WAIT_S = 0.5
+VERSION = 2
+VERSION_OF_ALL = 1
+"""Version of ``lockouts.json``, in which earlier releases kept all robots of a machine."""
+
 FILE_MAX_BYTES = 16 * 2**20
 
 
@@ -49,80 +54,135 @@ def simulation_key(peer_id: str) -> str:
 
 
 class LockoutStore:
-    """File ``lockouts.json`` in ``directory``, by default the state directory."""
+    """Directory ``lockouts`` in ``state``, by default the state directory.
 
-    def __init__(self, directory: Path | None = None) -> None:
-        self._directory = directory
+    ``lockouts.json`` of an earlier release is read for robots that have no file of their own yet, and put aside if
+    it cannot be read.
+    """
+
+    def __init__(self, state: Path | None = None) -> None:
+        self._state = state
 
     @property
-    def path(self) -> Path:
-        """The file."""
-        return (self._directory or state_dir()) / "lockouts.json"
+    def directory(self) -> Path:
+        """The directory of the files."""
+        return (self._state or state_dir()) / "lockouts"
 
     @property
-    def _aside(self) -> Path:
-        return self.path.with_suffix(".unreadable")
+    def file_of_all(self) -> Path:
+        """The one file of an earlier release."""
+        return self.directory.with_suffix(".json")
+
+    def file(self, key: str) -> Path:
+        """The file of one robot, named for a person and distinct by a hash."""
+        readable = re.sub(r"[^A-Za-z0-9._-]+", "_", key)[:64]
+        return self.directory / f"{readable}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.json"
 
     def load(self, key: str) -> StoredLockout:
         """Return the record of ``key``: empty if absent, locked if unreadable.
 
-        A robot without a record is locked as well while a file that could not be read lies aside.
+        A robot without a record is locked as well while a ``lockouts.json`` that could not be read lies there, or lies
+        aside as ``lockouts.unreadable``.
         """
         try:
             return self._found(key)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as exc:
-            logger.critical("%s cannot be read (%s): %s comes up locked.", self.path, exc, key)
+        except (OSError, ValueError) as exc:
+            logger.critical("The lockout file of %s cannot be read (%s): it comes up locked.", key, exc)
             unreadable = Lockout(OVERFLOW, "this machine", "the lockout file is unreadable", time.time())
             return StoredLockout(LockoutState(overflow=unreadable))
-
-    def _found(self, key: str) -> StoredLockout:
-        record = self._read().get(key)
-        if record is not None:
-            return _kept(record)
-        if self._aside.exists():
-            raise ValueError(f"what was kept of this robot may stand in {self._aside.name}")
-        return StoredLockout()
 
     def load_all(self) -> dict[str, StoredLockout]:
         """Every record, by key.
 
         Raises:
-            OSError, ValueError: the file cannot be read or is no record of lockouts.
+            OSError, ValueError: a file cannot be read or is no record of lockouts.
         """
-        try:
-            return {key: _kept(record) for key, record in self._read().items()}
-        except (KeyError, TypeError, AttributeError) as exc:
-            raise ValueError(f"{self.path} holds no record of lockouts: {exc!r}") from exc
+        found = {key: _kept(record) for key, record in self._of_all().items()}
+        for path in self._files():
+            record = _read(path, VERSION)
+            if record is not None:
+                found[str(record.get("key", path.name))] = _kept(record)
+        return found
 
     def save(self, kept: Mapping[str, StoredLockout]) -> None:
-        """Write these records beside those of other processes, and wait.
+        """Write these records, and return when all are on the disk.
 
         Raises:
-            OSError: not written; TimeoutError (one of its kinds) when another process holds the file.
+            OSError: not written.
         """
-        path = self.path
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with _locked(path.with_name("lockouts.lock")):
-            try:
-                records = self._read()
-            except ValueError:
-                # The unreadable file is set aside for a person; a robot without a record comes up locked by it.
-                path.replace(self._aside)
-                records = {}
-            records.update({key: _record(each) for key, each in kept.items()})
-            _replace(path, {"v": VERSION, "robots": records})
+        directory = self.directory
+        if not directory.exists():
+            directory.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            directory.mkdir(mode=0o700, exist_ok=True)
+            _sync(directory.parent)
+        self._put_aside()
+        with ExitStack() as files:
+            # All are written before the first is waited for: the disk takes them together.
+            drafts = {self.file(key): files.enter_context(_draft(self.file(key))) for key in kept}
+            for (key, each), descriptor in zip(kept.items(), drafts.values(), strict=True):
+                _write(descriptor, {"v": VERSION, "key": key, **_record(each)})
+            for path, descriptor in drafts.items():
+                os.fsync(descriptor)
+                _draft_of(path).replace(path)
+        _sync(directory)
 
-    def _read(self) -> dict[str, Any]:
+    def _found(self, key: str) -> StoredLockout:
+        path = self.file(key)
+        record = _read(path, VERSION)
+        if record is not None:
+            if record.get("key") != key:
+                raise ValueError(f"{path.name} is of another robot")
+            return _kept(record)
+        earlier = self._of_all().get(key)
+        if earlier is not None:
+            return _kept(earlier)
+        if self._aside.exists():
+            raise ValueError(f"what was kept of this robot may stand in {self._aside.name}")
+        return StoredLockout()
+
+    @property
+    def _aside(self) -> Path:
+        return self.file_of_all.with_suffix(".unreadable")
+
+    def _put_aside(self) -> None:
+        """Keep an unreadable file of an earlier release for a person to look at."""
         try:
-            descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            self._of_all()
+        except ValueError:
+            with contextlib.suppress(FileNotFoundError):  # another process was first
+                self.file_of_all.replace(self._aside)
+
+    def _files(self) -> list[Path]:
+        try:
+            return sorted(path for path in self.directory.iterdir() if path.suffix == ".json")
         except FileNotFoundError:
+            return []
+
+    def _of_all(self) -> dict[str, Any]:
+        data = _read(self.file_of_all, VERSION_OF_ALL)
+        if data is None:
             return {}
-        with os.fdopen(descriptor, "rb") as file:
-            data = json.loads(file.read(FILE_MAX_BYTES))
-        if not isinstance(data, dict) or data.get("v") != VERSION or not isinstance(data.get("robots"), dict):
-            raise ValueError("not a record of lockouts")
-        robots: dict[str, Any] = data["robots"]
+        robots = data.get("robots")
+        if robots is None or not isinstance(robots, dict):
+            raise ValueError(f"{self.file_of_all.name} is no record of lockouts")
         return robots
+
+
+def _read(path: Path, version: int) -> dict[str, Any] | None:
+    """Return what a file of lockouts holds, None where there is no file.
+
+    Raises:
+        OSError, ValueError: it cannot be read, or is none of this version.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+    with os.fdopen(descriptor, "rb") as file:
+        data = json.loads(file.read(FILE_MAX_BYTES))
+    if not isinstance(data, dict) or data.get("v") != version:
+        raise ValueError(f"{path.name} is no record of lockouts")
+    return data
 
 
 def _record(kept: StoredLockout) -> dict[str, Any]:
@@ -135,6 +195,13 @@ def _record(kept: StoredLockout) -> dict[str, Any]:
 
 
 def _kept(record: Mapping[str, Any]) -> StoredLockout:
+    try:
+        return _stored(record)
+    except (KeyError, TypeError, AttributeError) as exc:
+        raise ValueError(f"no record of lockouts: {exc!r}") from exc
+
+
+def _stored(record: Mapping[str, Any]) -> StoredLockout:
     lockouts = tuple(_lockout(each) for each in record["holds"])
     overflow = _lockout(record["overflow"]) if record["overflow"] is not None else None
     if len(lockouts) > MAX_EPOCHS or len({each.epoch for each in lockouts}) != len(lockouts):
@@ -150,34 +217,32 @@ def _lockout(data: Mapping[str, Any]) -> Lockout:
     return lockout
 
 
-def _replace(path: Path, data: dict[str, Any]) -> None:
-    draft = path.with_suffix(".draft")
-    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
-    with os.fdopen(os.open(draft, flags, 0o600), "wb") as file:
-        file.write(json.dumps(data, separators=(",", ":")).encode())
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
-    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
-
-
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+def _draft(path: Path) -> Iterator[int]:
+    """Open the draft of ``path``, and remove it unless it was renamed."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+    descriptor = os.open(_draft_of(path), flags, 0o600)
     try:
-        deadline = time.monotonic() + LOCK_WAIT_S
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() >= deadline:
-                    raise TimeoutError(f"{path} is held by another process") from None
-                time.sleep(0.005)
-        yield
+        yield descriptor
+    finally:
+        os.close(descriptor)
+        _draft_of(path).unlink(missing_ok=True)
+
+
+def _draft_of(path: Path) -> Path:
+    # Of this writer: another process may clear a robot that is just coming up here.
+    return path.with_suffix(f".{os.getpid()}-{threading.get_ident()}.draft")
+
+
+def _write(descriptor: int, data: Mapping[str, Any]) -> None:
+    text = json.dumps(data, separators=(",", ":")).encode()
+    if os.write(descriptor, text) != len(text):
+        raise OSError("a part of the lockout fitted on the disk")
+
+
+def _sync(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
     finally:
         os.close(descriptor)

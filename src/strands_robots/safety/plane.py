@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import threading
@@ -30,6 +31,9 @@ from strands_robots.utils import ValidationError, identifier, shown
 logger = logging.getLogger(__name__)
 
 REPORTS_KEPT = 64
+KEEP_AGAIN_S = 1.0
+"""Seconds between two attempts to write a lockout, or its clearing, that could not be written."""
+
 ISSUER_EXCESS = 64
 """Different stops of one source after which the audit says so, once; they still stop."""
 
@@ -54,6 +58,7 @@ class Registered:
         self.gates: tuple[MotionGate, ...] = (robot.gate,)
         self.latch = LockoutLatch(wire_id, kept.state, kept.seen)
         self.on_disk = kept.state
+        self.keep_again = False
         self.verifier = ResumeVerifier([wire_id])
         self.reports: dict[str, RobotReport] = {}
         self._plane = plane
@@ -147,6 +152,7 @@ class SafetyPlane:
         self._executor = executor
         self._registering = threading.Lock()
         self._keeping = threading.Lock()
+        self._keep_at = 0.0
         self._robots: dict[str, Registered] = {}
         self._reporter: Reporter | None = None
         self._issued: dict[str, int] = {}
@@ -204,7 +210,7 @@ class SafetyPlane:
             self._inherit(entry)
             if not self._robots:
                 self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
-                self._reporter = Reporter(self._tick, self._look)
+                self._reporter = Reporter(self._tick, self._chore)
             self._robots = {**self._robots, robot_id: entry}
         if entry.locked:
             entry.come_up_locked()
@@ -381,18 +387,35 @@ class SafetyPlane:
         with self._keeping:
             due = [each for each in entries if each.key and each.latch.state is not each.on_disk]
             kept = {each: StoredLockout(each.latch.state, each.latch.seen, each.wire_id) for each in due}
-            if kept:
-                self.store.save({entry.key: record for entry, record in kept.items() if entry.key})
+            try:
+                if kept:
+                    self.store.save({entry.key: record for entry, record in kept.items() if entry.key})
+            except BaseException:
+                for entry in kept:
+                    entry.keep_again = True
+                raise
             for entry, record in kept.items():
                 entry.on_disk = record.state
+                if entry.keep_again:
+                    entry.keep_again = False
+                    logger.warning("The lockout file of %s is written now.", entry.robot_id)
+                    log_safety_event("lockout_kept", entry.robot_id, {"epochs": list(record.state.epochs)})
 
     def _kept(self, entries: Iterable[Registered]) -> bool:
         try:
             self._keep(entries)
         except OSError:
-            logger.critical("The lockout file was not written: after a restart the old state holds.", exc_info=True)
+            logger.critical("The lockout file was not written: until it is, a restart forgets this.", exc_info=True)
             return False
         return True
+
+    def _keep_again(self) -> None:
+        """Write what could not be written; the log and the audit say when it is."""
+        due = [each for each in self._robots.values() if each.keep_again]
+        if due and time.monotonic() >= self._keep_at:
+            self._keep_at = time.monotonic() + KEEP_AGAIN_S
+            with contextlib.suppress(OSError):  # reported when it failed first
+                self._keep(due)
 
     def _record(self, run: StopRun) -> None:
         order, now = run.order, time.time()
@@ -423,7 +446,8 @@ class SafetyPlane:
             reason = f"check-in lost: {names}, {self.checkin.timeout_s:g} s"
             self.begin(StopOrder(new_epoch(), "check-in", reason, path="check-in"))
 
-    def _look(self) -> None:
+    def _chore(self) -> None:
+        self._keep_again()
         if any(entry.locked for entry in self._robots.values()):
             self._clearance.look()
 

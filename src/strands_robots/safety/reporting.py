@@ -23,7 +23,9 @@ GRACE_S = 0.03
 """Lockouts are written when every robot has answered, or after this long: a slow halt delays only its own report."""
 
 KEEP_S = 0.7
-"""Seconds that a report waits for the lockout file before it says ``persisted: false``."""
+"""Seconds that a report waits for the lockout file before it says ``persisted: false``.
+
+When the file is written later, the robot is reported again."""
 
 OnReport = Callable[[RobotReport], None]
 OnDone = Callable[["StopRun"], None]
@@ -135,7 +137,7 @@ class Reporter:
                 elif isinstance(message, _Answer):
                     self._answered(message)
                 else:
-                    message.run.kept = message.ok
+                    self._keep_ended(message)
                 message = self._inbox.get_nowait()
         return True
 
@@ -149,6 +151,14 @@ class Reporter:
         if late is not None:
             logger.warning("%s answered its halt late: stopped=%s.", answer.robot_id, answer.verdict.stopped)
             self._report(run, answer.robot_id, late=True)
+
+    def _keep_ended(self, kept: _Kept) -> None:
+        run = kept.run
+        late, run.kept = run.kept is False and kept.ok, kept.ok
+        for robot_id in run.kept_ids if late else ():
+            if robot_id in run.reports:
+                logger.warning("%s: its lockout is on the disk now.", robot_id)
+                self._report(run, robot_id, late=True)
 
     def _advance(self, run: StopRun, now: float) -> None:
         waiting = [each for each in run.robot_ids if each not in run.answers]
@@ -204,11 +214,14 @@ class Reporter:
         _call(run.on_done, run)
 
     def _write(self) -> None:
+        due = time.monotonic() + self._chore_s
         while True:
-            try:
-                run = self._files.get(timeout=self._chore_s)
-            except queue.Empty:
+            if time.monotonic() >= due:
+                due = time.monotonic() + self._chore_s
                 _call(self._chore)
+            try:
+                run = self._files.get(timeout=max(0.0, due - time.monotonic()))
+            except queue.Empty:
                 continue
             if run is None:
                 return

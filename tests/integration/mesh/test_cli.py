@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 from fixtures.command_line import Machine
@@ -14,6 +13,7 @@ from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
 from strands_robots.mesh.resume_authority import keygen
+from strands_robots.safety.persistence import LockoutStore
 
 
 @pytest.fixture
@@ -22,9 +22,9 @@ def machine(tmp_path: Path, port: int) -> Machine:
     return Machine(tmp_path / "state", STRANDS_MESH_PORT=str(port))
 
 
-def lockouts(file: Path) -> dict[str, list[dict[str, Any]]]:
-    """The lockouts of each robot by name, as stored in a lockout file."""
-    return {each["name"]: each["holds"] for each in json.loads(file.read_text())["robots"].values()}
+def lockouts(store: LockoutStore) -> dict[str, bool]:
+    """Whether each robot by name is stored as locked."""
+    return {each.name: each.state.locked for each in store.load_all().values()}
 
 
 def test_served_arm_is_listed_from_another_terminal_and_stopped_by_ctrl_c(machine: Machine) -> None:
@@ -43,11 +43,10 @@ def test_served_arm_is_stopped_locked_and_cleared_from_another_terminal(tmp_path
         code, answer = machine.json("estop", "--mesh")
         assert (code, answer["stopped"], list(answer["robots"])) == (0, True, ["arm-1"])
         # It is locked at once and stored a moment later, because no disk may delay a halt.
-        file = tmp_path / "state" / "lockouts.json"
-        eventually(lambda: file.exists() and lockouts(file))
-        assert list(lockouts(file)) == ["arm-1"]
+        store = LockoutStore(tmp_path / "state")
+        eventually(lambda: lockouts(store) == {"arm-1": True})
         assert machine.json("resume", "--local", "arm-1")[0] == 0
-        assert lockouts(file) == {"arm-1": []}
+        assert lockouts(store) == {"arm-1": False}
 
 
 def test_unanswered_stop_is_no_success(machine: Machine) -> None:

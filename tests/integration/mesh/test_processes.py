@@ -11,6 +11,7 @@ from tests.integration.mesh.conftest import Join
 
 from strands_robots.mesh.registry import PEER_TIMEOUT
 from strands_robots.mesh.resume_authority import keygen
+from strands_robots.safety.persistence import LockoutStore
 
 
 def test_two_processes_without_configuration_see_and_command_each_other(join: Join) -> None:
@@ -107,8 +108,8 @@ def test_a_locked_robot_comes_back_locked_from_a_restart(join: Join, tmp_path: P
     eventually(lambda: robot.ask("epoch"))
     epoch = robot.ask("epoch")
     # It is locked at once and stored a moment later, because no disk may delay a halt.
-    stored = tmp_path / "arm-1" / "lockouts.json"
-    eventually(lambda: stored.exists() and epoch in stored.read_text())
+    stored = LockoutStore(tmp_path / "arm-1")
+    eventually(lambda: [each.state.epochs for each in stored.load_all().values()] == [(epoch,)])
     robot.kill()
     assert join("arm-1", "arm").ask("epoch") == epoch
 

@@ -17,6 +17,7 @@ from tests.integration.safety.conftest import Stage
 
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.persistence import LockoutStore
 
 
 def recorded(robots: Child, epoch: str) -> list[dict[str, Any]]:
@@ -35,7 +36,8 @@ def test_a_stop_played_again_after_a_crash_holds_only_where_it_was_never_resumed
     robots.ask("clear")
     assert hand.ask("stop", ["arm-1"], 20.0, held)["ok"]
     # A verdict waits neither for a slow disk nor for the record; a kill -9 before the disk has it is another test's.
-    eventually(lambda: held in (stage.folder / "lockouts.json").read_text())
+    stored = LockoutStore(stage.folder)
+    eventually(lambda: [each.state.epochs for each in stored.load_all().values()] == [(held,)])
     assert eventually(lambda: recorded(robots, held))
     robots.kill()
     again = stage.robots("arm-1")
