@@ -13,7 +13,7 @@ from strands_robots.cli import safety_controller
 from strands_robots.cli.resume import LockoutReport
 from strands_robots.cli.safety_controller import FleetScreen, StopButton
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.safety.controller import Answer, StopReport
+from strands_robots.safety.controller import Answer, Progress, StopReport
 from strands_robots.safety.lockout import Lockout
 
 
@@ -25,12 +25,16 @@ class FakeController:
 
     def __init__(self) -> None:
         self.ids: list[str] = []
+        self.presses: list[str] = []
         self.expected: list[Collection[str]] = []
         self.answer = threading.Event()
         self.answer.set()
         self.links: list[bool] = []
         self.refused: dict[str, Answer] = {}
         self.silent: list[tuple[str, ...]] = []
+
+    def press(self, estop_id: str) -> None:
+        self.presses.append(estop_id)
 
     def stop(self, expected: Collection[str], reason: str, *, estop_id: str, on_progress: Any) -> StopReport:
         self.ids.append(estop_id)
@@ -97,6 +101,7 @@ def test_stop_that_never_left_is_repeated_with_its_id(controller: FakeController
     eventually(lambda: button.report is not None and not button.running)
     assert len(controller.ids) == 3
     assert len(set(controller.ids)) == 1
+    assert controller.presses == controller.ids[:1]
 
 
 def test_stop_is_repeated_until_no_robot_is_silent(controller: FakeController) -> None:
@@ -108,6 +113,19 @@ def test_stop_is_repeated_until_no_robot_is_silent(controller: FakeController) -
     assert len(set(controller.ids)) == 1
     assert button.report is not None
     assert button.report.silent == ()
+
+
+def test_screen_says_how_long_ago_a_stop_was_pressed(controller: FakeController) -> None:
+    fleet, button = FleetScreen(controller, loopback_config(), None), made(controller)  # type: ignore[arg-type]
+    fleet.update([LockoutReport("arm-1")])
+    button.progress = Progress("e" * 32, {}, ("arm-1",), False, 6600.0)
+    controller.answer.clear()
+    button.press()
+    assert "STOPPING, pressed 6.6 s ago: 0 answered" in drawn(fleet, button)
+    controller.answer.set()
+    eventually(lambda: not button.running)
+    button.progress = Progress("e" * 32, {"arm-1": Answer("arm-1", True, 11_021.0, "")}, (), True, 11_021.0, 11_000.0)
+    assert "stopped 11.0 s after the press" in drawn(fleet, button)
 
 
 def drawn(fleet: FleetScreen, button: StopButton) -> str:

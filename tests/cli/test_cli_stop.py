@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from tests.cli.conftest import FakeFleet, Run
 
 from strands_robots.cli.output import Exit
-from strands_robots.cli.stop import exit_code, progress_rows, report_rows
+from strands_robots.cli.stop import exit_code, progress_rows, report_rows, summary
 from strands_robots.device_connect import safety_controller
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.controller import Answer, Progress, StopReport
@@ -32,9 +33,13 @@ class FakeController:
     def __init__(self, stop_report: StopReport) -> None:
         self.report = stop_report
         self.calls: list[tuple[Collection[str], str]] = []
+        self.presses: list[str] = []
 
     def wait_link(self, timeout: float) -> bool:
         return True
+
+    def press(self, estop_id: str) -> None:
+        self.presses.append(estop_id)
 
     def stop(self, expected: Collection[str], reason: str, **more: Any) -> StopReport:
         self.calls.append((expected, reason))
@@ -82,6 +87,14 @@ def test_slow_and_silent_robots_are_red() -> None:
     styles = {row[0]: str(row[1].style) for row in progress_rows(progress)}
     assert styles == {"quick": "green", "slow": "bold red", "mute": "bold red"}
     assert report_rows(report(answer("a"), silent=("b",)))[0][0] == "b"
+
+
+def test_connecting_is_not_the_robots_time_and_an_outage_is_said() -> None:
+    connected = Progress("e" * 32, {"a": answer("a", ms=430.0)}, (), True, 430.0, 420.0)
+    assert str(progress_rows(connected)[0][2]) == "10.0"
+    outage = replace(report(answer("a", ms=11_010.0)), elapsed_ms=11_010.0, left_ms=11_000.0)
+    assert str(report_rows(outage)[0][2]) == "11010.0"
+    assert "1 stopped, in 11010 ms. It left 11.0 s after the press." in summary(outage)
 
 
 def test_exit_code_is_that_of_the_worst_answer() -> None:

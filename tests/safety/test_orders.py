@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Any
 
 import pytest
@@ -11,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots.safety import ed25519
-from strands_robots.safety.orders import PARSED_MAX_BYTES, StopOrder, StopRefused, StopRules, new_epoch, signed_fields
+from strands_robots.safety.orders import PARSED_MAX_BYTES, StopOrder, StopRefused, StopRules, new_epoch, signed_bytes
+from strands_robots.safety.statements import Purpose
 
 OPEN = StopRules(allow=(), keys=())
 
@@ -90,10 +92,12 @@ class Signer:
         self.key = Ed25519PrivateKey.generate()
         self.public = ed25519.public_half(self.key)
 
-    def params(self, source: str = "safety-1", **changes: Any) -> dict[str, Any]:
-        fields = {"estop_id": new_epoch(), "t": 12.5, "nonce": new_epoch()}
-        message = signed_fields(fields["estop_id"], source, fields["t"], fields["nonce"])
-        return {**fields, "reason": "smoke", "sig": ed25519.encode(self.key.sign(message)), **changes}
+    def params(
+        self, source: str = "safety-1", purpose: Purpose = Purpose.EMERGENCY_STOP, **changes: Any
+    ) -> dict[str, Any]:
+        fields = {"estop_id": new_epoch(), "t": 12.5, "pressed_at": 12.0, "nonce": new_epoch(), "reason": "smoke"}
+        message = signed_bytes(purpose, source, fields)
+        return {**fields, "sig": ed25519.encode(self.key.sign(message)), **changes}
 
 
 def test_with_keys_only_a_signed_stop_counts() -> None:
@@ -116,6 +120,10 @@ def test_with_keys_only_a_signed_stop_counts() -> None:
         {"t": None},
         {"t": True},
         {"t": 10**400},
+        {"pressed_at": 11.0},
+        {"pressed_at": None},
+        {"reason": "fire"},
+        {"reason": "x" * 300},
     ],
 )
 def test_a_signature_over_anything_else_does_not_count(change: dict[str, Any]) -> None:
@@ -128,6 +136,63 @@ def test_a_signed_stop_of_another_source_does_not_count() -> None:
     signer = Signer()
     rules = StopRules(allow=(), keys=(signer.public,))
     assert isinstance(rules.order("safety-2", signer.params(), "lane"), StopRefused)
+
+
+def test_a_check_in_that_was_recorded_is_no_emergency_stop() -> None:
+    signer = Signer()
+    rules = StopRules(allow=(), keys=(signer.public,))
+    recorded = signer.params(purpose=Purpose.CHECK_IN)
+    assert rules.signature_refusal("safety-1", recorded, Purpose.CHECK_IN) is None
+    for renamed in (recorded, {**recorded, "purpose": "emergency-stop"}):
+        refused = rules.order_of("safety-1", event(**renamed))
+        assert isinstance(refused, StopRefused)
+        assert "emergency-stop" in refused.why
+
+
+def test_an_emergency_stop_that_was_recorded_is_no_check_in() -> None:
+    signer = Signer()
+    rules = StopRules(allow=(), keys=(signer.public,))
+    assert rules.signature_refusal("safety-1", signer.params(), Purpose.CHECK_IN) is not None
+
+
+def stop_at(sent: float, pressed: float | None, **more: Any) -> StopOrder:
+    return StopOrder(new_epoch(), "safety-1", issued=sent, pressed=pressed, **more)
+
+
+@pytest.mark.parametrize(
+    ("sent", "pressed", "ahead", "received", "timing", "delay"),
+    [
+        (100.0, 100.0, None, 100.01, "on time", 0.0),
+        (111.0, 100.0, None, 111.01, "late", 11.0),
+        (101.2, 100.0, None, 101.2, "late", 1.2),
+        (100.9, 100.0, 0.0, 101.2, "late", 1.2),
+        (100.0, 100.0, 30.0, 130.2, "on time", 0.2),
+        (100.0, 100.0, 30.0, 132.0, "late", 2.0),
+        (100.0, 100.0, -30.0, 70.1, "on time", 0.1),
+        (100.0, 100.0, None, 130.0, "on time", 0.0),
+        (100.0, 100.0, None, 161.0, "late", 0.0),
+        (100.0, 100.0, None, 90.0, "ahead", 0.0),
+        (100.0, 105.0, None, 100.0, "on time", 0.0),
+        (100.0, None, 0.0, 111.0, "on time", None),
+        (100.0, None, 0.0, 161.0, "late", None),
+    ],
+)
+def test_a_stop_is_late_by_the_time_since_its_press_whatever_the_clocks(
+    sent: float, pressed: float | None, ahead: float | None, received: float, timing: str, delay: float | None
+) -> None:
+    order = stop_at(sent, pressed, clock_ahead_s=ahead)
+    assert order.timing(received) == timing
+    assert order.delay_s(received) == (delay if delay is None else pytest.approx(delay))
+
+
+def test_clocks_are_compared_by_the_messages_of_a_source_that_counts() -> None:
+    now = 1000.0
+    rules = StopRules(allow=(), keys=(), clock=lambda: now)
+    rules.compare_clock("safety-1", {"t": 970.0}, time.monotonic())
+    order = counted(rules.order_of("safety-1", event(estop_id=new_epoch(), t=969.0, pressed_at=968.5)))
+    assert order.clock_ahead_s == pytest.approx(30.0, abs=0.1)
+    assert order.delay_s(order.received_at) == pytest.approx(1.5, abs=0.1)
+    assert counted(rules.order_of("safety-2", event(t=969.0))).clock_ahead_s is None
 
 
 def test_a_mistyped_key_leaves_the_fleet_stoppable_and_says_so(

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 FOLLOW_S = 0.3
 FIRST_FIELDS = ("stopped", "source", "who", "why", "reason", "estop_id", "epoch")
-HIDDEN_FIELDS = ("device_id", "epochs", "issued", "timing", "repeated", "late", "road", "persisted")
+HIDDEN_FIELDS = ("device_id", "epochs", "issued", "pressed_at", "timing", "repeated", "late", "road", "persisted")
 
 
 def register(app: typer.Typer) -> None:

@@ -23,7 +23,7 @@ from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
 from strands_robots.cli.resume import LockoutReport, ask_robots, lockable_robots
-from strands_robots.cli.stop import SLOW_MS, exit_code, summary
+from strands_robots.cli.stop import LATE_MS, SLOW_MS, exit_code, summary
 from strands_robots.safety.controller import Answer, Progress, SafetyController, StopReport
 from strands_robots.safety.lockout import utc
 from strands_robots.safety.orders import new_epoch
@@ -165,6 +165,7 @@ class StopButton:
                 return
             if not (repeated and self._id):
                 self._id = new_epoch()
+                self._controller.press(self._id)
             self._running = True
             threading.Thread(target=self._stop, args=(self._id,), name="space bar", daemon=True).start()
 
@@ -285,6 +286,8 @@ def _stop_cell(answer: Answer | None) -> Text | str:
     if answer is None:
         return ""
     if answer.stopped:
+        if answer.latency_ms > LATE_MS:
+            return label(f"stopped {answer.latency_ms / 1000:.1f} s after the press", "bold red")
         slow = answer.latency_ms > SLOW_MS
         return label(f"stopped in {answer.latency_ms:.1f} ms", "bold red" if slow else "green")
     return label("DID NOT STOP" if answer.stopped is False else "UNKNOWN", "bold red")
@@ -303,7 +306,9 @@ def _outcome(button: StopButton) -> Text:
         silent = button.progress.unconfirmed
         waiting = f"; unconfirmed: {', '.join(silent)}" if silent else ""
         link = "" if button.progress.link_up else "; THE LINK IS DOWN, the stop leaves when it is back"
-        return label(f"STOPPING: {len(button.progress.answered)} answered{waiting}{link}", "bold red")
+        elapsed = button.progress.elapsed_ms
+        age = f", pressed {elapsed / 1000:.1f} s ago" if elapsed > LATE_MS else ""
+        return label(f"STOPPING{age}: {len(button.progress.answered)} answered{waiting}{link}", "bold red")
     if button.report is None:
         return label("")
     report = button.report

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 SLOW_MS = 100.0
 """An answer that took longer is shown in red."""
 
+LATE_MS = 1000.0
+"""A stop that left later than this after the press says so."""
+
 LOCKED = "They are locked until they are resumed: strands-robots resume."
 LOCKED_MESH = (
     "They are locked until they are resumed: strands-robots resume --mesh --key FILE, or resume --local where they run."
@@ -147,6 +150,7 @@ class RunningStop:
         self._controller, self._expected, self._reason = controller, expected, reason
         self._deadline_s, self._link = deadline_s, link
         self._id = new_epoch()
+        controller.press(self._id)
         self._lookup: threading.Thread | None = None
         self.report: Future[StopReport] = Future()
         threading.Thread(target=self._run, name="estop", daemon=True).start()
@@ -204,20 +208,22 @@ def summary(report: StopReport) -> str:
         (report.silent, "silent"),
     ):
         parts += [f"{len(robots)} {outcome}"] if robots else []
-    return f"{', '.join(parts)}, in {report.elapsed_ms:.0f} ms. Emergency stop {report.estop_id}."
+    late = f" It left {report.left_ms / 1000:.1f} s after the press." if report.left_ms > LATE_MS else ""
+    return f"{', '.join(parts)}, in {report.elapsed_ms:.0f} ms.{late} Emergency stop {report.estop_id}."
 
 
 def report_rows(report: StopReport) -> list[tuple[Any, ...]]:
     """Return one row for each robot of a finished stop, the worst first."""
-    worst = [_row(name, each) for name, each in sorted({**report.not_stopped, **report.refused}.items())]
+    left_ms = report.left_ms
+    worst = [_row(name, each, left_ms) for name, each in sorted({**report.not_stopped, **report.refused}.items())]
     worst += [_silent_row(name, "NO ANSWER") for name in report.silent]
     slowest = sorted(report.stopped.items(), key=lambda each: -each[1].latency_ms)
-    return [*worst, *(_row(*each) for each in slowest)]
+    return [*worst, *(_row(*each, left_ms) for each in slowest)]
 
 
 def progress_rows(progress: Progress) -> list[tuple[Any, ...]]:
     """Return one row for each robot of a stop in progress."""
-    answered = [_row(*each) for each in sorted(progress.answered.items())]
+    answered = [_row(*each, progress.left_ms) for each in sorted(progress.answered.items())]
     return [*(_silent_row(name, "unconfirmed") for name in progress.unconfirmed), *answered]
 
 
@@ -233,20 +239,26 @@ def _watch(screen: Screen, running: RunningStop) -> StopReport:
     with captured_log(), Live(_table([], "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
         while not wait([running.report], POLL_S).done:
             if running.latest is not None:
-                link = "" if running.latest.link_up else ": THE LINK IS DOWN"
-                live.update(_table(progress_rows(running.latest), f"EMERGENCY STOP{link}"), refresh=True)
+                live.update(_table(progress_rows(running.latest), _title(running.latest)), refresh=True)
         report = running.report.result()
         live.update(_table(report_rows(report), "EMERGENCY STOP"), refresh=True)
     return report
 
 
-def _row(name: str, answer: Answer) -> tuple[Any, ...]:
-    slow = "bold red" if answer.latency_ms > SLOW_MS else ""
+def _title(progress: Progress) -> str:
+    age = f", pressed {progress.elapsed_ms / 1000:.1f} s ago" if progress.elapsed_ms > LATE_MS else ""
+    return f"EMERGENCY STOP{age}" + ("" if progress.link_up else ": THE LINK IS DOWN")
+
+
+def _row(name: str, answer: Answer, left_ms: float) -> tuple[Any, ...]:
+    # Connecting takes this command some tenths of a second; the table shows the robots' time, the summary the rest.
+    took_ms = answer.latency_ms - (left_ms if left_ms <= LATE_MS else 0.0)
+    slow = "bold red" if took_ms > SLOW_MS else ""
     still = "stopped, settling" if answer.facts.get("settling") is True else "stopped"
     mark = label(still, slow or "green") if answer.stopped else label("DID NOT STOP", "bold red")
     if answer.stopped is None:
         mark = label("UNKNOWN", "bold red")
-    return name, mark, label(f"{answer.latency_ms:.1f}", slow), answer.why or _halted(answer.facts)
+    return name, mark, label(f"{took_ms:.1f}", slow), answer.why or _halted(answer.facts)
 
 
 def _silent_row(name: str, mark: str) -> tuple[Any, ...]:

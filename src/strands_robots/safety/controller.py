@@ -17,7 +17,8 @@ from typing import Any
 
 from strands_robots.safety import ed25519
 from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, RenewableLink, StopLink, notification
-from strands_robots.safety.orders import new_epoch, signed_fields
+from strands_robots.safety.orders import REASON_MAX, new_epoch, signed_bytes
+from strands_robots.safety.statements import Purpose
 from strands_robots.utils import ValidationError, device_id, number
 
 logger = logging.getLogger(__name__)
@@ -33,12 +34,15 @@ SETTLE_S = 1.0
 """A stop goes on for at least so long before it has the connection made anew."""
 
 DEADLINE_S = 3.0
+PRESSES_MAX = 64
+"""Presses remembered, so that a stop that goes on under its id keeps the time of its press."""
+
 REFUSED = "resumed before"
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One robot's verdict; ``latency_ms`` is from ``stop`` to its receipt here."""
+    """One robot's verdict; ``latency_ms`` is from the press to its receipt here."""
 
     device_id: str
     stopped: bool | None
@@ -48,12 +52,20 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
+class Press:
+    """The moment of a press, in monotonic and in wall-clock seconds."""
+
+    at: float
+    wall: float
+
+
+@dataclass(frozen=True, slots=True)
 class StopReport:
     """Outcome of one emergency stop, by robot.
 
     ``stopped``, ``not_stopped`` and ``refused`` map a robot to its answer; ``silent`` are the expected ones that
-    gave none. ``link``: the stop left this machine at least once. ``elapsed_ms`` is the time until the last answer
-    or the deadline.
+    gave none. ``link``: the stop left this machine at least once. ``elapsed_ms`` is the time from the press until the
+    last answer or the deadline, ``left_ms`` until the stop first left this machine.
     """
 
     estop_id: str
@@ -63,6 +75,7 @@ class StopReport:
     silent: tuple[str, ...]
     link: bool
     elapsed_ms: float
+    left_ms: float = 0.0
 
     @property
     def ok(self) -> bool:
@@ -72,13 +85,14 @@ class StopReport:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """State of a running stop; given to ``on_progress`` at each change."""
+    """State of a running stop, given to ``on_progress``; times as in the report."""
 
     estop_id: str
     answered: Mapping[str, Answer]
     unconfirmed: tuple[str, ...]
     link_up: bool
     elapsed_ms: float
+    left_ms: float = 0.0
 
 
 OnProgress = Callable[[Progress], None]
@@ -107,6 +121,7 @@ class SafetyController:
         self._on_link = on_link
         self._changed = threading.Condition()
         self._stops: dict[str, _Running] = {}
+        self._presses: dict[str, Press] = {}
         self._closing = threading.Event()
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
@@ -148,18 +163,30 @@ class SafetyController:
         number("deadline_s", deadline_s, above=0, high=3600)
         if isinstance(expected, str):
             raise ValidationError(f"expected must be a collection of robot ids, not the text {expected!r}.")
-        run = _Running(estop_id or new_epoch(), frozenset(expected), time.monotonic())
-        payload = self._signed(ESTOP, run.estop_id, {"reason": reason[:200]})
+        estop_id = estop_id or new_epoch()
+        press = self.press(estop_id)
+        run = _Running(estop_id, frozenset(expected), time.monotonic(), press, reason[:REASON_MAX])
         with self._changed:
             self._stops[run.estop_id] = run
         try:
             # The first one is sent before anything else is done.
-            run.sent = self._link.publish(self.controller_id, ESTOP, payload)
-            self._repeat(run, payload, deadline_s, on_progress)
+            self._send(run)
+            self._repeat(run, deadline_s, on_progress)
         finally:
             with self._changed:
                 del self._stops[run.estop_id]
         return self._report(run)
+
+    def press(self, estop_id: str) -> Press:
+        """Record the press of a stop, once; every later call gives the same moment.
+
+        ``stop`` does so by itself. A caller that waits between the press and ``stop`` calls this first.
+        """
+        with self._changed:
+            press = self._presses.setdefault(estop_id, Press(time.monotonic(), time.time()))
+            while len(self._presses) > PRESSES_MAX:
+                del self._presses[next(iter(self._presses))]
+        return press
 
     def expect(self, estop_id: str, names: Collection[str]) -> None:
         """Name further robots that must answer the running stop ``estop_id``."""
@@ -180,7 +207,8 @@ class SafetyController:
 
     def check_in(self) -> bool:
         """Check in once; False when the link is down."""
-        return self._link.publish(self.controller_id, CHECK_IN, self._signed(CHECK_IN, new_epoch(), {}))
+        payload = self._signed(CHECK_IN, Purpose.CHECK_IN, {"estop_id": new_epoch()})
+        return self._link.publish(self.controller_id, CHECK_IN, payload)
 
     def close(self) -> None:
         """Stop checking in and close the link. Safe to call twice."""
@@ -189,7 +217,14 @@ class SafetyController:
             self._check_in.join(2.0)
         self._link.close()
 
-    def _repeat(self, run: _Running, payload: bytes, deadline_s: float, on_progress: OnProgress) -> None:
+    def _send(self, run: _Running) -> None:
+        """Send the stop, issued now and pressed at its press."""
+        fields = {"estop_id": run.estop_id, "reason": run.reason, "pressed_at": run.press.wall}
+        payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
+        if self._link.publish(self.controller_id, ESTOP, payload) and run.left is None:
+            run.left = now
+
+    def _repeat(self, run: _Running, deadline_s: float, on_progress: OnProgress) -> None:
         pauses, reported = iter(REPEAT_S), -1
         pause, next_send, again = 0.0, run.started, 0
         renew_at = run.started + max(SETTLE_S, RENEW_S - self._unanswered_s)
@@ -210,8 +245,8 @@ class SafetyController:
                 if isinstance(self._link, RenewableLink):
                     self._link.renew()
             if now >= next_send:
-                if again or not run.sent:
-                    run.sent = self._link.publish(self.controller_id, ESTOP, payload) or run.sent
+                if again or run.left is None:
+                    self._send(run)
                 again += 1
                 pause = next(pauses, pause)
                 next_send = now + pause
@@ -235,8 +270,9 @@ class SafetyController:
             {name: each for name, each in answers.items() if each.stopped is not True and name not in refused},
             refused,
             tuple(sorted(run.expected - answers.keys())),
-            run.sent,
-            (time.monotonic() - run.started) * 1000,
+            run.left is not None,
+            run.since_press_ms(time.monotonic()),
+            run.left_ms,
         )
         for name, each in {**report.not_stopped, **refused}.items():
             logger.critical("%s DID NOT STOP: %s", name, each.why or each.facts)
@@ -262,7 +298,7 @@ class SafetyController:
                     answer = Answer(
                         source,
                         stopped if isinstance(stopped, bool) else None,
-                        (at - run.started) * 1000,
+                        run.since_press_ms(at),
                         _why(params),
                         params,
                     )
@@ -280,12 +316,11 @@ class SafetyController:
             due = max(due + interval_s, time.monotonic())
             self.check_in()
 
-    def _signed(self, event: str, estop_id: str, params: Mapping[str, Any]) -> bytes:
-        fields: dict[str, Any] = {"estop_id": estop_id, "t": time.time(), "nonce": secrets.token_hex(16)}
+    def _signed(self, event: str, purpose: Purpose, params: Mapping[str, Any]) -> bytes:
+        stated: dict[str, Any] = {**params, "purpose": purpose, "t": time.time(), "nonce": secrets.token_hex(16)}
         if self._key is not None:
-            message = signed_fields(estop_id, self.controller_id, fields["t"], fields["nonce"])
-            fields["sig"] = ed25519.encode(self._key.sign(message))
-        return notification(event, {**params, **fields})
+            stated["sig"] = ed25519.encode(self._key.sign(signed_bytes(purpose, self.controller_id, stated)))
+        return notification(event, stated)
 
 
 @dataclass(eq=False)
@@ -293,8 +328,10 @@ class _Running:
     estop_id: str
     expected: frozenset[str]
     started: float
+    press: Press
+    reason: str
     answers: dict[str, Answer] = field(default_factory=dict)
-    sent: bool = False
+    left: float | None = None
 
     @property
     def complete(self) -> bool:
@@ -305,10 +342,20 @@ class _Running:
         """An expected robot, or every robot, has not answered yet."""
         return not self.answers or not self.expected <= self.answers.keys()
 
+    @property
+    def left_ms(self) -> float:
+        """Milliseconds from the press to the first sending that left; 0 while none did."""
+        return 0.0 if self.left is None else self.since_press_ms(self.left)
+
+    def since_press_ms(self, now: float) -> float:
+        """Milliseconds from the press to ``now``."""
+        return (now - self.press.at) * 1000
+
     def progress(self, link_up: bool, now: float) -> Progress:
         late = now - self.started >= UNCONFIRMED_S
         open_ = tuple(sorted(self.expected - self.answers.keys())) if late or not link_up else ()
-        return Progress(self.estop_id, dict(self.answers), open_, link_up, (now - self.started) * 1000)
+        elapsed_ms = self.since_press_ms(now)
+        return Progress(self.estop_id, dict(self.answers), open_, link_up, elapsed_ms, self.left_ms)
 
 
 def _why(params: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from typing import Any, Protocol, runtime_checkable
 from strands_robots.audit import log_safety_event
 from strands_robots.safety.orders import RobotReport, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
+from strands_robots.safety.statements import Purpose
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -316,7 +317,7 @@ class EstopListener:
 
     def _check_in(self, received: StopEvent) -> None:
         source, params = received.source, params_of(received.payload)
-        why = self._rules.source_refusal(source) or self._rules.signature_refusal(source, params)
+        why = self._rules.source_refusal(source) or self._rules.signature_refusal(source, params, Purpose.CHECK_IN)
         t = params.get("t")
         if why is None and self._rules.signed and isinstance(t, int | float):
             # A recorded check-in played again must not keep a robot moving.
@@ -328,6 +329,7 @@ class EstopListener:
             self._refusals.record(StopRefused(source, why), received.event)
         else:
             self._plane.checkin.record(source, received.at)
+            self._rules.compare_clock(source, params, received.at)
 
     def _answer(self, report: RobotReport) -> None:
         key, now = (report.robot_id, report.epoch), time.monotonic()

@@ -16,10 +16,17 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import estop_refusal
+from strands_robots.safety.clocks import ObservedClocks
 from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.statements import Purpose, covered
 from strands_robots.safety.stopping import StopVerdict
 
-LATE_S = 60.0
+LATE_S = 1.0
+"""Time from the press to its receipt, above which a stop is late."""
+
+UNTIMED_LATE_S = 60.0
+"""Age above which a stop is late where clocks were not compared or its press is not stated."""
+
 AHEAD_S = 5.0
 
 PARSED_MAX_BYTES = 64 * 2**10
@@ -47,8 +54,11 @@ class StopOrder:
         source: who stops, as declared.
         path: lane (the e-stop listener), runtime, mesh, local or check-in.
         remote: it came over a network, so the robot named as its source is left alone.
-        issued: the issuer's wall-clock seconds, or None; decides only what the audit says.
+        issued: the issuer's wall-clock seconds at this sending, or None; decides only what the audit says.
         received: this process's monotonic seconds at receipt; latencies count from here.
+        pressed: the issuer's wall-clock seconds at the press, the same in every repetition, or None.
+        received_at: this process's wall-clock seconds at receipt.
+        clock_ahead_s: seconds by which this process's clock is ahead of the issuer's, or None where not measured.
     """
 
     epoch: str
@@ -58,12 +68,31 @@ class StopOrder:
     remote: bool = False
     issued: float | None = None
     received: float = field(default_factory=time.monotonic)
+    pressed: float | None = None
+    received_at: float = field(default_factory=time.time, compare=False)
+    clock_ahead_s: float | None = None
+
+    def delay_s(self, now: float) -> float | None:
+        """Return the seconds from the press to wall-clock ``now``; None if not stated.
+
+        The time until the sending is exact, for one clock measured it. The time on the network counts where the two
+        clocks were compared.
+        """
+        if self.issued is None or self.pressed is None:
+            return None
+        on_network = 0.0 if self.clock_ahead_s is None else now - self.clock_ahead_s - self.issued
+        return round(max(0.0, self.issued - self.pressed) + max(0.0, on_network), 3)
 
     def timing(self, now: float) -> str:
         """Return ``on time``, ``late``, ``ahead`` or ``untimed`` at wall-clock ``now``."""
         if self.issued is None:
             return "untimed"
-        if now - self.issued > LATE_S:
+        delay = self.delay_s(now)
+        if delay is not None and delay > LATE_S:
+            return "late"
+        if self.clock_ahead_s is not None and delay is not None:
+            return "on time"
+        if now - self.issued > UNTIMED_LATE_S:
             return "late"
         return "ahead" if self.issued - now > AHEAD_S else "on time"
 
@@ -130,9 +159,20 @@ class StopRefused:
     why: str
 
 
-def signed_fields(estop_id: object, source: str, t: object, nonce: object) -> bytes:
-    """Return the signed bytes of a stop or check-in: id, source, time, nonce."""
-    return ed25519.canonical({"estop_id": estop_id, "nonce": nonce, "source": source, "t": t})
+def signed_bytes(purpose: Purpose, source: str, params: Mapping[str, Any]) -> bytes:
+    """Return the signed bytes of a stop or check-in.
+
+    They hold purpose, source, id, both times, nonce and reason; a field that is absent or of another kind as null.
+    """
+    reason, pressed = params.get("reason"), params.get("pressed_at")
+    stated = {
+        "estop_id": params.get("estop_id"),
+        "nonce": params.get("nonce"),
+        "t": params.get("t"),
+        "pressed_at": None if _seconds(pressed) is None else pressed,
+        "reason": reason if isinstance(reason, str) and len(reason) <= REASON_MAX else None,
+    }
+    return covered(purpose, source, stated)
 
 
 def estop_keys() -> tuple[bytes, ...]:
@@ -162,6 +202,7 @@ class StopRules:
         self._allow = tuple(settings.items("DEVICE_CONNECT_ESTOP_ALLOW") if allow is None else allow)
         self._keys = tuple(estop_keys() if keys is None else keys)
         self._clock = clock
+        self._clocks = ObservedClocks()
 
     @property
     def signed(self) -> bool:
@@ -185,32 +226,43 @@ class StopRules:
         received: float | None = None,
     ) -> StopOrder | StopRefused:
         """Decide on the parameters of an ``emergencyStop``; ``raw`` may identify it."""
-        why = self.source_refusal(source) or self.signature_refusal(source, params)
+        why = self.source_refusal(source) or self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
         if why is not None:
             return StopRefused(source, why)
         distinct = raw if raw is not None and not params else _text(params)
-        t, reason = params.get("t"), params.get("reason")
+        reason, received = params.get("reason"), time.monotonic() if received is None else received
+        received_at, issued = self._clock() - (time.monotonic() - received), _seconds(params.get("t"))
+        ahead = self._clocks.note(source, received_at - issued, received) if issued is not None else None
         return StopOrder(
             epoch_of(source, params, distinct),
             source,
             reason[:REASON_MAX] if isinstance(reason, str) and reason.isprintable() else "",
             path,
             remote=True,
-            issued=_seconds(t),
-            received=time.monotonic() if received is None else received,
+            issued=issued,
+            received=received,
+            pressed=_seconds(params.get("pressed_at")),
+            received_at=received_at,
+            clock_ahead_s=ahead,
         )
 
-    def signature_refusal(self, source: str, params: Mapping[str, Any]) -> str | None:
+    def signature_refusal(self, source: str, params: Mapping[str, Any], purpose: Purpose) -> str | None:
         """Return the reason why the signature is not valid, or None; None without keys."""
         if not self._keys:
             return None
-        estop_id, nonce, t = params.get("estop_id"), params.get("nonce"), params.get("t")
         signature = ed25519.decode(params.get("sig"), 64)
-        if signature is None or not is_epoch(estop_id) or not is_epoch(nonce) or _seconds(t) is None:
+        shaped = is_epoch(params.get("estop_id")) and is_epoch(params.get("nonce"))
+        if signature is None or not shaped or _seconds(params.get("t")) is None:
             return "it is not signed, and DEVICE_CONNECT_ESTOP_PUBLIC_KEYS asks for a signature"
-        if not ed25519.signed_by_one_of(self._keys, signature, signed_fields(estop_id, source, t, nonce)):
-            return "none of DEVICE_CONNECT_ESTOP_PUBLIC_KEYS made its signature"
+        if not ed25519.signed_by_one_of(self._keys, signature, signed_bytes(purpose, source, params)):
+            return f"none of DEVICE_CONNECT_ESTOP_PUBLIC_KEYS signed it as {purpose.value}"
         return None
+
+    def compare_clock(self, source: str, params: Mapping[str, Any], received: float) -> None:
+        """Take the time of a check-in that counts as a comparison of clocks."""
+        sent = _seconds(params.get("t"))
+        if sent is not None:
+            self._clocks.note(source, self._clock() - (time.monotonic() - received) - sent, received)
 
 
 def params_of(payload: bytes) -> dict[str, Any]:

@@ -418,7 +418,7 @@ class SafetyPlane:
                 self._keep(due)
 
     def _record(self, run: StopRun) -> None:
-        order, now = run.order, time.time()
+        order = run.order
         event = "remote_estop_engaged" if order.remote else "emergency_stop"
         for report in run.reports.values():
             facts: dict[str, Any] = {
@@ -427,7 +427,9 @@ class SafetyPlane:
                 "reason": order.reason,
                 "road": order.path,
                 "issued": order.issued,
-                "timing": order.timing(now),
+                "pressed_at": order.pressed,
+                "delay_s": order.delay_s(order.received_at),
+                "timing": order.timing(order.received_at),
             }
             log_safety_event(event, report.robot_id, facts)
         if len(self._issued) < 1024 or order.source in self._issued:

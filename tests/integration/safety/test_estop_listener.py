@@ -20,7 +20,8 @@ from strands_robots.device_connect.backends import LinkConfig, loopback_config, 
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
 from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, StopLink, notification
-from strands_robots.safety.orders import StopRules, new_epoch, signed_fields
+from strands_robots.safety.orders import StopRules, new_epoch, signed_bytes
+from strands_robots.safety.statements import Purpose
 
 Broker = ZenohRouter | NatsServer
 
@@ -189,7 +190,7 @@ def test_a_flood_of_forged_stops_delays_no_true_one_and_stops_nothing(
         eventually(lambda: {"forger", "safety-9", "safety-1"} <= set(refused()))
         assert robot.halts == []
         fields = {"estop_id": new_epoch(), "t": time.time(), "nonce": new_epoch()}
-        message = signed_fields(fields["estop_id"], "safety-1", fields["t"], fields["nonce"])
+        message = signed_bytes(Purpose.EMERGENCY_STOP, "safety-1", fields)
         fields["sig"] = ed25519.encode(key.sign(message))
 
         def stopped() -> bool:

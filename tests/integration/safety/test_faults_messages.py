@@ -16,8 +16,9 @@ from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
 from strands_robots.safety.estop_listener import ESTOP, StopLink, notification
-from strands_robots.safety.orders import new_epoch, signed_fields
+from strands_robots.safety.orders import new_epoch, signed_bytes
 from strands_robots.safety.resume import sign
+from strands_robots.safety.statements import Purpose
 
 Send = Callable[..., bool]
 
@@ -140,7 +141,7 @@ def test_a_signature_does_not_pass_from_one_source_or_stop_to_another(stage: Sta
 
     def signed(source: str, **changed: Any) -> bytes:
         fields: dict[str, Any] = {"estop_id": new_epoch(), "t": time.time(), "nonce": new_epoch()}
-        signature = key.sign(signed_fields(fields["estop_id"], source, fields["t"], fields["nonce"]))
+        signature = key.sign(signed_bytes(Purpose.EMERGENCY_STOP, source, fields))
         return notification(ESTOP, {**fields, "sig": ed25519.encode(signature), **changed})
 
     true = signed("safety-1")
