@@ -23,6 +23,7 @@ from device_connect_edge.messaging.exceptions import AuthenticationError, Messag
 from .. import settings
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
+from .presence import PresenceView
 
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""
@@ -100,6 +101,8 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         )
         self._messaging_backend = link.transport
         self._d2d_mode = discovery != "registry"
+        if self._d2d_mode:
+            self._d2d_collector = PresenceView(link, device_id)
         self.link = link
         self.problem = ""
         """Why the last attempt to connect failed."""

@@ -141,6 +141,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         )
         self.runtime: Any = None
         self.activity = Activity()
+        self._looked_once = False
         self.changed = asyncio.Event()
         self._rolling: set[str] = set()
         self._watchers: list[asyncio.Task[None]] = []
@@ -306,7 +307,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
     @property
     def status(self) -> DeviceStatus:
         """Live availability: busy (score 1.0) while something runs, else idle (0.0)."""
-        activity = self.activity if self._watchers else self._look_now()
+        activity = self.activity if self._looked_once else self._look_now()
         return DeviceStatus(**_status_fields(activity))
 
     def heartbeat(self) -> dict[str, Any]:
@@ -341,9 +342,11 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         if self.runtime is None or self._watchers:
             return
         self.changed = asyncio.Event()
-        self.activity = await self._looked()
+        if not self._looked_once:
+            await self.read_activity()
         pump = RolloutPump(self._on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
-        self._unsubscribe = self.robot.subscribe(pump.observe)
+        subscribe = partial(self.robot.subscribe, pump.observe)
+        self._unsubscribe = await called(self.pipeline.shares.read, subscribe, READ_DEADLINE_S)
         self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
 
     def watches(self) -> list[Any]:
@@ -355,12 +358,21 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
     async def disconnect(self) -> None:
         """Stop telling the state; the robot manages its own shutdown."""
         watchers, self._watchers = self._watchers, []
-        if self._unsubscribe is not None:
-            self._unsubscribe()
-            self._unsubscribe = None
         for watcher in watchers:
             watcher.cancel()
         await asyncio.gather(*watchers, return_exceptions=True)
+        self._looked_once = False
+        unsubscribe, self._unsubscribe = self._unsubscribe, None
+        if unsubscribe is not None:
+            try:
+                await called(self.pipeline.shares.read, unsubscribe, READ_DEADLINE_S)
+            except Exception as exc:  # noqa: BLE001 - whatever a robot raises, its device leaves
+                logger.warning("%s: its events could not be unsubscribed: %s", self.peer_id, exc)
+
+    async def read_activity(self) -> None:
+        """Ask the robot for its activity, which the status tells from now on."""
+        self.activity = await self._looked()
+        self._looked_once = True
 
     async def refresh(self) -> Activity:
         """Ask the robot again; the answer is what status and presence say from now on."""

@@ -11,6 +11,7 @@ import re
 import secrets
 import sys
 import threading
+import time
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +25,7 @@ from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
+from strands_robots.device_connect.device_loop import DeviceLoop, enter_loop
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.safety_registration import SafetyRegistration, register_safety
@@ -47,6 +49,9 @@ PROBES, PROBE_EVERY_S = 3, 0.05
 PRESENCE_WAIT_S = 0.25
 """Seconds in which a live device has announced itself after a probe, where access rules forbid to call it."""
 
+EXIT_TIMEOUT_S = 3.0
+"""Seconds that the interpreter's end waits for the devices to announce their departure."""
+
 LEAVE_TIMEOUT_S = 15.0
 """Seconds that a device's end waits for the link of its e-stop listener to close."""
 
@@ -57,12 +62,19 @@ class DuplicateDeviceError(StrandsRobotsError, RuntimeError):
 
 @dataclass(slots=True)
 class Host:
-    """Loop, task and thread of a running device."""
+    """Loop and task of a running device.
+
+    Attributes:
+        home: the loop that this module started for it; None on a loop of the caller's.
+        end: set to end it.
+        ended: set when it has ended.
+    """
 
     loop: asyncio.AbstractEventLoop
     task: asyncio.Task[None]
-    thread: threading.Thread | None = None
+    home: DeviceLoop | None = None
     end: asyncio.Event = field(default_factory=asyncio.Event)
+    ended: threading.Event = field(default_factory=threading.Event)
 
 
 _hosts: dict[Runtime, Host] = {}
@@ -109,6 +121,9 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     driver = driver_for(robot, peer_type)
     announceable(driver)
     warnings = _framework_warnings(name)
+    if isinstance(driver, RobotDriver):
+        # The runtime reads the status when it is made, on the loop, where a robot that blocks would hold all others.
+        await driver.read_activity()
     registration = asyncio.create_task(
         called(
             _REGISTRATIONS,
@@ -162,78 +177,75 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
     link: LinkConfig | None = None,
     bringup_timeout: float = BRINGUP_TIMEOUT_S,
 ) -> Runtime:
-    """Serve a robot as :func:`init_device_connect` does, on a thread of its own.
+    """Serve a robot as :func:`init_device_connect`, on the process's device loop.
 
     The arguments are the same. End it with :func:`stop_device_connect`; at the latest the interpreter's end does.
 
     Raises:
-        Exception: what :func:`init_device_connect` raised; the thread is gone by then.
+        Exception: what :func:`init_device_connect` raised; nothing of the device is left by then.
         TimeoutError: not callable in time; the bring-up is cancelled and never comes online later.
         RuntimeError: the bring-up ended without a runtime.
     """
-    started: Future[Runtime | None] = Future()
+    home = enter_loop(alone=isinstance(robot, DeviceDriver))
+    started: Future[Runtime] = Future()
+    ended = threading.Event()
 
     async def serve() -> None:
-        runtime = await init_device_connect(
-            robot,
-            peer_id=peer_id,
-            peer_type=peer_type,
-            messaging_url=messaging_url,
-            messaging_backend=messaging_backend,
-            tenant=tenant,
-            allow_insecure=allow_insecure,
-            link=link,
-            bringup_timeout=bringup_timeout,
-        )
-        host = _hosts.get(runtime)
-        if host is None:
-            started.set_result(None)
-            return
-        host.thread = threading.current_thread()
-        # A caller who has given up would never stop the device.
-        if not started.set_running_or_notify_cancel():
-            await runtime.shutdown()
-            return
-        started.set_result(runtime)
-        ending = asyncio.create_task(host.end.wait())
-        await asyncio.wait({host.task, ending}, return_when=asyncio.FIRST_COMPLETED)
-        await runtime.shutdown()
-
-    def live() -> None:
         try:
-            with asyncio.Runner() as runner:
-                loops.append(runner.get_loop())
-                runner.run(serve())
+            runtime = await init_device_connect(
+                robot,
+                peer_id=peer_id,
+                peer_type=peer_type,
+                messaging_url=messaging_url,
+                messaging_backend=messaging_backend,
+                tenant=tenant,
+                allow_insecure=allow_insecure,
+                link=link,
+                bringup_timeout=bringup_timeout,
+            )
+            host = _hosts.get(runtime)
+            if host is None:
+                started.set_exception(RuntimeError("The bring-up ended without a runtime."))
+                return
+            host.home, host.ended = home, ended
+            # A caller who has given up would never stop the device.
+            if started.set_running_or_notify_cancel():
+                started.set_result(runtime)
+                ending = asyncio.create_task(host.end.wait())
+                await asyncio.wait({host.task, ending}, return_when=asyncio.FIRST_COMPLETED)
+                ending.cancel()
+            await runtime.shutdown()
         except BaseException as exc:
             if not started.done():
                 started.set_exception(exc)
             elif not isinstance(exc, asyncio.CancelledError):
-                logger.exception("The device's thread ended.")
-
-    loops: list[asyncio.AbstractEventLoop] = []
-    thread = threading.Thread(target=live, name="device-connect", daemon=True)
-    thread.start()
-    try:
-        runtime = started.result(bringup_timeout + LOOP_JOIN_TIMEOUT_S)
-    except TimeoutError as exc:
-        if not started.cancel():
-            thread.join(LOOP_JOIN_TIMEOUT_S)
+                logger.exception("A device ended.")
             raise
-        if loops:
-            _cancel_everything(loops[0])
-        thread.join(LOOP_JOIN_TIMEOUT_S)
-        raise TimeoutError(f"The device was not up within {bringup_timeout:g} s; the bring-up is cancelled.") from exc
-    except BaseException:
-        thread.join(LOOP_JOIN_TIMEOUT_S)
+        finally:
+            home.leave()
+            ended.set()
+
+    serving = home.submit(serve())
+    try:
+        return started.result(bringup_timeout + LOOP_JOIN_TIMEOUT_S)
+    except BaseException as exc:
+        given_up = started.cancel()
+        serving.cancel()
+        _gone(home, ended, LOOP_JOIN_TIMEOUT_S)
+        if given_up and isinstance(exc, TimeoutError):
+            late = f"The device was not up within {bringup_timeout:g} s; the bring-up is cancelled."
+            raise TimeoutError(late) from exc
         raise
-    if runtime is None:
-        thread.join(LOOP_JOIN_TIMEOUT_S)
-        raise RuntimeError("The bring-up ended without a runtime.")
-    return runtime
+
+
+def _gone(home: DeviceLoop, ended: threading.Event, within: float) -> bool:
+    """Wait for the end of a device, and of its loop where it was the last one."""
+    until = time.monotonic() + within
+    return ended.wait(within) and home.join(max(until - time.monotonic(), 0.0))
 
 
 def stop_device_connect(runtime: Any, within: float = 10.0) -> None:
-    """Announce a device's departure, close its link and end its thread.
+    """Announce a device's departure and close its link; the last one ends the loop.
 
     Callable from any thread but the device's own loop; there, ``await runtime.shutdown()``. A device that is off
     already is no error. The robot is not halted: ask ``robot.halt`` first where it may move.
@@ -244,13 +256,12 @@ def stop_device_connect(runtime: Any, within: float = 10.0) -> None:
     host = _hosts.get(runtime)
     if host is None:
         return
-    if host.thread is None:
+    if host.home is None:
         asyncio.run_coroutine_threadsafe(runtime.shutdown(), host.loop).result(within)
         return
     with contextlib.suppress(RuntimeError):  # the loop closed by itself a moment ago
         host.loop.call_soon_threadsafe(host.end.set)
-    host.thread.join(within)
-    if host.thread.is_alive():
+    if not _gone(host.home, host.ended, within):
         raise TimeoutError(f"The device did not leave the network within {within:g} s.")
 
 
@@ -389,15 +400,6 @@ def _ended(runtime: Runtime, task: asyncio.Task[None]) -> None:
         logger.error("Device %s went off the network: %s", runtime.device_id, task.exception())
 
 
-def _cancel_everything(loop: asyncio.AbstractEventLoop) -> None:
-    def cancel() -> None:
-        for task in asyncio.all_tasks(loop):
-            task.cancel()
-
-    with contextlib.suppress(RuntimeError):  # the loop closed by itself a moment ago
-        loop.call_soon_threadsafe(cancel)
-
-
 class _LastWarning(logging.Handler):
     """Keeps the framework's last warning; the application decides what is shown."""
 
@@ -421,10 +423,11 @@ def _framework_warnings(name: str) -> _LastWarning:
 
 
 def _depart_at_exit() -> None:
-    for runtime, host in list(_hosts.items()):
-        if host.thread is None or not host.thread.is_alive():
-            continue
-        try:
-            stop_device_connect(runtime, within=3.0)
-        except TimeoutError:
+    own = {runtime: host for runtime, host in _hosts.items() if host.home is not None}
+    for host in own.values():
+        with contextlib.suppress(RuntimeError):  # its loop closed a moment ago
+            host.loop.call_soon_threadsafe(host.end.set)
+    until = time.monotonic() + EXIT_TIMEOUT_S
+    for runtime, host in own.items():
+        if not host.ended.wait(max(until - time.monotonic(), 0.0)):
             logger.warning("Device %s could not announce its departure.", runtime.device_id)

@@ -44,6 +44,10 @@ class Stoppable(Haltable, Protocol):
     gate: MotionGate
 
 
+READY_MAX = 4
+"""Robots of a process that own a halt thread before they have moved."""
+
+
 class Registered:
     """One robot in the plane. ``close`` takes it out; the lockout on disk stays."""
 
@@ -63,8 +67,9 @@ class Registered:
         self.reports: dict[str, RobotReport] = {}
         self._plane = plane
         self._ready, self._readying = False, threading.Lock()
-        # A world that has not moved yet shares the threads of the reserve: a hundred of them need no hundred threads.
-        if isinstance(robot, WorldRobot):
+        # A world that has not moved yet shares the threads of the reserve, and so does every robot of a large process
+        # until it moves: a hundred of them need no hundred threads.
+        if isinstance(robot, WorldRobot) or len(plane.robots) >= READY_MAX:
             plane.executor.prepare()
         else:
             self._stand_by()

@@ -1,0 +1,217 @@
+"""Presence of other devices, collected only while a device of this process asks.
+
+The framework's runtime parses the presence of every device for each device that it serves, which costs the square of
+their number. Here the devices of one loop and one link share a collector, which runs while one of them needs it: for
+``list_devices``, ``wait_for_device``, ``depends_on``, ``@on(device_type=...)`` and the lifecycle events.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from device_connect_edge.discovery import PresenceCollector
+
+from strands_robots.device_connect.backends import LinkConfig, open_client
+
+KEEP_S = 60.0
+"""Seconds that the collector goes on after the last question of a device."""
+
+SETTLE_S = 0.5
+"""Seconds after its start in which the collector has the answers to its first probe."""
+
+POLL_S = 0.02
+"""Seconds between two looks for a device that the collector may still hear of."""
+
+OnPeer = Callable[[str], Any]
+Presence = dict[str, Any]
+
+
+class _SharedCollector:
+    """The collector of one loop and one link."""
+
+    def __init__(self, link: LinkConfig) -> None:
+        self._link = link
+        self._users = 0
+        self._changing = asyncio.Lock()
+        self._client: Any = None
+        self._collector: Any = None
+        self.settled_at = 0.0
+
+    async def enter(self) -> Any:
+        """Return the running collector; started by the first user."""
+        async with self._changing:
+            self._users += 1
+            if self._collector is None:
+                try:
+                    self._client = await open_client(self._link)
+                    collector = PresenceCollector(self._client, self._link.tenant)
+                    await collector.start()
+                    await collector.send_discovery_probe()
+                except BaseException:
+                    await self._leave()
+                    raise
+                self._collector = collector
+                self.settled_at = asyncio.get_running_loop().time() + SETTLE_S
+            return self._collector
+
+    async def leave(self) -> None:
+        """End one use; the last one ends the collector."""
+        async with self._changing:
+            await self._leave()
+
+    async def _leave(self) -> None:
+        self._users -= 1
+        if self._users:
+            return
+        collector, self._collector = self._collector, None
+        client, self._client = self._client, None
+        if collector is not None:
+            await collector.stop()
+        if client is not None:
+            await client.close()
+        _SHARED.pop((asyncio.get_running_loop(), self._link), None)
+
+
+_SHARED: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], _SharedCollector] = {}
+
+
+class PresenceView:
+    """Other devices as one sees them, in place of the framework's collector.
+
+    Args:
+        link: where the devices are.
+        device_id: the device that asks; it does not see itself.
+    """
+
+    # The runtime starts no collector that says that it was started, and sets this listener to announce itself more
+    # often for a newcomer, who asks by a probe anyway.
+    _started = True
+    _on_new_peer: OnPeer | None = None
+
+    def __init__(self, link: LinkConfig, device_id: str) -> None:
+        self._link = link
+        self._device_id = device_id
+        self._entering = asyncio.Lock()
+        self._shared: _SharedCollector | None = None
+        self._collector: Any = None
+        self._asked_at = 0.0
+        self._listens = False
+        self._letting_go: asyncio.Task[None] | None = None
+        self._replays: set[asyncio.Task[None]] = set()
+
+    async def start(self) -> None:
+        """Do nothing: the collector starts with the first question."""
+
+    async def stop(self) -> None:
+        """End the use of the collector."""
+        tasks = [*self._replays, *([self._letting_go] if self._letting_go is not None else ())]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._leave()
+
+    def add_on_new_peer(self, callback: OnPeer) -> None:
+        """Have ``callback(device_id)`` called for every device, present ones first."""
+        self._listen(lambda collector: collector.add_on_new_peer(self._others(callback)), replayed=callback)
+
+    def add_on_peer_removed(self, callback: OnPeer) -> None:
+        """Have ``callback(device_id)`` called for every device that goes."""
+        self._listen(lambda collector: collector.add_on_peer_removed(self._others(callback)))
+
+    async def list_devices(self, *, device_type: str | None = None, location: str | None = None) -> list[Presence]:
+        """Return the devices that are known, by type and place."""
+        collector = await self._settled()
+        found = await collector.list_devices(device_type=device_type, location=location)
+        return [each for each in found if each.get("device_id") != self._device_id]
+
+    async def get_device(self, device_id: str) -> Presence | None:
+        """Return one device; while the first answers come in, wait for it."""
+        collector = await self._asked()
+        loop = asyncio.get_running_loop()
+        while True:
+            found: Presence | None = await collector.get_device(device_id)
+            if found is not None or self._shared is None or loop.time() >= self._shared.settled_at:
+                return found
+            await asyncio.sleep(POLL_S)
+
+    async def send_discovery_probe(self) -> None:
+        """Ask every device to announce itself."""
+        await (await self._asked()).send_discovery_probe()
+
+    async def wait_for_peers(self, timeout: float = 3.0) -> list[Presence]:  # noqa: ASYNC109 - the framework's
+        """Return the devices, as soon as there is one or ``timeout`` seconds are over."""
+        return await self._within(timeout, self.list_devices) or []
+
+    async def wait_for_device_type(self, device_type: str, timeout: float = 10.0) -> Presence | None:  # noqa: ASYNC109
+        """Return the first device of a type, or None after ``timeout`` seconds."""
+        found = await self._within(timeout, lambda: self.list_devices(device_type=device_type))
+        return found[0] if found else None
+
+    async def wait_for_device_id(self, device_id: str, timeout: float = 10.0) -> Presence | None:  # noqa: ASYNC109
+        """Return the device of this id, or None after ``timeout`` seconds."""
+        found: Presence | None = await self._within(timeout, lambda: self.get_device(device_id))
+        return found
+
+    async def _within(self, seconds: float, ask: Callable[[], Any]) -> Any:
+        loop = asyncio.get_running_loop()
+        until = loop.time() + seconds
+        while True:
+            found = await ask()
+            if found or loop.time() >= until:
+                return found
+            await asyncio.sleep(POLL_S)
+
+    def _listen(self, add: Callable[[Any], None], replayed: OnPeer | None = None) -> None:
+        self._listens = True
+        task = asyncio.create_task(self._begin_listening(add, replayed))
+        self._replays.add(task)
+        task.add_done_callback(self._replays.discard)
+
+    async def _begin_listening(self, add: Callable[[Any], None], replayed: OnPeer | None) -> None:
+        collector = await self._asked()
+        known = await collector.list_devices()
+        add(collector)
+        if replayed is not None:
+            told = self._others(replayed)
+            for each in known:
+                result = told(str(each.get("device_id", "")))
+                if asyncio.iscoroutine(result):
+                    await result
+
+    def _others(self, callback: OnPeer) -> OnPeer:
+        def told(device_id: str) -> Any:
+            # The collector has no way to take a listener away again.
+            return callback(device_id) if device_id != self._device_id and self._collector is not None else None
+
+        return told
+
+    async def _settled(self) -> Any:
+        collector = await self._asked()
+        if self._shared is not None:
+            await asyncio.sleep(max(self._shared.settled_at - asyncio.get_running_loop().time(), 0.0))
+        return collector
+
+    async def _asked(self) -> Any:
+        loop = asyncio.get_running_loop()
+        self._asked_at = loop.time()
+        async with self._entering:
+            if self._collector is None:
+                shared = _SHARED.setdefault((loop, self._link), _SharedCollector(self._link))
+                self._collector, self._shared = await shared.enter(), shared
+                self._letting_go = asyncio.create_task(self._let_go())
+        return self._collector
+
+    async def _let_go(self) -> None:
+        loop = asyncio.get_running_loop()
+        # Each question moves the end.
+        while (left := KEEP_S if self._listens else self._asked_at + KEEP_S - loop.time()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(left)
+        await self._leave()
+
+    async def _leave(self) -> None:
+        async with self._entering:
+            shared, self._shared, self._collector = self._shared, None, None
+        if shared is not None:
+            await shared.leave()
