@@ -50,7 +50,7 @@ def test_the_types_are_those_of_the_arguments() -> None:
     [
         (
             DRIVERS[0],
-            {"execute", "stop", "resume", "getStatus", "getFeatures", "getState"},
+            {"execute", "stop", "releaseTorque", "resume", "getStatus", "getFeatures", "getState"},
             {"taskStarted", "taskComplete", "streamStep", "stateUpdate", "emergencyStop"},
         ),
         (

@@ -5,12 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator
-from types import SimpleNamespace
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fixtures.devices import RANGES, RecordingDevice
+from fixtures.devices import RANGES, RecordingDevice, TorqueDevice
 from fixtures.planes import own_plane
 from fixtures.waiting import eventually
 
@@ -24,35 +23,6 @@ from strands_robots.utils import ValidationError
 REST = {"pan.pos": 0.0, "lift.pos": -40.0, "grip.pos": 0.0}
 STEP = {key: (high - low) * RANGES_PER_S / SETTLE_HZ for key, (low, high) in RANGES.items()}
 """Longest way of one step."""
-
-
-class TorqueDevice(RecordingDevice):
-    """An arm whose torque goes on and off by motor; a motor without torque does not follow."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.torque = dict.fromkeys(("pan", "lift", "grip"), True)
-        self.bus = SimpleNamespace(motors=self.torque, disable_torque=self._off, enable_torque=self._on)
-        self.stuck: set[str] = set()
-        self.before_write: Callable[[], object] = lambda: None
-
-    def send_action(self, action: dict[str, float]) -> dict[str, float]:
-        self.before_write()
-        kept = {key: self.positions[key] for key in self.positions if key in self.stuck}
-        kept |= {key: self.positions[key] for key in self.positions if not self.torque[key.removesuffix(".pos")]}
-        sent = super().send_action(action)
-        self.positions.update(kept)
-        return sent
-
-    def _off(self, motor: str) -> None:
-        self.torque[motor] = False
-
-    def _on(self, motor: str) -> None:
-        self.torque[motor] = True
-
-    @property
-    def limp(self) -> list[str]:
-        return [motor for motor, on in self.torque.items() if not on]
 
 
 @pytest.fixture

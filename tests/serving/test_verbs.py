@@ -62,10 +62,10 @@ def test_the_agent_tool_describes_a_task_as_execute_does() -> None:
 def test_the_mesh_knows_the_documented_actions() -> None:
     assert set(PEER_VERBS) == {
         *("status", "stop", "features", "state", "execute", "start", "step", "reset"),
-        *("teleop_status", "teleop_receive", "teleop_stop", "resume", "ping"),
+        *("teleop_status", "teleop_receive", "teleop_stop", "releaseTorque", "resume", "ping"),
     }
     moving = {name for name, verb in PEER_VERBS.items() if verb.kind is Kind.MOTION}
-    assert moving == {"execute", "start", "step", "reset", "teleop_receive"}
+    assert moving == {"execute", "start", "step", "reset", "teleop_receive", "releaseTorque"}
 
 
 def test_the_mesh_fills_in_defaults_and_drops_what_an_action_does_not_have() -> None:

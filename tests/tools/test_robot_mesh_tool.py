@@ -46,6 +46,7 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
     robot_mesh(action="stop", target="arm-1")
     robot_mesh(action="stop")
     robot_mesh(action="emergency_stop", instruction="smoke")
+    robot_mesh(action="release_torque", target="arm-1")
     assert fake.calls == [
         ("peers",),
         ("tell", "arm-1", "wave", "mock", 2.0),
@@ -53,6 +54,7 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
         ("stop", "arm-1"),
         ("stop", ""),
         ("emergency_stop", "smoke"),
+        ("release_torque", "arm-1"),
     ]
 
 
@@ -68,6 +70,7 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
         ({"action": "tell", "target": "arm-1", "instruction": "wave", "duration": 1e9}, "duration"),
         ({"action": "tell", "target": "arm-1", "instruction": "wave", "policy_provider": ""}, "policy_provider"),
         ({"action": "status"}, "target"),
+        ({"action": "release_torque"}, "target"),
         ({"action": "stop", "target": "arm 1"}, "target"),
     ],
 )

@@ -36,8 +36,7 @@ class ReachyMiniDriver(RobotDriver):
         prefix: of the Zenoh keys of a daemon before 1.5: identifiers joined by ``/``.
         api_port: TCP port of the daemon, 1 to 65535.
         transport: ``auto`` for what the daemon speaks, ``websocket`` or ``zenoh``.
-        release_on_estop: switch the motors off at an emergency stop of this device's own; the head drops. By default
-            it stops and holds.
+        release_on_estop: switch the motors off at every emergency stop; the head drops. By default it stops and holds.
         robot: a ready :class:`ReachyDriver` in place of one for ``host``.
 
     Raises:
@@ -61,7 +60,8 @@ class ReachyMiniDriver(RobotDriver):
         approval: Approval | None = None,
     ) -> None:
         self.reachy = robot or ReachyDriver(host, prefix, api_port, transport=transport)
-        self._release = flag("release_on_estop", release_on_estop)
+        if flag("release_on_estop", release_on_estop):
+            self.reachy.release_on_estop = True
         # A driver needs of a robot its name, gate, halt and subscribe; tasks by instruction are not a Reachy's.
         super().__init__(cast(TaskRobot, self.reachy), hardware=True, authorization=authorization, approval=approval)
         self._emergencies = Share()
@@ -121,7 +121,9 @@ class ReachyMiniDriver(RobotDriver):
         within = 2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0
         try:
             told = await called(
-                self._emergencies, lambda: self.reachy.emergency_stop(reason, release=self._release), within
+                self._emergencies,
+                lambda: self.reachy.emergency_stop(reason, release=self.reachy.release_on_estop),
+                within,
             )
         except Exception as exc:  # noqa: BLE001 - the fleet is told, whatever this robot's own stop did
             logger.critical("%s: its own emergency stop failed: %s: %s", self.peer_id, type(exc).__name__, exc)

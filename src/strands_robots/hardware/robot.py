@@ -6,15 +6,16 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, cast
 
 from strands_robots import settings
+from strands_robots.audit import log_safety_event
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.hardware.body import READ_TRIES, DeviceBody, is_velocity
 from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
 from strands_robots.hardware.settling import Settling, checked_rest_pose
@@ -319,31 +320,69 @@ class HardwareRobot(TeleopMixin):
         if self._settling is not None and self._settling.running and ordered == self._frozen_at:
             # Ordered before the halt that began to settle had frozen the robot: the two are one stop.
             return StopVerdict(settling=True)
+
+        def freeze() -> None:
+            # A halt that waited for the bus when this one was ordered has frozen the robot for both.
+            if ordered != self._frozen_at or self._body.driven:
+                seen = self.gate.generation
+                self._body.stop()
+                self._frozen_at = seen
+
+        verdict = self._settled_after(self._halted_by(freeze, deadline))
+        logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
+        return verdict
+
+    def release_here(self, motors: Collection[str], deadline: float) -> StopVerdict:
+        """Halt and switch torque off on the stop executor's thread."""
+        if self._settling is not None:
+            self._settling.take()
+        return self._halted_by(lambda: self._body.release(motors), deadline)
+
+    def _halted_by(self, freeze: Callable[[], None], deadline: float) -> StopVerdict:
+        """Void every permit, ask every loop to end, and freeze the body."""
         moved = self._halting = dict.fromkeys([*self._moved, *self._moving()])
         self._moved = {}
         self.gate.revoke()
         ends = self._ends(deadline)
         try:
             with self._body.stopping():
-                seen = self.gate.generation
-                # A halt that waited for the bus when this one was ordered has frozen the robot for both.
-                if ordered != self._frozen_at or self._body.driven:
-                    self._body.stop()
-                    self._frozen_at = seen
+                freeze()
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
-            verdict = _unfrozen(_failure(self.tool_name_str, exc), moved)
+            return _unfrozen(_failure(self.tool_name_str, exc), moved)
         else:
-            verdict = self._settled_after(halt_each({**dict.fromkeys(moved, _stopped), **ends}))
+            return halt_each({**dict.fromkeys(moved, _stopped), **ends})
         finally:
             self._halting = {}
-        logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
-        return verdict
 
     def unanswered(self, why: str) -> StopVerdict:
         """Return the verdict while the bus does not answer."""
         if self._frozen_at == self.gate.generation:
             return halt_each(self._ends(time.monotonic()))
         return _unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
+
+    @answered
+    def release_torque(self, motor_ids: str = "") -> Envelope:
+        """Stop every motion and switch torque off, within the halt deadline.
+
+        It works while the robot is locked. The torque comes back with the next motion.
+
+        Args:
+            motor_ids: motors, by name with commas; the others are frozen. Empty for all.
+        """
+        if not self._body.motors:
+            return error(f"{self.tool_name_str} cannot switch the torque of its motors off.")
+        asked = tuple(part.strip() for part in motor_ids.split(",") if part.strip())
+        for motor in asked:
+            choice("motor_ids", motor, self._body.motors)
+        verdict = stop_executor().halt(_TorqueRelease(self, ",".join(asked)), self.tool_name_str, "releaseTorque")
+        answer = {**verdict.envelope(), "released": list(self._body.limp_motors)}
+        log_safety_event(
+            "torque_released", self.tool_name_str, {"motors": answer["released"], "stopped": verdict.stopped}
+        )
+        if is_error(answer):
+            return answer
+        fields = {name: value for name, value in answer.items() if name not in ("status", "content")}
+        return success(f"Torque is off: {', '.join(answer['released'])}.", **fields)
 
     def _settled_after(self, verdict: StopVerdict) -> StopVerdict:
         """Let a robot that was just frozen settle, if it does so."""
@@ -520,6 +559,24 @@ class _TaskStop:
 
     def unanswered(self, why: str) -> StopVerdict:
         return StopVerdict(not_stopped={"task": why})
+
+
+@dataclass(frozen=True)
+class _TorqueRelease:
+    """Stops a robot and takes the torque of some motors, or all, away."""
+
+    robot: HardwareRobot
+    motors: str
+
+    def halt_ordered(self) -> None:
+        """Note what moves."""
+        self.robot.halt_ordered()
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
+        return self.robot.release_here(self.motors.split(",") if self.motors else (), deadline)
+
+    def unanswered(self, why: str) -> StopVerdict:
+        return self.robot.unanswered(why)
 
 
 def _failure(name: str, exc: Exception) -> str:

@@ -247,10 +247,13 @@ class Pipeline:
 
     def _claim(self, verb: Verb) -> Claim:
         """Check the lockout and, for hardware, claim the operator's approval."""
-        if self.robot is not None:
+        if self.robot is not None and not verb.while_locked:
             locked = self.robot.gate.lockout(verb.name)
             if locked is not None:
                 text = str(locked.get("reason", "locked"))
+                if verb.instead:
+                    text = f"{text} {verb.instead} works while it is locked, with the operator's approval."
+                    locked = {**locked, **error(text)}
                 raise Refused(RefusalReason.LOCKOUT, text, reason="locked by an emergency stop", envelope=locked)
             # Halted since the command arrived: refused before a grant is spent on it.
             late = self.robot.gate.refusal(verb.name)

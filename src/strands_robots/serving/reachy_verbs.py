@@ -11,7 +11,17 @@ from strands_robots.drivers.reachy.driver import LIBRARIES, motor_names
 from strands_robots.drivers.reachy.rest import DaemonError
 from strands_robots.drivers.reachy.target import HeadPose, Target, bounded
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.serving.verbs import RESUME, Arguments, Check, Kind, Parameter, Run, Verb, table
+from strands_robots.serving.verbs import (
+    RESUME,
+    Arguments,
+    Check,
+    Kind,
+    Parameter,
+    Run,
+    Verb,
+    release_torque_verb,
+    table,
+)
 from strands_robots.utils import choice, identifier, shown
 
 DEGREES, MILLIMETRES = math.degrees(1.0), 1000.0
@@ -69,8 +79,8 @@ def _daemon_status(reachy: ReachyDriver, arguments: Arguments) -> Envelope:
     return {**payload, "status": answer["status"], "content": answer["content"]}
 
 
-def _motion(name: str, summary: str, run: Run, *parameters: Parameter) -> Verb:
-    return Verb(name, Kind.MOTION, summary, parameters, run=run)
+def _motion(name: str, summary: str, run: Run, *parameters: Parameter, instead: str = "") -> Verb:
+    return Verb(name, Kind.MOTION, summary, parameters, run=run, instead=instead)
 
 
 def _read(name: str, summary: str, run: Run, *parameters: Parameter) -> Verb:
@@ -151,7 +161,9 @@ REACHY_VERBS = table(
             "Switch torque off; the head drops. Whatever moves is stopped first.",
             _torque("disableMotors", False),
             _MOTOR_IDS,
+            instead="releaseTorque",
         ),
+        release_torque_verb(_MOTOR_IDS, method="release_torque"),
         Verb(
             "stopMotion",
             Kind.STOP,

@@ -13,7 +13,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import RUNNING, SETTLE, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt
+from strands_robots.contract import RUNNING, SETTLE, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt, body_of
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
@@ -22,6 +22,7 @@ from strands_robots.serving.verbs import (
     ASSERTION,
     DURATION,
     INSTRUCTION,
+    MOTOR_IDS,
     N_STEPS,
     POLICY_PORT,
     POLICY_PROVIDER,
@@ -33,6 +34,7 @@ from strands_robots.serving.verbs import (
     Parameter,
     Verb,
     between,
+    release_torque_verb,
     table,
 )
 from strands_robots.utils import ValidationError, identifier, number, port, shown
@@ -272,6 +274,14 @@ def _accepted(method: Callable[..., Any], options: dict[str, Any]) -> set[str]:
     return set(parameters)
 
 
+def _release_torque(robot: Robot, arguments: Arguments) -> Envelope:
+    own = getattr(body_of(robot), "release_torque", None)
+    if not callable(own):
+        return error("releaseTorque: this robot cannot switch its torque off.")
+    answer: Envelope = own(arguments.get("motor_ids", ""))
+    return answer
+
+
 GET_FEATURES = Verb(
     "getFeatures",
     Kind.READ,
@@ -302,6 +312,7 @@ ARM_VERBS = table(
             "Stop everything that moves the robot now; the answer says whether it stopped.",
             returns="stopped, halted, not_stopped, unknown, elapsed_ms",
         ),
+        release_torque_verb(MOTOR_IDS, run=_release_torque),
         RESUME,
         Verb(
             "getStatus",
@@ -416,6 +427,9 @@ PEER_VERBS = table(
             "Close the named input stream, or all of them.",
             (_optional("source_peer_id", str, _SOURCE.meaning, identifier), _DEVICE),
             urgent=True,
+        ),
+        release_torque_verb(
+            _optional("motor_ids", str, MOTOR_IDS.meaning, MOTOR_IDS.check), drops_unknown=True, run=_release_torque
         ),
         _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),

@@ -71,6 +71,8 @@ class Verb:
             optional one that was not given stays out: the mesh's wire has it so.
         lasts: it is answered when the motion has ended, so it takes no turn from motions that are only started.
         urgent: it takes energy away, and waits for no read and no motion.
+        while_locked: it works under a lockout; caller and operator are asked as for any motion.
+        instead: the verb that a locked robot offers in the place of this one.
     """
 
     name: str
@@ -84,6 +86,8 @@ class Verb:
     drops_unknown: bool = False
     lasts: bool = False
     urgent: bool = False
+    while_locked: bool = False
+    instead: str = ""
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -170,6 +174,29 @@ ASSERTION = Parameter(
     "What the operator's resume key signed: v, epoch, targets, t, nonce and sig",
     lambda name, value: value,  # the check of the signature counts refusals
 )
+
+MOTOR_IDS = Parameter(
+    "motor_ids",
+    str,
+    "Comma list of motor names; empty for all",
+    _text(1000, empty=True),
+    default="",
+)
+
+
+def release_torque_verb(motor_ids: Parameter, **carried_out: Any) -> Verb:
+    """Describe the ``releaseTorque`` of a robot whose motors ``motor_ids`` names."""
+    return Verb(
+        "releaseTorque",
+        Kind.MOTION,
+        "Stop the robot and switch its torque off, also while it is locked, as for a trapped finger; an arm falls.",
+        (motor_ids,),
+        returns="released, stopped, not_stopped, unknown",
+        urgent=True,
+        while_locked=True,
+        **carried_out,
+    )
+
 
 RESUME = Verb(
     "resume",

@@ -121,6 +121,10 @@ class NativeMesh:
         """Ask the peer for its ``status``."""
         return self._request(target, action="status")
 
+    def release_torque(self, target: str) -> Envelope:
+        """Send the peer a ``releaseTorque``."""
+        return self._request(target, action="releaseTorque")
+
     def stop(self, target: str) -> Envelope:
         """Stop one peer, or every peer in reach at once; answers by name."""
 
@@ -266,6 +270,10 @@ class DeviceConnect:
     def status(self, target: str) -> Envelope:
         """Call the device's ``getStatus``."""
         return _on_fleet(lambda fleet: fleet.call(target, "getStatus", {}, ANSWER_S))
+
+    def release_torque(self, target: str) -> Envelope:
+        """Call the device's ``releaseTorque``."""
+        return _on_fleet(lambda fleet: fleet.call(target, "releaseTorque", {}, ANSWER_S))
 
     def stop(self, target: str) -> Envelope:
         """Stop one device, or every device at once; answers by name."""

@@ -18,7 +18,8 @@ from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.tools import networks
 from strands_robots.utils import ValidationError, choice, device_id, text
 
-ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop")
+ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop", "release_torque")
+NEEDS_TARGET = ("tell", "status", "release_torque")
 
 
 @tool
@@ -35,15 +36,16 @@ def robot_mesh(
 
     Args:
         action: peers lists the robots; tell gives one an instruction and returns once the motion has started; status
-            returns what one is doing; stop stops one, or all without a target; emergency_stop stops and locks all.
-        target: The robot's id, as peers lists it. Needed by tell and status.
+            returns what one is doing; stop stops one, or all without a target; emergency_stop stops and locks all;
+            release_torque stops one and switches its motors off, so that it falls, once its operator approved that.
+        target: The robot's id, as peers lists it. Needed by tell, status and release_torque.
         instruction: What to do, in plain language, 1 to 2000 characters. For emergency_stop: the reason.
         policy_provider: Policy that decides the actions, such as mock, remote or lerobot_local.
         duration: Longest time the motion may take, in seconds, above 0 and at most 3600.
     """
     try:
         verb = choice("action", action, ACTIONS)
-        robot = device_id("target", target) if target or verb in ("tell", "status") else ""
+        robot = device_id("target", target) if target or verb in NEEDS_TARGET else ""
         if verb == "tell":
             given = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
             task = ARM_VERBS["execute"].checked(given)
@@ -54,4 +56,6 @@ def robot_mesh(
         return error(str(refused))
     if verb == "stop":
         return networks.network().stop(robot)
+    if verb == "release_torque":
+        return networks.network().release_torque(robot)
     return networks.network().status(robot) if verb == "status" else networks.network().peers()

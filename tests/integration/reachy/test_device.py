@@ -46,7 +46,7 @@ def fleet() -> Iterator[FleetClient]:
 def device(daemon: Daemon, fleet: FleetClient) -> Iterator[ReachyMiniDriver]:
     # The stand-in's Zenoh twin has a port of its own, so that tests may run beside a real daemon.
     reachy = ReachyDriver("127.0.0.1", api_port=daemon.port, zenoh_port=daemon.zenoh_port)
-    driver = ReachyMiniDriver(robot=reachy, release_on_estop=True)
+    driver = ReachyMiniDriver(robot=reachy)
     runtime = init_device_connect_sync(driver, peer_id="head-1", link=fleet.link)
     yield driver
     stop_device_connect(runtime)
@@ -167,6 +167,7 @@ def test_status_reports_link_version_state_and_fresh_joints(call: Call, daemon: 
 
 @pytest.mark.usefixtures("allowed")
 def test_own_emergency_stop_halts_and_releases_the_motors(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
+    device.reachy.release_on_estop = True
     call("shake")
     asyncio.run(device.emergencyStop(reason="test"))
     motion = device.reachy.motions.current
@@ -194,6 +195,8 @@ def test_emergency_stop_halts_and_locks_until_a_signed_resume(
         sent = device.reachy.motions.frames_sent
         for function in MOTIONS:
             assert report.estop_id in call(function)["reason"], function
+        assert "releaseTorque works while it is locked" in call("disableMotors")["reason"]
+        assert call("getStatus")["motor_mode"] == "enabled"
         assert call("getJoints")["status"] == "success"
         assert call("getStatus")["locked"] is True
         (assertion,) = sign(operator, report.estop_id, ["head-1"])
@@ -202,6 +205,50 @@ def test_emergency_stop_halts_and_locks_until_a_signed_resume(
         assert call("nod")["status"] == "success"
     finally:
         controller.close()
+
+
+@pytest.fixture
+def stopped(call: Call, fleet: FleetClient) -> Iterator[Callable[[], Any]]:
+    """Stops the fleet, this robot in it; gives the report."""
+    controller = safety_controller("safety-1", fleet.link)
+    eventually(
+        lambda: controller.link_up and all(each.link.up for each in estop_listener().registrations), what="the lane"
+    )
+    yield lambda: controller.stop(["head-1"], "test")
+    controller.close()
+
+
+@pytest.mark.usefixtures("allowed")
+def test_a_fleets_stop_releases_the_motors_of_a_robot_that_was_told_to(
+    call: Call, device: ReachyMiniDriver, daemon: Daemon, stopped: Callable[[], Any]
+) -> None:
+    if daemon.kind.simulation == "mujoco":
+        pytest.skip("its motors cannot be switched off")
+    device.reachy.release_on_estop = True
+    call("shake")
+    assert call("stopMotion")["stopped"] is True
+    assert daemon.request("GET", "/api/motors/status").json() == {"mode": "enabled"}, "a plain stop holds"
+    report = stopped()
+    assert report.ok, report
+    assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
+
+
+def test_torque_is_released_under_lockout_only_with_the_operators_approval(
+    call: Call, daemon: Daemon, stopped: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if daemon.kind.simulation == "mujoco":
+        pytest.skip("its motors cannot be switched off")
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "tester")
+    assert stopped().ok
+    assert "strands-robots grant releaseTorque@head-1" in call("releaseTorque")["reason"]
+    assert daemon.request("GET", "/api/motors/status").json() == {"mode": "enabled"}
+    monkeypatch.setenv("STRANDS_ROBOT_COMMAND_ALLOW", "releaseTorque@head-1")
+    answer = call("releaseTorque")
+    assert (answer["status"], answer["verified"], len(answer["released"])) == ("success", True, 9)
+    assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
+    assert call("releaseTorque", motor_ids="17")["released"] == ["right_antenna"]
+    assert "motor_ids must name motors" in call("releaseTorque", motor_ids="tail")["reason"]
+    assert call("getStatus")["locked"] is True
 
 
 def test_device_without_its_daemon_is_unavailable_and_still_answers(fleet: FleetClient) -> None:

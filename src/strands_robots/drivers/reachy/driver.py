@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
 
+from strands_robots import settings
+from strands_robots.audit import log_safety_event
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.drivers.reachy.connection import FRESH_S, Connection
 from strands_robots.drivers.reachy.links import (
@@ -99,9 +102,14 @@ class Motors:
         self._set(mode, self._connection.rest)
         self._set_singly = False
 
-    def release(self, within_s: float = 1.0) -> None:
-        """Switch all motors off for an emergency stop, without a turn or a permit."""
-        self._set("disabled", self._connection.stop_rest, within_s)
+    def release(self, within_s: float = 1.0, names: tuple[str, ...] = ()) -> None:
+        """Switch all motors off, or those of ``names``, without a turn or a permit."""
+        if names:
+            self._connection.link().send_torque(False, names)
+            self._set_singly = True
+        else:
+            self._set("disabled", self._connection.stop_rest, within_s)
+        self._motions.forget_sent()
 
     def _set(self, mode: str, rest: RestClient, within_s: float | None = None) -> None:
         rest.post(f"/api/motors/set_mode/{mode}", within_s=within_s)
@@ -195,6 +203,7 @@ class ReachyDriver:
             65 degrees apart.
         session: a pub/sub object for the Zenoh link in place of a session of its own.
         zenoh_port: Zenoh port of a daemon before 1.5.
+        release_on_estop: switch the motors off at every emergency stop; the head drops. By default it holds.
 
     Raises:
         ValidationError: an argument outside its domain.
@@ -214,7 +223,9 @@ class ReachyDriver:
         automatic_body_yaw: bool = True,
         session: PubSub | None = None,
         zenoh_port: int = ZENOH_PORT,
+        release_on_estop: bool = False,
     ) -> None:
+        self.release_on_estop = flag("release_on_estop", release_on_estop)
         self._automatic = flag("automatic_body_yaw", automatic_body_yaw)
         self.connection = Connection(
             host, api_port, prefix=prefix, transport=transport, session=session, zenoh_port=zenoh_port
@@ -365,8 +376,41 @@ class ReachyDriver:
         return self.motions.observers.subscribe(observer)
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop gestures, ramps, streams, and every move that the daemon runs."""
-        return self.motions.halt(reason)
+        """Stop gestures, ramps, streams, and every move that the daemon runs.
+
+        While it is locked by an emergency stop, the motors go off as well where ``release_on_estop`` says so.
+        """
+        began = time.monotonic()
+        verdict = self.motions.halt(reason)
+        locked = self.gate.lockout("motion") or {}
+        if not (self.release_on_estop and locked.get("locked") is True and self.connection.connects):
+            return verdict
+        left = 0.95 * settings.number("STRANDS_HALT_DEADLINE_S") - (time.monotonic() - began)
+        try:
+            self.motors.release(max(left / 2, 0.05))
+        except Exception as exc:  # noqa: BLE001 - a stop reports every failure of its parts
+            return replace(verdict, unknown={**verdict.unknown, "torque": f"it was not released: {exc}"})
+        return verdict
+
+    def release_torque(self, motor_ids: str = "") -> Envelope:
+        """Stop every motion and switch motors off; it works while the robot is locked.
+
+        Args:
+            motor_ids: names or bus ids with commas, which the daemon offers no way to verify. Empty for all, verified.
+        """
+        names = motor_names(motor_ids)
+        verdict = self.halt("releaseTorque").envelope()
+        fields = {key: value for key, value in verdict.items() if key not in ("status", "content", "reason")}
+        try:
+            self.motors.release(names=names)
+        except Exception as exc:  # noqa: BLE001 - as in halt
+            return error(f"{verdict['content'][0]['text']} Torque was not released: {exc}", **fields, released=[])
+        log_safety_event("torque_released", self.tool_name_str, {"motors": list(names) or "all"})
+        released = list(names or MOTOR_IDS)
+        text = f"Torque is off: {', '.join(names) or 'all motors'}."
+        if verdict["status"] == "error":
+            return error(f"{text} {verdict['content'][0]['text']}", **fields, released=released)
+        return success(text, **fields, released=released, verified=not names)
 
     def emergency_stop(self, reason: str = "", *, release: bool = False) -> Envelope:
         """Halt, then keep the pose or, with ``release``, switch the motors off."""

@@ -256,7 +256,7 @@ class MotionController:
                 raise
             motion.brief = False
             motion.posted.set()
-            self._forget_sent()
+            self.forget_sent()
             try:
                 motion.check()
             except MotionRefused:
@@ -280,7 +280,7 @@ class MotionController:
             except Exception as exc:
                 self._end(motion, "error", str(exc))
                 raise
-            self._forget_sent()
+            self.forget_sent()
             self._end(motion, "completed")
 
     def halt(self, reason: str) -> StopVerdict:
@@ -347,7 +347,7 @@ class MotionController:
                 moves.discard(before.uuid)
         for uuid in moves:
             self._moves.stop(uuid, time.monotonic() + REPLACE_S)
-            self._forget_sent()
+            self.forget_sent()
         if before is not None and running and not before.done.wait(REPLACE_S):
             raise MotionRefused(error(f"{name} refused: {before.name} did not end.", running=before.name))
 
@@ -419,7 +419,7 @@ class MotionController:
         finally:
             self._end(motion, "error", "its frames ended with a fault; the log has it")
 
-    def _forget_sent(self) -> None:
+    def forget_sent(self) -> None:
         """Forget the last target, because something else moved the robot."""
         self._sent = Target()
 
@@ -467,7 +467,7 @@ class MotionController:
         stopped, left = self._moves.stop_all(motion.uuid if motion is not None else "", deadline)
         if not stopped:
             return None
-        self._forget_sent()
+        self.forget_sent()
         if left:
             return error(f"the daemon still runs {', '.join(sorted(left))}", stopped=False)
         return success(f"stopped {len(stopped)} moves", stopped=True, moves=sorted(stopped))
