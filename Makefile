@@ -1,8 +1,9 @@
-.PHONY: help demo test test-all lint bench serve api system venv clean real-arm dds-security
+.PHONY: help demo test test-all lint bench serve api system venv clean real-arm dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
 REAL_ARM := .venv-lerobot/bin
+MODELS := .venv-models/bin
 DDS_SECURITY := .venv-dds-security/bin
 DDS_TESTS := tests/integration/ros/test_dds.py tests/integration/ros/test_dds_security.py \
   tests/integration/ros/test_rtps_bridge.py tests/ros/test_dds_types.py tests/ros/test_dds_security.py
@@ -31,6 +32,7 @@ system:
 	@./scripts/reachy-daemon.sh 1.13.0
 	@./scripts/reachy-daemon.sh 1.4.1
 	@./scripts/real-arm.sh
+	@./scripts/models.sh
 	@./scripts/rosbridge.sh
 	@./scripts/dds-peers.sh
 	@./scripts/dds-security.sh
@@ -38,6 +40,7 @@ system:
 test-all: venv system  ## What needs Debian or npm packages besides
 	@$(BIN)/python -m pytest -m system $(ARGS)
 	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
+	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
 	@$(DDS_SECURITY)/python -m pytest $(DDS_TESTS) $(ARGS)
 
 dds-security:  ## DDS Security on a Cyclone DDS that has it, in .venv-dds-security, and its tests
@@ -47,6 +50,10 @@ dds-security:  ## DDS Security on a Cyclone DDS that has it, in .venv-dds-securi
 real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot, and its tests
 	@./scripts/real-arm.sh
 	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
+
+models:  ## The models of four other projects in a world of ours, in .venv-models, and their test
+	@./scripts/models.sh
+	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
 
 lint: venv  ## ruff and mypy --strict
 	@$(BIN)/ruff check .

@@ -81,17 +81,27 @@ class ObjectPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Everything in the world; ``timestep`` in seconds, ``gravity`` in m/s² along z."""
+    """Everything in the world.
+
+    ``timestep`` in seconds, ``gravity`` in m/s² along z, ``density`` in kg/m³ and ``viscosity`` in Pa·s of the medium.
+    """
 
     timestep: float = 0.002
     gravity: float = -9.81
+    density: float = 0.0
+    viscosity: float = 0.0
     robots: tuple[RobotPlan, ...] = ()
     objects: tuple[ObjectPlan, ...] = ()
 
     @classmethod
-    def checked(cls, timestep: object, gravity: object) -> Plan:
+    def checked(cls, timestep: object, gravity: object, density: object, viscosity: object) -> Plan:
         """Return an empty plan. Raises :class:`ValidationError`."""
-        return cls(number("timestep", timestep, low=1e-4, high=2e-2), number("gravity", gravity, low=-100, high=100))
+        return cls(
+            number("timestep", timestep, low=1e-4, high=2e-2),
+            number("gravity", gravity, low=-100, high=100),
+            number("density", density, low=0, high=20_000),
+            number("viscosity", viscosity, low=0, high=1000),
+        )
 
     def with_robot(self, robot: RobotPlan, *, beside: bool = False) -> Plan:
         """Add a robot, ``beside`` those that are there or where its plan says.

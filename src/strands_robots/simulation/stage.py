@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from strands_robots.kinematics.chain import tip_site
 from strands_robots.simulation.engine import mujoco
+from strands_robots.simulation.fitting import is_floor, load_fitted, name_parts, set_options
 from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
 from strands_robots.utils import ValidationError
 
@@ -23,6 +24,9 @@ MAX_WIDTH, MAX_HEIGHT = 1920, 1440
 """Largest picture, in pixels: the size of the off-screen buffer."""
 
 UNBOUNDED = float("inf")
+
+SUNK_M = 0.003
+"""Depth in a plane from which a body does not only rest on it, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +88,7 @@ def compile_stage(plan: Plan) -> Stage:
     """
     spec = mujoco.MjSpec()
     spec.modelname = "world"
-    _set_options(spec, plan)
+    set_options(spec, plan)
     homes: dict[str, Floats] = {}
     controls: dict[str, float] = {}
     if hasattr(mujoco, "mjtConflict"):
@@ -92,9 +96,8 @@ def compile_stage(plan: Plan) -> Stage:
         spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
     own_floor = own_lights = True
     for robot in plan.robots:
-        child = robot.source.load()
-        _set_options(child, plan)
-        own_floor = own_floor and not any(g.type == mujoco.mjtGeom.mjGEOM_PLANE for g in child.worldbody.geoms)
+        child = load_fitted(robot, plan)
+        own_floor = own_floor and not any(map(is_floor, child.worldbody.geoms))
         own_lights = own_lights and not child.lights
         home, control = _attach(spec, robot, child)
         homes.update(home)
@@ -112,20 +115,30 @@ def compile_stage(plan: Plan) -> Stage:
     return Stage(plan, model, robots, qpos, ctrl)
 
 
-def _set_options(spec: Any, plan: Plan) -> None:
-    """Set the options that the world decides, for itself and for every model in it."""
-    spec.option.timestep = plan.timestep
-    spec.option.gravity = [0, 0, plan.gravity]
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+def in_floor(data: Any, owner: str) -> dict[str, float]:
+    """Return the depth in a plane of each body of a robot or an object, metres.
+
+    Physics pushes such a body out with force. ``data`` has a computed pose; its contacts are computed here.
+    """
+    model = data.model
+    mujoco.mj_collision(model, data)
+    depths: dict[str, float] = {}
+    for index in range(data.ncon):
+        contact = data.contact[index]
+        geoms = sorted((int(geom) for geom in contact.geom), key=lambda g: int(model.geom_type[g]))
+        if min(geoms) < 0 or int(model.geom_type[geoms[0]]) != mujoco.mjtGeom.mjGEOM_PLANE or contact.dist > -SUNK_M:
+            continue
+        name = str(model.body(int(model.geom_bodyid[geoms[1]])).name)
+        if name == owner or name.startswith(f"{owner}/"):
+            key = name.removeprefix(f"{owner}/")
+            depths[key] = max(depths.get(key, 0.0), round(-float(contact.dist), 4))
+    return depths
 
 
 def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats], dict[str, float]]:
     """Put ``child`` into ``spec``; return its home pose and controls by full name."""
     try:
-        if not child.actuators:
-            _add_servos(child)
-        alone = robot.source.load() if child.keys else None
-        home, control = ({}, {}) if alone is None else _home(alone.compile(), f"{robot.name}/")
+        home, control = _home(robot) if child.keys else ({}, {})
         for key in list(child.keys):
             child.delete(key)
         frame = spec.worldbody.add_frame(
@@ -138,28 +151,18 @@ def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats],
     return home, control
 
 
-def _add_servos(child: Any) -> None:
-    """Add a critically damped position servo to each joint; a URDF has no actuators."""
-    for joint in child.joints:
-        if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) or not joint.name:
-            continue
-        joint.armature = max(float(joint.armature), 0.01)
-        servo = child.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        servo.set_to_position(kp=100.0, dampratio=1.0)
-        limited = float(joint.range[0]) < float(joint.range[1])
-        servo.ctrlrange = list(joint.range) if limited else [-np.pi, np.pi]
-        servo.ctrllimited = True
-
-
-def _home(model: Any, prefix: str) -> tuple[dict[str, Floats], dict[str, float]]:
-    """Return a model's pose named home, else its first, by full name."""
+def _home(robot: RobotPlan) -> tuple[dict[str, Floats], dict[str, float]]:
+    """Return the pose named home of a robot's file, else its first, by full name."""
+    alone, prefix = robot.source.load(), f"{robot.name}/"
+    name_parts(alone)
+    model = alone.compile()
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
     index = max(key, 0)
     pose: dict[str, Floats] = {}
     for joint in range(model.njnt):
         name = model.joint(joint).name
         # A free joint starts where the robot was placed, not where its own file puts it.
-        if name and model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             start = int(model.jnt_qposadr[joint])
             width = {1: 4}.get(int(model.jnt_type[joint]), 1)
             pose[prefix + name] = np.array(model.key_qpos[index][start : start + width])
@@ -205,7 +208,6 @@ def _map_robot(model: Any, name: str, label: str) -> RobotParts:
     prefix = f"{name}/"
     joints: dict[str, Joint] = {}
     base: int | None = None
-    joint_names: dict[int, str] = {}
     for index in range(model.njnt):
         full = model.joint(index).name
         if not full.startswith(prefix):
@@ -217,18 +219,15 @@ def _map_robot(model: Any, name: str, label: str) -> RobotParts:
             continue
         if kind == mujoco.mjtJoint.mjJNT_BALL:
             continue
-        key = full[len(prefix) :] or f"joint_{len(joints)}"
+        key = full[len(prefix) :]
         low, high = model.jnt_range[index] if model.jnt_limited[index] else (-UNBOUNDED, UNBOUNDED)
         joints[key] = Joint(key, address, int(model.jnt_dofadr[index]), float(low), float(high))
-        joint_names[index] = key
     actuators: dict[str, Actuator] = {}
     for index in range(model.nu):
         full = model.actuator(index).name
-        target = int(model.actuator_trnid[index][0])
-        on_joint = int(model.actuator_trntype[index]) == mujoco.mjtTrn.mjTRN_JOINT and target in joint_names
         if not full.startswith(prefix):
             continue
-        key = full[len(prefix) :] or (joint_names[target] if on_joint else f"actuator_{len(actuators)}")
+        key = full[len(prefix) :]
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-UNBOUNDED, UNBOUNDED)
         # MuJoCo computes an inherited range, which leaves 2.0 as 2.0000000000000004.
         bounds = round(float(low), 12), round(float(high), 12)

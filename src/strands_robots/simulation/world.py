@@ -34,7 +34,7 @@ from strands_robots.simulation.rendering import (
     draw_path,
     picture_size,
 )
-from strands_robots.simulation.stage import compile_stage
+from strands_robots.simulation.stage import compile_stage, in_floor
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, flag, identifier, shown, text, whole
 
@@ -66,6 +66,8 @@ class Simulation(TeleopMixin):
         tool_name: name of the simulation on a network.
         timestep: physics step in seconds, 0.0001 to 0.02.
         gravity: along z, m/s².
+        density: of the medium, kg/m³: 0 without one, 1.2 for air, 1000 for water; at most 20,000.
+        viscosity: of the medium, Pa·s, 0 to 1000.
         realtime: false if single commands shall start no clock, so that only :meth:`step` and rollouts move time.
 
     Raises:
@@ -78,13 +80,15 @@ class Simulation(TeleopMixin):
         *,
         timestep: float = 0.002,
         gravity: float = -9.81,
+        density: float = 0.0,
+        viscosity: float = 0.0,
         realtime: bool = True,
     ) -> None:
         self.tool_name_str = text("tool_name", tool_name, longest=128)
         self.gate = MotionGate()
         self.starting: AbstractContextManager[Any] = threading.RLock()
         self.observers = RolloutObservers()
-        self.physics = Physics(compile_stage(Plan.checked(timestep, gravity)))
+        self.physics = Physics(compile_stage(Plan.checked(timestep, gravity, density, viscosity)))
         self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime))
         self._bodies: dict[str, RobotBody] = {}
         self._rollouts: dict[str, Rollout] = {}
@@ -117,14 +121,18 @@ class Simulation(TeleopMixin):
         return body
 
     @answered
-    def create_world(self, timestep: float = 0.002, gravity: float = -9.81) -> Envelope:
+    def create_world(
+        self, timestep: float = 0.002, gravity: float = -9.81, *, density: float = 0.0, viscosity: float = 0.0
+    ) -> Envelope:
         """Start over with an empty world.
 
         Args:
             timestep: 0.0001 to 0.02 s.
             gravity: along z, -100 to 100 m/s².
+            density: of the medium, 0 to 20,000 kg/m³.
+            viscosity: of the medium, 0 to 1000 Pa·s.
         """
-        plan = Plan.checked(timestep, gravity)
+        plan = Plan.checked(timestep, gravity, density, viscosity)
         with self.starting:
             self._require_idle("create_world")
             permit = self.gate.permit("create_world")
@@ -144,19 +152,23 @@ class Simulation(TeleopMixin):
                 name; by default ``name``.
             position: of its base, metres; by default beside the robots that are there.
             yaw: heading, radians from -2π to 2π.
+
+        ``in_floor`` of the answer has the depth of each body that starts in the floor, metres.
         """
         robot = RobotPlan.checked(name, model, position, yaw)
         with self.starting:
             self._require_idle("add_robot")
             self._rebuild(self.physics.stage.plan.with_robot(robot, beside=position is None))
             parts = self.body(robot.name).parts
+            sunk = self._in_floor(robot.name)
         return success(
-            f"Added {robot.name} ({robot.source.label}) with {len(parts.actuators)} actuators.",
+            f"Added {robot.name} ({robot.source.label}) with {len(parts.actuators)} actuators.{_sunk(sunk)}",
             robot=robot.name,
             model=robot.source.label,
             joints=list(parts.joints),
             actuators=list(parts.actuators),
             cameras=list(parts.cameras),
+            in_floor=sunk,
         )
 
     @answered
@@ -197,7 +209,9 @@ class Simulation(TeleopMixin):
         with self.starting:
             self._require_idle("add_object")
             self._rebuild(self.physics.stage.plan.with_object(item))
-        return success(f"Added {item.shape} {item.name}.", object=item.name, position=list(item.position))
+            sunk = {} if item.fixed else self._in_floor(item.name)
+        summary = f"Added {item.shape} {item.name}.{_sunk(sunk)}"
+        return success(summary, object=item.name, position=list(item.position), in_floor=sunk)
 
     @answered
     def remove_object(self, name: str) -> Envelope:
@@ -501,6 +515,13 @@ class Simulation(TeleopMixin):
             r.name: self._bodies.get(r.name) or RobotBody(r.name, self.physics, self._clock) for r in plan.robots
         }
 
+    def _in_floor(self, owner: str) -> dict[str, float]:
+        """Return and log the depths of the bodies that start in the floor."""
+        sunk = in_floor(self.physics.snapshot.data(), owner)
+        if sunk:
+            logger.warning("%s:%s", owner, _sunk(sunk))
+        return sunk
+
     def _running(self) -> dict[str, Rollout]:
         return {name: rollout for name, rollout in list(self._rollouts.items()) if rollout.running}
 
@@ -542,6 +563,14 @@ def _row(rollout: Rollout) -> dict[str, Any]:
 
 def _range(low: float, high: float) -> list[float] | None:
     return [low, high] if low > float("-inf") or high < float("inf") else None
+
+
+def _sunk(depths: dict[str, float]) -> str:
+    """Return a sentence about bodies in the floor, empty without one."""
+    if not depths:
+        return ""
+    deep = ", ".join(f"{name} by {depth:g} m" for name, depth in depths.items())
+    return f" In the floor: {deep}; place it higher."
 
 
 def _count(robots: dict[str, Any]) -> str:
