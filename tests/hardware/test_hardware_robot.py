@@ -12,6 +12,7 @@ import pytest
 from fixtures.bodies import ScriptedPolicy
 from fixtures.devices import BlindDevice, FailingDevice, RecordingDevice, WedgingDevice
 from fixtures.leaders import ScriptedLeader
+from fixtures.planes import own_plane
 from fixtures.waiting import eventually
 
 from strands_robots import policies
@@ -19,6 +20,8 @@ from strands_robots.contract import RolloutEvent, TaskRobot
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware import robot as robots
+from strands_robots.policies.base import Ranges
+from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.utils import ValidationError
 
 WAVES = {"pan.pos": (0.0, 50.0, 1.0), "lift.pos": (0.0, 50.0, 1.0), "grip.pos": (50.0, 40.0, 1.0)}
@@ -147,6 +150,58 @@ def test_a_stop_of_a_loop_that_outlives_it_says_stopped_false(
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     assert all(write.action.get("pan.pos") != 99.0 for write in robot.device.writes)
     assert robot.halt().stopped is True
+
+
+class Loading(ScriptedPolicy):
+    """Loads its weights for as long as the test wants."""
+
+    def __init__(self) -> None:
+        super().__init__([], always={"pan.pos": 99.0})
+        self.loads, self.loaded = threading.Event(), threading.Event()
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        self.loads.set()
+        assert self.loaded.wait(60)
+
+
+@pytest.mark.parametrize("stop", ["halt", "stop_task"])
+def test_a_stop_while_a_policy_loads_says_stopped_at_once_and_it_never_moves_the_robot(
+    robot: HardwareRobot, monkeypatch: pytest.MonkeyPatch, stop: str
+) -> None:
+    loading = Loading()
+    monkeypatch.setattr(policies, "policy_factory", lambda name: lambda: loading)
+    robot.start_task("wave")
+    assert loading.loads.wait(20)
+    answer = getattr(robot, stop)()
+    assert (answer.stopped if stop == "halt" else answer["stopped"]) is True
+    assert not loading.loaded.is_set()
+    loading.loaded.set()
+    eventually(lambda: robot.get_task_status()["task_status"] == "stopped")
+    assert all(write.action.get("pan.pos") != 99.0 for write in robot.device.writes)
+
+
+def test_an_emergency_stop_of_a_policy_that_does_not_return_is_stopped_once_the_robot_is_frozen_and_locked(
+    robot: HardwareRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    thinks, go_on = threading.Event(), threading.Event()
+
+    def think() -> dict[str, float]:
+        thinks.set()
+        go_on.wait(60)
+        return {"pan.pos": 99.0}
+
+    thinking = ScriptedPolicy([{"pan.pos": 5.0}], always=think)
+    monkeypatch.setattr(policies, "policy_factory", lambda name: lambda: thinking)
+    with own_plane(20.0) as plane:
+        plane.register("arm", robot)
+        robot.start_task("think")
+        assert thinks.wait(20)
+        report = plane.emergency_stop(StopOrder(new_epoch(), "safety-1"))["arm"]
+        assert (report.stopped, report.verdict.halted) == (True, ("task",))
+        assert robot.device.writes[-1].action == robot.device.positions, "frozen"
+        go_on.set()
+        eventually(lambda: robot.get_task_status()["task_status"] == "stopped")
+    assert all(write.action.get("pan.pos") != 99.0 for write in robot.device.writes)
 
 
 def test_after_the_verdict_of_a_halt_nothing_is_written() -> None:

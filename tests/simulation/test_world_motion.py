@@ -69,6 +69,14 @@ class Stuck:
         """Nothing to free."""
 
 
+class Loading(Stuck):
+    """A policy that loads until ``let_go`` is set."""
+
+    def reset(self, instruction: str, ranges: Mapping[str, tuple[float, float]]) -> None:
+        self.inside.set()
+        assert self.let_go.wait(60)
+
+
 class Failing(Stuck):
     def act(self, observation: Mapping[str, Any]) -> dict[str, float]:
         raise ZeroDivisionError("no idea")
@@ -176,6 +184,22 @@ def test_halt_names_a_policy_that_does_not_return_and_its_action_is_not_written(
     stuck.let_go.set()
     eventually(lambda: not busy(world))
     assert held == world.body("left").targets
+
+
+@pytest.mark.parametrize("stop", ["halt", "stop_policy"])
+def test_a_stop_while_a_policy_loads_says_stopped_and_it_never_moves_the_robot(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch, stop: str
+) -> None:
+    loading = Loading()
+    monkeypatch.setattr(world_module, "create_policy", lambda *_, **__: loading)
+    world.start_policy("left", "think")
+    assert loading.inside.wait(20)
+    answer = world.halt() if stop == "halt" else world.stop_policy("left")
+    assert (answer.stopped if isinstance(answer, StopVerdict) else answer["stopped"]) is True
+    assert not loading.let_go.is_set()
+    loading.let_go.set()
+    eventually(lambda: not busy(world))
+    assert abs(world.body("left").targets["shoulder_pan"]) < 0.1, "it would go to 1.5"
 
 
 def test_later_action_of_a_stuck_policy_is_not_written_after_stop_policy(

@@ -32,6 +32,9 @@ STEPS_MAX = 10_000_000
 STOP_JOIN_S = 2.0
 """Seconds that a stop of one robot waits for its loop."""
 
+STILL_JOIN_S = 0.05
+"""Seconds that a stop waits for the loop of a robot that cannot move any more."""
+
 
 class RolloutOptions(TypedDict):
     """The arguments of :class:`Rollout` that a caller chooses."""
@@ -186,6 +189,7 @@ class Rollout:
         self._observers = observers or RolloutObservers()
         self._clock = clock or Clock()
         self._stop_requested = threading.Event()
+        self._loading = True
         self._started_at: float | None = None
         self._ended_at: float | None = None
         self._thread = threading.Thread(target=self.run, name=f"rollout-{body.name}", daemon=True)
@@ -237,10 +241,15 @@ class Rollout:
     def ended_by(self, deadline: float) -> Envelope:
         """Answer a stop: wait for the loop's end until ``deadline`` (monotonic).
 
-        A loop that outlives it, in a policy that computes or on a bus that hangs, sends no action any more.
+        The caller has frozen the body, so a loop that outlives this sends no action any more. It counts as stopped
+        while its policy is still loading, for it never moved the robot, and while the robot is locked.
         """
-        if self.join(max(0.0, deadline - time.monotonic())):
+        still = self._loading or self._permit.locked
+        patience = deadline - time.monotonic()
+        if self.join(max(0.0, min(patience, STILL_JOIN_S) if still else patience)):
             return success("Stopped.", stopped=True)
+        if still:
+            return success(f"Stopped; its {self.policy_name} has not returned yet and can move nothing.", stopped=True)
         return error(
             f"the loop of its {self.policy_name} has not returned yet; it sends no action any more", stopped=False
         )
@@ -256,6 +265,7 @@ class Rollout:
                 try:
                     bounds = dict(self._body.bounds)
                     self._policy.reset(self.instruction, bounds)
+                    self._loading = False
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"

@@ -107,6 +107,11 @@ class Permit:
         """True for ever once the whole robot was halted or locked."""
         return self._gate.generation != self._asked.generation
 
+    @property
+    def locked(self) -> bool:
+        """The robot refuses every motion until it is resumed."""
+        return self._gate.lockout(self.verb) is not None
+
     def check(self) -> None:
         """Raise :class:`MotionRefused` when this permit became void during a wait."""
         if not self.valid:

@@ -399,7 +399,7 @@ class Simulation(TeleopMixin):
             return success(f"{body.name} ran no policy; it is held.", robot=body.name, stopped=True, was_running=False)
         rollout.request_stop()
         body.hold()
-        stopped = rollout.join(STOP_JOIN_S)
+        stopped = bool(rollout.ended_by(time.monotonic() + STOP_JOIN_S)["stopped"])
         row = {**_row(rollout), "stopped": stopped, "was_running": True}
         if not stopped:
             return error(f"{body.name} is frozen, but its policy {rollout.policy_name} has not returned yet.", **row)
