@@ -12,7 +12,7 @@ from strands_robots.bus_access import bus_lock, read_joints
 from strands_robots.contract import AdaptedRobot, TaskRobot, adapt, put_away
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.stopping import StopVerdict, grade
 from strands_robots.utils import ValidationError
 
 
@@ -103,6 +103,92 @@ def test_own_halt_of_a_foreign_robot_is_called_and_graded() -> None:
     verdict = robot.halt("test")
     assert verdict.stopped is None
     assert "own" in verdict.unknown
+
+
+def telling(status: object, answer: object) -> AdaptedRobot:
+    """A foreign robot that answers so to a stop, and goes on telling this status."""
+    foreign = Foreign()
+    foreign.stop_answer = answer
+    foreign.get_task_status = lambda: status  # type: ignore[method-assign,assignment,return-value]
+    return AdaptedRobot(foreign)
+
+
+IDLE, RUNS = {"task_status": "idle"}, {"task_status": "Running"}
+
+
+@pytest.mark.parametrize(
+    ("status", "answer", "stopped"),
+    [
+        (RUNS, None, False),
+        (RUNS, success("Stopped.", stopped=True), False),
+        (RUNS, {"odd": 1}, False),
+        (success("", task_status="running"), None, False),
+        ({"status": "success", "content": [{"json": RUNS}]}, None, False),
+        (IDLE, None, True),
+        ({"content": [{"json": {"task_status": "STOPPED"}}]}, None, True),
+        (IDLE, success("Stopped."), True),
+        (IDLE, {"odd": 1}, None),
+        (IDLE, "stopped", None),
+        (IDLE, error("no"), False),
+        (None, None, None),
+        (None, success("Stopped.", stopped=True), None),
+        ("idle", success("Stopped."), None),
+        ({"task_status": "perhaps"}, success("Stopped."), None),
+        ({"task_status": None}, success("Stopped."), None),
+    ],
+)
+@pytest.mark.parametrize("verb", ["stop_task", "halt"])
+def test_a_stop_counts_as_what_the_status_after_it_confirms(
+    monkeypatch: pytest.MonkeyPatch, verb: str, status: object, answer: object, stopped: bool | None
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    assert grade(getattr(telling(status, answer), verb)()).stopped is stopped
+
+
+def test_a_robot_that_takes_a_moment_to_stop_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "40")
+    words = iter(["running", "running", "running", "stopped"])
+    foreign = Foreign()
+    foreign.stop_answer = None
+    foreign.get_task_status = lambda: success("", task_status=next(words))  # type: ignore[method-assign]
+    assert adapt(foreign).halt().halted == ("task",)
+
+
+def test_a_status_that_raises_after_a_stop_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    foreign = Foreign()
+
+    def lost() -> Envelope:
+        raise ConnectionError("no status packet")
+
+    foreign.get_task_status = lost  # type: ignore[method-assign]
+    verdict = adapt(foreign).halt()
+    assert verdict.stopped is None
+    assert "idle" in verdict.unknown["task"], "it says what was expected"
+
+
+def test_teleoperation_that_answers_none_to_its_stop_is_unknown() -> None:
+    foreign = Foreign()
+    foreign.stop_teleoperate = lambda: None  # type: ignore[attr-defined]
+    verdict = adapt(foreign).halt()
+    assert (verdict.halted, list(verdict.unknown)) == (("task",), ["teleoperation"])
+
+
+def test_an_own_halt_is_checked_by_the_status_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
+    robot = telling(RUNS, None)
+    robot.wrapped.halt = lambda reason: StopVerdict(("arm",))
+    assert robot.halt().stopped is False
+
+
+def test_a_refusal_at_registration_says_which_answers_are_expected() -> None:
+    class Mute:
+        def start_task(self) -> None: ...
+        def get_features(self) -> None: ...
+
+    with pytest.raises(ValidationError, match="lacks stop_task, get_task_status") as refused:
+        adapt(Mute())
+    assert "{'task_status': busy, completed, " in str(refused.value)
+    assert "stop_task() -> {'status': 'success' or 'error'}" in str(refused.value)
 
 
 @pytest.mark.parametrize("answer", [success("Stopped.", stopped=False), error("no"), {"running": True}])

@@ -7,18 +7,23 @@ Networks, tools and the command line reach a robot only through these protocols.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
+from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate, MotionRefused
-from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.safety.stopping import StopVerdict, grade, halt_each, json_blocks
 from strands_robots.utils import ValidationError, shown
+
+logger = logging.getLogger(__name__)
 
 Joints = dict[str, float]
 
@@ -27,6 +32,13 @@ SETTLE = "settle"
 
 RUNNING = frozenset({"running", "starting", "connecting", "busy"})
 """Values of ``task_status`` of a task that may move its robot."""
+
+AT_REST = frozenset({"idle", "completed", "stopped", "error"})
+"""Values of ``task_status`` of a robot whose task moves nothing; any other value is unknown."""
+
+STATUS_EVERY_S = 0.02
+STATUS_SHARE = 0.5
+"""Part of the halt deadline for which the status may go on saying that the task runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,14 +154,45 @@ Robot = TaskRobot | WorldRobot
 JointReader = Callable[[Any], Mapping[str, float]]
 """Reads a robot's joints, by name in its own unit; empty where it has none. Raises what the robot raises."""
 
-_TASK_VERBS = ("start_task", "stop_task", "get_task_status", "get_features")
+
+class ForeignRobot(Protocol):
+    """Least robot that :func:`adapt` makes fit: four verbs and their answers.
+
+    Further keys are passed on. A robot with a ``halt(reason)`` of its own is halted by that, and one with a
+    ``stop_teleoperate()`` by that as well; both answer as :meth:`stop_task` does.
+    """
+
+    def start_task(
+        self, instruction: str, *, policy_provider: str, duration: float, policy_port: int
+    ) -> Mapping[str, Any]:
+        """Start and return at once: ``status`` success, or error with ``reason``."""
+
+    def stop_task(self) -> Mapping[str, Any] | None:
+        """Stop: ``status`` is ``success`` or ``error``; ``stopped`` false did not stop.
+
+        None leaves it to :meth:`get_task_status`, which is read after every stop; anything else is unknown.
+        """
+
+    def get_task_status(self) -> Mapping[str, Any]:
+        """``task_status`` of :data:`AT_REST` or :data:`RUNNING`; all else is unknown."""
+
+    def get_features(self) -> Mapping[str, Any]:
+        """``observation_features`` and ``action_features``, as data."""
+
+
+_TASK_VERBS = {
+    "start_task": "(instruction, policy_provider, duration, policy_port) -> {'status': 'success' or 'error'}",
+    "stop_task": "() -> {'status': 'success' or 'error'}",
+    "get_task_status": f"() -> {{'task_status': {', '.join(sorted(AT_REST | RUNNING))}}}",
+    "get_features": "() -> {'observation_features': {}, 'action_features': {}}",
+}
 
 
 def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
     """Return ``robot`` when it fits :class:`TaskRobot`, else a wrapper that does.
 
     Args:
-        robot: what is to fit.
+        robot: what is to fit: a :class:`ForeignRobot` at least.
         joints: reads the joints of a robot that has no ``get_state`` of its own; without it those are none.
 
     Raises:
@@ -159,7 +202,10 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
         return robot
     missing = [verb for verb in _TASK_VERBS if not callable(getattr(robot, verb, None))]
     if missing:
-        raise ValidationError(f"robot must have {', '.join(_TASK_VERBS)}; {shown(robot)} lacks {', '.join(missing)}.")
+        shapes = "; ".join(f"{verb}{_TASK_VERBS[verb]}" for verb in missing)
+        raise ValidationError(
+            f"robot must have {', '.join(_TASK_VERBS)}; {shown(robot)} lacks {', '.join(missing)}. Expected: {shapes}."
+        )
     return AdaptedRobot(robot, joints)
 
 
@@ -253,9 +299,11 @@ class AdaptedRobot:
         return answer
 
     def stop_task(self) -> Envelope:
+        """Stop the task; the robot's own answer where its status does not contradict it."""
         with self._shared.calling():
-            answer: Envelope = self.wrapped.stop_task()
-        return answer
+            answer: Envelope | None = self.wrapped.stop_task()
+            verdict = halt_each({"task": partial(self._checked, answer)})
+        return answer if answer is not None and verdict.stopped else verdict.envelope()
 
     def get_task_status(self) -> Envelope:
         answer: Envelope = self.wrapped.get_task_status()
@@ -278,7 +326,7 @@ class AdaptedRobot:
         # One at a time, so that one that waited looks anew at what the robot does. No stop ever waits for this.
         with self._shared.reading:
             task = _facts(self.get_task_status())
-            problem = self._refresh(str(task.get("task_status", "")).lower())
+            problem = self._refresh(_task_status(task) or "")
             read_at, joints = self._shared.read or (None, {})
         fields: dict[str, Any] = {"joints": dict(joints), "task": task}
         fields["joints_age_s"] = None if read_at is None else round(time.monotonic() - read_at, 4)
@@ -294,18 +342,48 @@ class AdaptedRobot:
         return lambda: None
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """The robot's own ``halt`` where it has one, else its task and its teleoperation."""
+        """The robot's own ``halt`` where it has one, else its task and its teleoperation.
+
+        Its status is read afterwards: a robot that says that its task runs has not stopped, whatever it answered.
+        """
         self.gate.revoke()
+        began = time.monotonic()
         own = getattr(self.wrapped, "halt", None)
         if callable(own):
-            sources: dict[str, Callable[[], object]] = {self.tool_name_str: lambda: own(reason)}
+            stops: dict[str, Callable[[], object]] = {self.tool_name_str: lambda: own(reason)}
         else:
-            sources = {"task": self.wrapped.stop_task}
+            stops = {"task": self.wrapped.stop_task}
             teleop = getattr(self.wrapped, "stop_teleoperate", None)
             if callable(teleop):
-                sources["teleoperation"] = teleop
+                stops["teleoperation"] = teleop
+        main, *_ = stops
         with self._shared.calling():
-            return halt_each(sources)
+            answers = {name: _answer(stop) for name, stop in stops.items()}
+            # When everything was asked to stop: the status is waited for.
+            answers[main] = self._checked(answers[main])
+        verdict = halt_each({name: partial(_given, answer) for name, answer in answers.items()})
+        return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
+
+    def _checked(self, answer: object) -> object:
+        """Return the answer to a stop, or what the status after it says against it."""
+        if grade(answer).stopped is False or not callable(getattr(self.wrapped, "get_task_status", None)):
+            return answer
+        deadline = time.monotonic() + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+        while (status := self._status()) in RUNNING and time.monotonic() < deadline:
+            time.sleep(STATUS_EVERY_S)
+        if status in RUNNING:
+            return error(f"its get_task_status says {status} after the stop, which answered {shown(answer)}")
+        if status not in AT_REST:
+            # Text is an unknown answer to a stop.
+            return "task_status is none of idle, stopped, completed, error, running"
+        return success("Stopped.", stopped=True) if answer is None else answer
+
+    def _status(self) -> str | None:
+        try:
+            return _task_status(self.wrapped.get_task_status())
+        except Exception:
+            logger.exception("%s: its status could not be read after a stop.", self.tool_name_str)
+            return None
 
     def _refresh(self, status: str) -> str:
         """Read the joints unless a call is disturbed; else return the reason."""
@@ -323,6 +401,25 @@ class AdaptedRobot:
         except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the answer says what
             return f"The joints could not be read: {type(exc).__name__}: {exc}"
         return ""
+
+
+def _task_status(answer: object) -> str | None:
+    """Return the ``task_status`` of an answer, beside its content or inside it."""
+    facts = [answer, *json_blocks(answer)] if isinstance(answer, Mapping) else []
+    words = [fact["task_status"] for fact in facts if isinstance(fact.get("task_status"), str)]
+    return words[0].lower() if words else None
+
+
+def _answer(stop: Callable[[], object]) -> object:
+    try:
+        return stop()
+    except Exception as exc:  # noqa: BLE001 - whatever a stop raises is graded
+        return exc
+
+
+def _given(answer: object) -> object:
+    """Return the answer to a stop; as text None, which would mean that nothing moved."""
+    return shown(answer) if answer is None else answer
 
 
 def _facts(answer: object) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def grade(answer: object) -> Outcome:
         return Outcome.RAISED
     if not isinstance(answer, Mapping):
         return Outcome.UNKNOWN
-    facts = [answer, *_json_blocks(answer)]
+    facts = [answer, *json_blocks(answer)]
     if any(_denies(fact) for fact in facts):
         return Outcome.REFUSED
     if any(fact.get("stopped", False) is None and "stopped" in fact for fact in facts):
@@ -174,7 +174,8 @@ def halt_each(sources: Mapping[str, Callable[[], object]]) -> StopVerdict:
     return StopVerdict(tuple(halted), not_stopped, unknown, (time.monotonic() - started) * 1000)
 
 
-def _json_blocks(answer: Mapping[str, object]) -> list[Mapping[str, object]]:
+def json_blocks(answer: Mapping[str, object]) -> list[Mapping[str, object]]:
+    """Return the ``json`` blocks of an envelope's content."""
     content = answer.get("content")
     blocks = content if isinstance(content, list) else []
     return [b["json"] for b in blocks if isinstance(b, Mapping) and isinstance(b.get("json"), Mapping)]
