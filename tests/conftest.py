@@ -26,6 +26,8 @@ if find_spec("hypothesis"):
 
     slow = [hypothesis.HealthCheck.too_slow]
     hypothesis.settings.register_profile("patient", deadline=None, suppress_health_check=slow)
+    patient = hypothesis.settings.get_profile("patient")
+    hypothesis.settings.register_profile("ten-thousand", patient, max_examples=10_000)
     hypothesis.settings.load_profile("patient")
 
 # A shell starts background jobs with Ctrl-C ignored, and every process that a test starts would inherit that.

@@ -16,7 +16,9 @@ from fixtures.waiting import eventually
 
 from strands_robots import audit
 from strands_robots.audit import flush_audit, log_safety_event, read_audit_log, verify_audit_integrity
-from strands_robots.audit.journal import GENESIS, NAME, AuditEntry, Journal, verify
+from strands_robots.audit.head import GENESIS
+from strands_robots.audit.journal import NAME, AuditEntry, Journal
+from strands_robots.audit.verification import verify
 
 
 def entry(number: int, peer: str = "arm-1", **payload: Any) -> AuditEntry:

@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.audit.journal import AuditEntry, Journal, verify
+from strands_robots.audit.head import log_id
+from strands_robots.audit.journal import NAME, AuditEntry, Journal
+from strands_robots.audit.verification import verify
 from strands_robots.safety.approval import state_dir
 from strands_robots.utils import shown
 
@@ -61,17 +63,19 @@ def flush_audit(timeout: float = FLUSH_S) -> bool:
 def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
     """Return every record, oldest first; with ``since`` (wall-clock s) newer ones."""
     flush_audit(FLUSH_S)
-    records = Journal(*_journal_key()).records()
+    records = _journal(_journal_key()).records()
     return [each for each in records if since is None or _time(each) >= since]
 
 
 def verify_audit_integrity() -> dict[str, Any]:
-    """Counts ``total``, ``signed``, ``verified``, ``bad``, ``missing``, ``gaps``, ``torn``, ``broken``, the list
-    ``breaks`` that says where, ``head``, and ``ok``; see :func:`strands_robots.audit.journal.verify`.
+    """Check the audit of this machine.
+
+    Counts ``total``, ``signed``, ``verified``, ``bad``, ``missing``, ``gaps``, ``torn``, ``broken``, ``tampered``,
+    the list ``breaks`` that says where, ``head``, and ``ok``; see :func:`strands_robots.audit.verification.verify`.
     """
     flush_audit(FLUSH_S)
     key = _journal_key()
-    return verify(Journal(*key), keyed=key[1] is not None)
+    return verify(_journal(key), keyed=key[1] is not None)
 
 
 _Key = tuple[Path, bytes | None]
@@ -80,6 +84,12 @@ _Key = tuple[Path, bytes | None]
 def _journal_key() -> _Key:
     secret = settings.raw("STRANDS_MESH_AUDIT_PSK")
     return audit_directory(), secret.encode() if secret else None
+
+
+def _journal(key: _Key) -> Journal:
+    directory, secret = key
+    # The anchor is not beside the log, so that a copy of the log and its head does not bring it along.
+    return Journal(directory, secret, anchor=state_dir() / "anchors" / log_id(directory / NAME))
 
 
 def _text(value: object) -> str:
@@ -96,7 +106,7 @@ class _Pending:
 
     def __init__(self, key: _Key) -> None:
         self.directory = key[0]
-        self.journal = Journal(*key)
+        self.journal = _journal(key)
         self.entries: deque[AuditEntry] = deque()
         self.waiting: list[threading.Event] = []
         self.failing = False

@@ -1,9 +1,9 @@
-"""Audit file: one chained record a line, shared by processes, and its check.
+"""Audit file: one chained record a line, shared by processes.
 
 A record is sorted compact JSON with ``ts`` (wall-clock s), ``event``, ``peer_id``, ``payload``, ``seq`` (per peer,
 never reused), ``prev`` (SHA-256 of the line before it) and, with a key, ``sig`` (HMAC-SHA256 of the rest). The head
-file beside it holds what the next record needs and what the last one was, so that a log cut at its end shows too;
-it may lag behind after a crash and is then caught up from the log.
+beside it and the anchor elsewhere say where it ends (:mod:`strands_robots.audit.head`). A writer that finds the log,
+the head and the anchor at odds records :data:`BROKEN` and goes on; the check fails from then on.
 """
 
 from __future__ import annotations
@@ -11,24 +11,48 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
-import hmac
 import json
+import logging
 import os
 import stat
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
+from strands_robots.audit.head import (
+    BREAKS_KEPT,
+    GENESIS,
+    Anchor,
+    Head,
+    Seal,
+    log_id,
+    opened,
+    read_anchor,
+    read_head,
+    sync_directory,
+    write_all,
+    write_anchor,
+    write_head,
+)
 from strands_robots.safety.ed25519 import canonical
 from strands_robots.utils import shown
 
+logger = logging.getLogger(__name__)
+
 NAME = "mesh_audit.jsonl"
-GENESIS = "0" * 64
+BROKEN = "audit_broken"
+AUDIT_PEER = "audit"
 MAX_BYTES = 100 * 2**20
 KEPT_FILES = 5
-BREAKS_SHOWN = 100
 PAYLOAD_MAX_BYTES = 256 * 2**10
+WRITE_BYTES = 2**20
+"""Bytes after which a write ends and the next begins: the head names the lines of one write."""
+
+TAIL_MAX_BYTES = 64 * 2**20
+"""Longest part behind the head that is looked at; a writer that died leaves one write."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,37 +65,60 @@ class AuditEntry:
     payload: Any
 
 
-@dataclass(slots=True)
-class Head:
-    """State of the chain: last line's hash, its file, last number of each peer.
+@dataclass(frozen=True, slots=True)
+class LogSnapshot:
+    """State of a log at one moment: head, anchor, files and their sizes."""
 
-    ``origin`` is the hash that the oldest kept record continues from.
-    """
+    head: Head | None
+    anchor: Anchor | None
+    files: tuple[tuple[Path, BinaryIO, int], ...]
 
-    last: str = GENESIS
-    size: int = 0
-    inode: int = 0
-    origin: str = GENESIS
-    seqs: dict[str, int] = field(default_factory=dict)
+    def lines(self) -> Iterator[tuple[Path, int, bytes]]:
+        """Yield file, line number from 1 and bytes of every line, with its end."""
+        for path, file, size in self.files:
+            file.seek(0)
+            left = size
+            for number, line in enumerate(file, 1):
+                if left <= 0:
+                    break
+                yield path, number, line[:left]
+                left -= len(line)
 
 
 class Journal:
     """Audit log in ``directory``. Not thread-safe; a file lock excludes processes.
+
+    Args:
+        anchor: file of the anchor; by default below ``directory``.
+        kept: rotated files that are stored besides the current one; 0 means that the log is never rotated.
 
     Raises, from :meth:`append`:
         OSError: full disk, read-only directory, a link where the log should be, a lost permission.
     """
 
     def __init__(
-        self, directory: Path, key: bytes | None = None, max_bytes: int = MAX_BYTES, kept: int = KEPT_FILES
+        self,
+        directory: Path,
+        key: bytes | None = None,
+        max_bytes: int = MAX_BYTES,
+        kept: int = KEPT_FILES,
+        *,
+        name: str = NAME,
+        anchor: Path | None = None,
     ) -> None:
         self.directory = directory
-        self.path = directory / NAME
-        self._head_path = directory / "mesh_audit.head"
-        self._key = key
+        self.path = directory / name
+        self._head_path = self.path.with_suffix(".head")
+        self._anchor_path = anchor or directory / "anchors" / name
+        self._seal = Seal(key)
         self._max_bytes = max_bytes
         self._kept = kept
         self._head: Head | None = None
+
+    @property
+    def written(self) -> Head | None:
+        """Head after the last write of this object."""
+        return self._head
 
     def append(self, entries: Sequence[AuditEntry]) -> None:
         """Write every entry and return when all of them are on the disk.
@@ -79,23 +126,10 @@ class Journal:
         On an error none is acknowledged, though some may have been written: a second try may record them twice.
         """
         self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        waiting = list(entries)
         with self._locked():
-            head = self._current()
-            if head.size >= self._max_bytes:
-                self._rotate(head)
-            self._head = None
-            with _opened(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as descriptor:
-                fresh = os.fstat(descriptor).st_size == 0
-                # A torn line of a writer that died is closed off; it was never acknowledged.
-                torn = not fresh and not self._ends_whole(head.size)
-                lines = b"".join(self._line(entry, head) for entry in entries)
-                _write_all(descriptor, (b"\n" if torn else b"") + lines)
-                os.fsync(descriptor)
-                head.size, head.inode = os.fstat(descriptor).st_size, os.fstat(descriptor).st_ino
-            if fresh:
-                _sync_directory(self.directory)
-            self._save(head)
-            self._head = head
+            while waiting:
+                del waiting[: self._write(waiting)]
 
     def lines(self) -> Iterator[tuple[Path, int, bytes]]:
         """Yield file, line number from 1 and bytes of every line, oldest first."""
@@ -118,119 +152,265 @@ class Journal:
 
     def signature_valid(self, record: dict[str, Any]) -> bool:
         """True when the key made the record's ``sig``."""
-        bare = {name: value for name, value in record.items() if name != "sig"}
-        sig = record.get("sig")
-        return self._key is not None and isinstance(sig, str) and hmac.compare_digest(sig, self._sign(bare))
+        return self._seal.valid(record)
 
-    def head(self) -> Head | None:
-        """Return the head file's content; None if missing, unreadable or unsigned."""
-        try:
-            data = json.loads(_read(self._head_path))
-            sig = data.pop("sig", "")
-            genuine = self._key is None or hmac.compare_digest(sig, self._sign(data))
-            return Head(**data) if genuine else None
-        except (OSError, ValueError, TypeError, AttributeError):
-            return None
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[LogSnapshot]:
+        """Give the log as it is now; writers go on meanwhile."""
+        with contextlib.ExitStack() as files:
+            with contextlib.ExitStack() as lock:
+                with contextlib.suppress(FileNotFoundError):  # nothing was written yet
+                    lock.enter_context(self._locked(shared=True))
+                log = log_id(self.path)
+                head = read_head(self._head_path, self._seal, log)
+                found = [(path, files.enter_context(path.open("rb"))) for path in self.files()]
+                sized = tuple((path, file, os.fstat(file.fileno()).st_size) for path, file in found)
+                anchor = read_anchor(self._anchor_path, self._seal, log)
+            yield LogSnapshot(head, anchor, sized)
+
+    def _write(self, entries: Sequence[AuditEntry]) -> int:
+        """Write the first entries, at least one; return how many."""
+        head, mismatches = self._recover()
+        self._note(head, mismatches)
+        if self._kept and head.size >= self._max_bytes:
+            mismatches += self._rotate(head)
+        after = deepcopy(head)
+        alarms = [AuditEntry(time.time(), BROKEN, AUDIT_PEER, {"why": why}) for why in mismatches]
+        lines = [self._line(each, after) for each in alarms]
+        done = length = 0
+        while done < len(entries) and length < WRITE_BYTES:
+            lines.append(self._line(entries[done], after))
+            length += len(lines[-1])
+            done += 1
+        with opened(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT) as descriptor:
+            # A torn line is closed off; it was never acknowledged.
+            text = (b"" if _ends_whole(descriptor) else b"\n") + b"".join(lines)
+            if head.inode == 0:
+                head.inode = os.fstat(descriptor).st_ino
+                sync_directory(self.directory)
+            head.pending = text.decode("ascii")
+            write_head(self._head_path, self._seal, head, durable=True)
+            write_all(descriptor, text)
+            os.fsync(descriptor)
+            after.size, after.inode = os.fstat(descriptor).st_size, os.fstat(descriptor).st_ino
+        self._finish(after)
+        return done
+
+    def _finish(self, head: Head) -> None:
+        write_anchor(self._anchor_path, self._seal, Anchor(head.log, head.count, head.last))
+        head.pending, head.rotating = "", False
+        # The head on the disk names the lines that are written by now: without this one it is caught up.
+        with contextlib.suppress(OSError):
+            write_head(self._head_path, self._seal, head, durable=False)
+        self._head = head
 
     def _line(self, entry: AuditEntry, head: Head) -> bytes:
-        seq = head.seqs.get(entry.peer_id, 0) + 1
-        record: dict[str, Any] = {
-            "ts": entry.ts,
-            "event": entry.event,
-            "peer_id": entry.peer_id,
-            "payload": storable(entry.payload),
-            "seq": seq,
-            "prev": head.last,
-        }
-        if self._key is not None:
-            record["sig"] = self._sign(record)
-        head.seqs[entry.peer_id] = seq
+        record = self._seal.sign(
+            {
+                "ts": entry.ts,
+                "event": entry.event,
+                "peer_id": entry.peer_id,
+                "payload": storable(entry.payload),
+                "seq": head.seqs.get(entry.peer_id, 0) + 1,
+                "prev": head.last,
+            }
+        )
         line = canonical(record)
-        head.last = hashlib.sha256(line).hexdigest()
+        head.advance(line, record)
         return line + b"\n"
 
-    def _sign(self, record: dict[str, Any]) -> str:
-        return hmac.new(self._key or b"", canonical(record), hashlib.sha256).hexdigest()
+    def _recover(self) -> tuple[Head, list[str]]:
+        """Return the state to go on from, and every mismatch of log, head and anchor."""
+        log = log_id(self.path)
+        size, inode = self._status()
+        anchor = read_anchor(self._anchor_path, self._seal, log)
+        found = read_head(self._head_path, self._seal, log)
+        if found is None and self._head is None and self._untouched(size):
+            write_anchor(self._anchor_path, self._seal, Anchor(log, 0, GENESIS))
+            return Head(log), []
+        head, mismatches = self._believed(found, anchor, log)
+        if head.rotating and inode != head.inode and self._renamed(head):
+            head.rotated(self._kept)
+        announced_from = head.count
+        # A log that does not fit its head is not caught up.
+        why = self._misfit(head, size, inode) or self._catch_up(head)
+        if why is not None:
+            mismatches.append(why)
+        mismatches += anchor_mismatches(head, anchor, announced_from, keyed=self._seal.keyed)
+        if mismatches:
+            head.size, head.inode = self._status()
+            head.count = max(head.count, anchor.count if anchor else 0)
+        elif anchor is None or anchor.count < head.count:
+            write_anchor(self._anchor_path, self._seal, Anchor(log, head.count, head.last))
+        head.pending = ""
+        return head, mismatches
 
-    def _current(self) -> Head:
+    def _untouched(self, size: int) -> bool:
+        anchor_missing = not self._anchor_path.exists()
+        begun = read_anchor(self._anchor_path, self._seal, log_id(self.path))
+        return (
+            size == 0 and not self._head_path.exists() and (anchor_missing or (begun is not None and begun.count == 0))
+        )
+
+    def _believed(self, found: Head | None, anchor: Anchor | None, log: str) -> tuple[Head, list[str]]:
+        own = deepcopy(self._head)
+        if found is None:
+            missing = ["its head is missing, changed or not signed with this secret"] if self._seal.keyed else []
+            return own or self._scan(log, anchor), missing
+        if own is not None and found.count + found.pending.count("\n") < own.count:
+            return own, [f"its head is rolled back to record {found.count}; this process wrote record {own.count}"]
+        if own is not None and found.count == own.count and found.last != own.last:
+            return own, [f"its head has another record {own.count} than this process wrote"]
+        return found, []
+
+    def _misfit(self, head: Head, size: int, inode: int) -> str | None:
+        if inode == 0:
+            return "it is gone" if head.size else None
+        if head.inode not in (0, inode):
+            return "another file is in its place"
+        if size < head.size:
+            return f"it was cut from {head.size} to {size} bytes"
+        if head.line:
+            with self.path.open("rb") as file:
+                file.seek(max(head.size - head.line, 0))
+                line = file.read(head.line)
+            torn = not line.endswith(b"\n") and not self._seal.keyed
+            if hashlib.sha256(line[:-1]).hexdigest() != head.last and not torn:
+                return "its last record was changed"
+        return None
+
+    def _catch_up(self, head: Head) -> str | None:
+        """Go over what a writer left behind that died; return why it is no writer's."""
+        pending = head.pending.encode()
+        tail = self._tail(head.size)
+        if pending.startswith(tail):
+            self._complete(head, pending, tail)
+            return None
+        if self._seal.keyed or len(tail) > TAIL_MAX_BYTES:
+            return "its end is none that its head announced"
+        for line in tail.split(b"\n"):
+            record = parse(line)
+            if record is not None:
+                if not head.expects(record):
+                    return "its end does not continue it"
+                head.advance(line, record)
+        head.size += len(tail)
+        return None
+
+    def _complete(self, head: Head, pending: bytes, tail: bytes) -> None:
+        if len(tail) < len(pending):
+            with opened(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as descriptor:
+                write_all(descriptor, pending[len(tail) :])
+                os.fsync(descriptor)
+        for line in pending.splitlines():
+            record = parse(line)
+            if record is not None:
+                head.advance(line, record)
+        head.size += len(pending)
+
+    def _tail(self, start: int) -> bytes:
+        with contextlib.suppress(FileNotFoundError), self.path.open("rb") as file:  # the first record is to come
+            file.seek(start)
+            return file.read(TAIL_MAX_BYTES + 1)
+        return b""
+
+    def _scan(self, log: str, anchor: Anchor | None) -> Head:
+        """Return the state as the log shows it, numbered by the anchor's record."""
+        head, origins = Head(log), []
+        for _, number, line in self.lines():
+            record = parse(line)
+            if number == 1:
+                origins.append(record["prev"] if record is not None else head.last)
+            if record is None:
+                continue
+            head.advance(line, record)
+            if anchor is not None and head.last == anchor.last:
+                head.count = anchor.count
+        head.origins = origins or head.origins
+        head.size, head.inode = self._status()
+        return head
+
+    def _note(self, head: Head, mismatches: Sequence[str]) -> None:
+        for why in mismatches:
+            logger.critical("The safety audit %s was tampered with: %s.", self.path, why)
+            if len(head.breaks) < BREAKS_KEPT:
+                head.breaks.append({"ts": time.time(), "why": why})
+
+    def _status(self) -> tuple[int, int]:
         try:
             status = self.path.lstat()
         except FileNotFoundError:
-            size, inode = 0, 0
-        else:
-            if not stat.S_ISREG(status.st_mode):
-                raise OSError(f"{self.path} is no regular file; the audit does not follow links")
-            size, inode = status.st_size, status.st_ino
-        for head in (self._head, self.head()):
-            if head is None or (inode and head.inode != inode) or head.size > size:
-                continue
-            self._catch_up(head)
-            return head
-        return self._scan()
+            return 0, 0
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(f"{self.path} is no regular file; the audit does not follow links")
+        return status.st_size, status.st_ino
 
-    def _catch_up(self, head: Head) -> None:
-        with contextlib.suppress(FileNotFoundError), self.path.open("rb") as file:  # the first record is to come
-            file.seek(head.size)
-            for line in file:
-                _advance(head, line.rstrip(b"\n"))
-                head.size += len(line)
-            head.inode = os.fstat(file.fileno()).st_ino
-
-    def _scan(self) -> Head:
-        head = Head()
-        for number, (_, _, line) in enumerate(self.lines()):
-            record = parse(line)
-            if number == 0 and record is not None:
-                head.origin = record["prev"]
-            _advance(head, line)
-        with contextlib.suppress(FileNotFoundError):  # nothing was written yet
-            status = self.path.stat()
-            head.size, head.inode = status.st_size, status.st_ino
-        return head
-
-    def _ends_whole(self, size: int) -> bool:
-        with self.path.open("rb") as file:
-            file.seek(size - 1)
-            return file.read(1) == b"\n"
-
-    def _rotate(self, head: Head) -> None:
-        for number in range(self._kept, 0, -1):
+    def _rotate(self, head: Head) -> list[str]:
+        """Rename the files; return what was wrong with the one that is removed."""
+        # A rotation that a dying writer left half done has a gap, up to which the files are renamed.
+        gap = next((number for number in range(1, self._kept + 1) if not self._rotated(number).exists()), self._kept)
+        mismatches = [] if head.rotating else self._dropping(head)
+        self._note(head, mismatches)
+        head.rotating = True
+        write_head(self._head_path, self._seal, head, durable=True)
+        for number in range(gap, 0, -1):
             younger = self._rotated(number - 1) if number > 1 else self.path
-            if younger.exists():
-                younger.replace(self._rotated(number))
-        oldest = next(iter(self.lines()), None)
-        first = parse(oldest[2]) if oldest else None
-        head.origin = first["prev"] if first else head.last
-        head.size, head.inode = 0, 0
-        _sync_directory(self.directory)
+            younger.replace(self._rotated(number))
+        head.rotated(min(self._kept, len(self.files())))
+        sync_directory(self.directory)
+        return mismatches
+
+    def _dropping(self, head: Head) -> list[str]:
+        files = self.files()
+        if len(files) != len(head.origins):
+            return [f"it has {len(files)} files of {len(head.origins)}"]
+        if len(files) <= self._kept or continues(files[0], head.origins[0], head.origins[1]):
+            return []
+        return [f"records were changed in {files[0].name}, the oldest file, which is removed now"]
+
+    def _renamed(self, head: Head) -> bool:
+        with contextlib.suppress(FileNotFoundError):  # it was not renamed
+            status = self._rotated(1).lstat()
+            return (status.st_ino, status.st_size) == (head.inode, head.size)
+        return False
 
     def _rotated(self, number: int) -> Path:
-        return self.path.with_name(f"{NAME}.{number}")
-
-    def _save(self, head: Head) -> None:
-        data: dict[str, Any] = {
-            "last": head.last,
-            "size": head.size,
-            "inode": head.inode,
-            "origin": head.origin,
-            "seqs": head.seqs,
-        }
-        if self._key is not None:
-            data["sig"] = self._sign(data)
-        draft = self._head_path.with_suffix(".draft")
-        # A head that cannot be written is caught up later; the records are what was promised.
-        with (
-            contextlib.suppress(OSError),
-            _opened(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as descriptor,
-        ):
-            _write_all(descriptor, canonical(data))
-            draft.replace(self._head_path)
+        return self.path.with_name(f"{self.path.name}.{number}")
 
     @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
-        with _opened(self.directory / "mesh_audit.lock", os.O_RDWR | os.O_CREAT) as descriptor:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+    def _locked(self, *, shared: bool = False) -> Iterator[None]:
+        flags = os.O_RDONLY if shared else os.O_RDWR | os.O_CREAT
+        with opened(self.path.with_suffix(".lock"), flags) as descriptor:
+            fcntl.flock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
             yield
+
+
+def anchor_mismatches(head: Head, anchor: Anchor | None, lowest: int, *, keyed: bool) -> list[str]:
+    """Return what is wrong with the anchor of a log that was read to its end.
+
+    It is written before the head: only records above ``lowest``, which a dead writer had announced, may be ahead of it.
+    """
+    if anchor is None:
+        return ["its anchor is missing, changed or not signed with this secret"] if keyed else []
+    if anchor.count > head.count:
+        return [f"it is rolled back to record {head.count}; its anchor has record {anchor.count}"]
+    if anchor.count == head.count and anchor.last != head.last:
+        return [f"its anchor has another record {anchor.count}"]
+    if anchor.count < lowest:
+        return [f"its anchor is rolled back to record {anchor.count}, of {head.count}"]
+    return []
+
+
+def continues(path: Path, start: str, end: str) -> bool:
+    """True when the lines of a file are one chain from ``start`` to ``end``."""
+    last = start
+    with path.open("rb") as file:
+        for raw in file:
+            line = raw.removesuffix(b"\n")
+            if line == raw or f'"prev":"{last}"'.encode() not in line:
+                return False
+            last = hashlib.sha256(line).hexdigest()
+    return last == end
 
 
 def parse(line: bytes) -> dict[str, Any] | None:
@@ -256,107 +436,6 @@ def storable(payload: Any) -> Any:
     return {"SERIALISE_FAILED": reason, "kept": {shown(key): shown(value) for key, value in items}}
 
 
-@dataclass(slots=True)
-class Findings:
-    """Counts of a check of the log; ``breaks`` are places, in order."""
-
-    total: int = 0
-    signed: int = 0
-    verified: int = 0
-    bad: int = 0
-    missing: int = 0
-    gaps: int = 0
-    torn: int = 0
-    broken: int = 0
-    breaks: list[dict[str, Any]] = field(default_factory=list)
-
-    def note(self, where: str, why: str) -> None:
-        """Remember a break; beyond the first hundred only the counts go on."""
-        if len(self.breaks) < BREAKS_SHOWN:
-            self.breaks.append({"where": where, "why": why})
-
-
-def verify(journal: Journal, *, keyed: bool) -> dict[str, Any]:
-    """Check the log: its chain, its numbers and its signatures.
-
-    ``bad`` are invalid signatures, ``missing`` records without one although a key is set, ``gaps`` jumps
-    in a peer's numbers, ``broken`` records that do not continue the one before, ``torn`` lines that a dying writer
-    left and the chain passes over. ``head`` is ok, missing (a cut at the end cannot be excluded) or cut.
-    """
-    head = journal.head()
-    found, last, first = Findings(), head.origin if head else None, True
-    seqs: dict[str, int] = {}
-    reached_head = head is not None and head.last == head.origin
-    for path, number, line in journal.lines():
-        where = f"{path.name}:{number}"
-        record = parse(line)
-        if record is None:
-            found.torn += 1
-            continue
-        found.total += 1
-        if last is not None and record["prev"] != last:
-            found.broken += 1
-            found.note(where, "does not continue the record before it")
-        expected = seqs.get(record["peer_id"])
-        if expected is not None and record["seq"] != expected + 1:
-            found.gaps += 1
-            found.note(where, f"{record['peer_id']} went from {expected} to {record['seq']}")
-        seqs[record["peer_id"]] = record["seq"]
-        _signature(journal, record, found, where, keyed=keyed)
-        last, first = hashlib.sha256(line).hexdigest(), False
-        reached_head = reached_head or (head is not None and head.last == last)
-    standing = "missing" if head is None and not first else "ok" if head is None or reached_head else "cut"
-    if standing == "cut":
-        found.note("end", "the last record that was acknowledged is not there")
-    counts = {name: getattr(found, name) for name in Findings.__slots__}
-    whole = not (found.bad or found.missing or found.gaps or found.broken) and standing != "cut"
-    return {**counts, "head": standing, "ok": whole}
-
-
-def _signature(journal: Journal, record: dict[str, Any], found: Findings, where: str, *, keyed: bool) -> None:
-    if "sig" not in record:
-        if keyed:
-            found.missing += 1
-            found.note(where, "not signed")
-        return
-    found.signed += 1
-    if not keyed:
-        return
-    if journal.signature_valid(record):
-        found.verified += 1
-    else:
-        found.bad += 1
-        found.note(where, "the signature does not hold")
-
-
-def _advance(head: Head, line: bytes) -> None:
-    record = parse(line)
-    if record is None:
-        return
-    head.last = hashlib.sha256(line).hexdigest()
-    head.seqs[record["peer_id"]] = max(record["seq"], head.seqs.get(record["peer_id"], 0))
-
-
-@contextlib.contextmanager
-def _opened(path: Path, flags: int) -> Iterator[int]:
-    descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-def _read(path: Path) -> bytes:
-    with _opened(path, os.O_RDONLY) as descriptor:
-        return os.read(descriptor, 2**26)
-
-
-def _write_all(descriptor: int, data: bytes) -> None:
-    written = os.write(descriptor, data)
-    if written != len(data):
-        raise OSError(f"{written} of {len(data)} bytes of the audit record fitted")
-
-
-def _sync_directory(directory: Path) -> None:
-    with _opened(directory, os.O_RDONLY | os.O_DIRECTORY) as descriptor:
-        os.fsync(descriptor)
+def _ends_whole(descriptor: int) -> bool:
+    size = os.fstat(descriptor).st_size
+    return size == 0 or os.pread(descriptor, 1, size - 1) == b"\n"

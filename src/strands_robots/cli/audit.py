@@ -17,6 +17,8 @@ from strands_robots.utils import number, whole
 T = TypeVar("T")
 
 FOLLOW_S = 0.3
+NOT_INTACT = "The audit is not intact: records were changed, left out, cut off or rolled back."
+NEVER_BEGUN = "There is no audit: nothing was recorded here with this secret yet, or all of it was deleted."
 FIRST_FIELDS = ("stopped", "source", "who", "why", "reason", "estop_id", "epoch")
 HIDDEN_FIELDS = ("device_id", "epochs", "issued", "pressed_at", "timing", "repeated", "late", "road", "persisted")
 
@@ -77,13 +79,14 @@ def show(
 def verify(screen: Screen) -> None:
     """Check the chain, the numbers and the signatures. Exits with 1 when the record was cut or changed."""
     found = _readable(verify_audit_integrity)
-    counts = ("total", "signed", "verified", "bad", "missing", "gaps", "broken", "torn")
+    counts = ("total", "signed", "verified", "bad", "missing", "gaps", "broken", "torn", "tampered")
     screen.say(str(audit_directory()))
     screen.show(table("", ("what", "count"), ((name, found[name]) for name in counts)))
     for each in found["breaks"]:
         screen.say(f"{each['where']}: {each['why']}", "red")
     if not found["ok"]:
-        raise CliError("The audit is not intact: records were changed, left out or cut off.", **found)
+        why = NEVER_BEGUN if found["head"] == "missing" and not found["total"] else NOT_INTACT
+        raise CliError(why, **found)
     screen.data({"status": "success", **found})
     end = "" if found["head"] == "ok" else " A cut at its end cannot be excluded: its head is missing."
     screen.say(f"The audit is intact: {found['total']} records.{end}", "yellow" if end else "green")

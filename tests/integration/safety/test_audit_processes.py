@@ -12,7 +12,8 @@ import pytest
 from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, log_safety_event
-from strands_robots.audit.journal import AuditEntry, Journal, verify
+from strands_robots.audit.journal import AuditEntry, Journal
+from strands_robots.audit.verification import verify
 
 WRITER = """
 import sys

@@ -1,0 +1,183 @@
+"""Check of an audit log: its chain, numbers, signatures, head and anchor."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from strands_robots.audit.head import Head
+from strands_robots.audit.journal import BROKEN, Journal, LogSnapshot, anchor_mismatches, parse
+
+BREAKS_SHOWN = 100
+
+
+@dataclass(slots=True)
+class Findings:
+    """Counts of a check of the log; ``breaks`` are places, in order."""
+
+    total: int = 0
+    signed: int = 0
+    verified: int = 0
+    bad: int = 0
+    missing: int = 0
+    gaps: int = 0
+    torn: int = 0
+    broken: int = 0
+    tampered: int = 0
+    breaks: list[dict[str, Any]] = field(default_factory=list)
+
+    def note(self, where: str, why: str) -> None:
+        """Remember a break; beyond the first hundred only the counts go on."""
+        if len(self.breaks) < BREAKS_SHOWN:
+            self.breaks.append({"where": where, "why": why})
+
+    def whole(self, *, keyed: bool) -> bool:
+        """True when nothing was found; a torn line is an offence only where a key is set."""
+        found = self.bad or self.missing or self.gaps or self.broken or self.tampered
+        return not found and not (keyed and self.torn)
+
+
+def verify(journal: Journal, *, keyed: bool) -> dict[str, Any]:
+    """Check the log as it is on the disk now.
+
+    ``bad`` are invalid signatures, ``missing`` records without one although a key is set, ``gaps`` jumps in a peer's
+    numbers, ``broken`` records that do not continue the one before, ``torn`` lines that are no record, ``tampered``
+    what a writer found and recorded as ``audit_broken``. ``head`` is ok, missing (a cut at the end cannot be excluded),
+    cut (the last record is not there) or older (it was rolled back, or the anchor was). With a key everything but ok
+    fails; without one a missing head and torn lines do not.
+    """
+    with journal.snapshot() as snapshot:
+        return _Check(journal, snapshot, keyed=keyed).run()
+
+
+class _Check:
+    def __init__(self, journal: Journal, snapshot: LogSnapshot, *, keyed: bool) -> None:
+        self._journal = journal
+        self._snapshot, self._announced = _acknowledged(snapshot, journal.path)
+        self._keyed = keyed
+        self._found = Findings()
+        self._seqs: dict[str, int] = {}
+
+    def run(self) -> dict[str, Any]:
+        head, found = self._snapshot.head, self._found
+        last: str | None = None
+        # Counted on behind the head's own record: a writer that died there had announced them.
+        reached = head.count if head is not None and head.last == head.origins[0] else None
+        anchored = False
+        for path, number, raw in self._snapshot.lines():
+            where = f"{path.name}:{number}"
+            line = raw.removesuffix(b"\n")
+            record = parse(line)
+            if record is None or line == raw:
+                found.torn += 1
+                if self._keyed:
+                    found.note(where, "no writer wrote this line")
+            if record is None:
+                continue
+            found.total += 1
+            self._record(record, where, self._follows(record, last, head))
+            last = hashlib.sha256(line).hexdigest()
+            anchored = anchored or (self._snapshot.anchor is not None and last == self._snapshot.anchor.last)
+            reached = None if reached is None else reached + 1
+            if head is not None and last == head.last:
+                reached = head.count
+        standing = self._standing(head, reached, last, anchored=anchored)
+        for each in head.breaks if head is not None else ():
+            found.tampered += not self._tampering_seen(each)
+        counts = {name: getattr(found, name) for name in Findings.__slots__}
+        whole = found.whole(keyed=self._keyed) and standing in (("ok",) if self._keyed else ("ok", "missing"))
+        return {**counts, "head": standing, "ok": whole}
+
+    @staticmethod
+    def _follows(record: dict[str, Any], last: str | None, head: Head | None) -> bool:
+        if last is not None:
+            return bool(record["prev"] == last)
+        return head is None or record["prev"] in head.origins[: 2 if head.rotating else 1]
+
+    def _record(self, record: dict[str, Any], where: str, follows: bool) -> None:
+        found, peer = self._found, record["peer_id"]
+        if not follows:
+            found.broken += 1
+            found.note(where, "does not continue the record before it")
+        expected = self._seqs.get(peer)
+        if expected is not None and record["seq"] != expected + 1:
+            found.gaps += 1
+            found.note(where, f"{peer} went from {expected} to {record['seq']}")
+        self._seqs[peer] = record["seq"]
+        if record.get("event") == BROKEN:
+            found.tampered += 1
+            payload = record.get("payload")
+            found.note(where, f"the writer found: {payload.get('why') if isinstance(payload, dict) else payload}")
+        self._signature(record, where)
+
+    def _signature(self, record: dict[str, Any], where: str) -> None:
+        found = self._found
+        if "sig" not in record:
+            if self._keyed:
+                found.missing += 1
+                found.note(where, "not signed")
+            return
+        found.signed += 1
+        if not self._keyed:
+            return
+        if self._journal.signature_valid(record):
+            found.verified += 1
+        else:
+            found.bad += 1
+            found.note(where, "the signature does not hold")
+
+    def _tampering_seen(self, record: dict[str, Any]) -> bool:
+        """True when the record of a break that the head names is still in the log."""
+        if self._found.tampered:
+            return True
+        self._found.note("head", f"the writer found: {record.get('why')}")
+        return False
+
+    def _standing(self, head: Head | None, reached: int | None, last: str | None, *, anchored: bool) -> str:
+        anchor, found = self._snapshot.anchor, self._found
+        if head is None:
+            if anchor is not None and anchor.count and not anchored and not self._keyed:
+                found.note("end", f"record {anchor.count}, which the anchor has, is not there")
+                return "cut"
+            if self._keyed:
+                found.note("head", "there is none that is signed with this secret")
+            return "missing" if self._keyed or last is not None else "ok"
+        if reached is None or self._short(head):
+            found.note("end", "the last record that was acknowledged is not there")
+            return "cut"
+        ended = Head(head.log, count=reached, last=last or head.last)
+        wrong = anchor_mismatches(ended, anchor, head.count, keyed=self._keyed)
+        if self._keyed and not self._announced:
+            wrong.append("the head is older than the log")
+        for why in wrong:
+            found.note("end", why)
+        return "older" if wrong else "ok"
+
+    def _short(self, head: Head) -> bool:
+        size = next((size for path, _, size in self._snapshot.files if path == self._journal.path), None)
+        if size is None:
+            return head.size > 0 and not head.rotating
+        return size < head.size and not head.rotating
+
+
+def _acknowledged(snapshot: LogSnapshot, current: Path) -> tuple[LogSnapshot, bool]:
+    """Leave out what a dead writer began; False when no head announced it.
+
+    The next writer completes it.
+    """
+    head = snapshot.head
+    if head is None:
+        return snapshot, True
+    files, announced = [], True
+    for path, file, size in snapshot.files:
+        until = size
+        if path == current and size > head.size:
+            file.seek(head.size)
+            begun = file.read(size - head.size)
+            announced = head.pending.encode().startswith(begun)
+            if announced and len(begun) < len(head.pending):
+                until = head.size
+        files.append((path, file, until))
+    return LogSnapshot(head, snapshot.anchor, tuple(files)), announced
