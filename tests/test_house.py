@@ -23,7 +23,7 @@ LINES_MAX = 700
 FLOORS: list[set[str]] = [
     {"envelope", "errors", "settings", "utils", "agent_tool", "_mesh_switch"},
     {"safety", "audit", "contract"},
-    {"kinematics", "policies", "teleop_mixin", "teleoperators", "recording"},
+    {"arm_mixin", "kinematics", "policies", "teleop_mixin", "teleoperators", "recording"},
     {
         "hardware",
         "simulation",

@@ -11,6 +11,7 @@ from fixtures.toy_robots import ToyRobot, ToyWorld
 from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 
 DRIVERS = [RobotDeviceDriver(ToyRobot()), SimulationDeviceDriver(ToyWorld())]
 TYPES = {"string", "integer", "number", "boolean", "object", "array"}
@@ -50,12 +51,15 @@ def test_the_types_are_those_of_the_arguments() -> None:
     [
         (
             DRIVERS[0],
-            {"execute", "stop", "releaseTorque", "resume", "getStatus", "getFeatures", "getState"},
+            {
+                *("execute", "stop", "releaseTorque", "resume", "getStatus", "getFeatures", "getState"),
+                *ARM_MOTION_VERBS,
+            },
             {"taskStarted", "taskComplete", "streamStep", "stateUpdate", "emergencyStop"},
         ),
         (
             DRIVERS[1],
-            {"execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset"},
+            {"execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset", *ARM_MOTION_VERBS},
             {"policyStarted", "policyComplete", "observationUpdate", "streamStep", "stateUpdate", "emergencyStop"},
         ),
     ],
@@ -69,7 +73,7 @@ def test_a_device_has_these_functions_and_events(driver: Any, functions: set[str
 def test_reads_and_writes_are_labelled() -> None:
     for driver in DRIVERS:
         for function in driver.functions:
-            reads = function.name.startswith("get")
+            reads = function.name.startswith(("get", "list", "wait"))
             assert function.labels["direction"] == ("read" if reads else "write"), function.name
 
 

@@ -21,6 +21,7 @@ from device_connect_edge.drivers.decorators import get_rpc_source_device
 from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
+from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
 from strands_robots.device_connect._compat import Labels, emit, observed, on, rpc
 from strands_robots.device_connect.safety_registration import SafetyRegistration
@@ -173,7 +174,8 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         try:
             self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
-            async with asyncio.timeout(START_DEADLINE_S if moves else READ_DEADLINE_S):
+            within_s = (START_DEADLINE_S if moves else READ_DEADLINE_S) + (WAIT_S if verb.lasts else 0.0)
+            async with asyncio.timeout(within_s):
                 result: Result = await answered
         except ShareFullError:
             result = busy(command)

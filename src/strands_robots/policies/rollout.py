@@ -158,6 +158,7 @@ class Rollout:
         hz: control rate. Ticks are at absolute times; a missed tick is dropped, never made up later.
         observers: called with the rollout's events.
         clock: the loop's time.
+        ends_at_rest: the last action is one to keep, such as a grip: a completed rollout leaves it as it is.
     """
 
     def __init__(
@@ -173,6 +174,7 @@ class Rollout:
         hz: float = 50.0,
         observers: RolloutObservers | None = None,
         clock: Clock | None = None,
+        ends_at_rest: bool = False,
     ) -> None:
         self.instruction = instruction
         self.policy_name = policy_name
@@ -188,6 +190,7 @@ class Rollout:
         self._period = 1 / hz
         self._observers = observers or RolloutObservers()
         self._clock = clock or Clock()
+        self._ends_at_rest = ends_at_rest
         self._stop_requested = threading.Event()
         self._loading = True
         self._started_at: float | None = None
@@ -274,7 +277,8 @@ class Rollout:
                     if self._permit.valid:
                         state, self.error = "error", f"{type(exc).__name__}: {exc}"
                         self._log_failure(exc)
-                state = self._hold(state)
+                if state != "completed" or not self._ends_at_rest:
+                    state = self._hold(state)
         except Exception as exc:
             state, self.error = "error", f"{type(exc).__name__}: {exc}"
             logger.exception("The rollout of %s on %s could not run.", self.policy_name, self.robot)

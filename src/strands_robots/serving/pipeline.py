@@ -178,9 +178,9 @@ class Pipeline:
         """Return the share of threads for a verb; only motions wait for motions."""
         if verb.urgent:
             return self.shares.urgent
-        if verb.kind is Kind.MOTION:
-            return self.shares.lasting if verb.lasts else self.shares.motion
-        return self.shares.read
+        if verb.lasts:
+            return self.shares.lasting
+        return self.shares.motion if verb.kind is Kind.MOTION else self.shares.read
 
     def serve(self, command: Command, answered: Answered) -> None:
         """Carry ``command`` out on this thread and hand its answer to ``answered``."""

@@ -17,6 +17,7 @@ from strands_robots.contract import RUNNING, SETTLE, Robot, RolloutEvent, TaskRo
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
+from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS, for_robot
 from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.verbs import (
     ASSERTION,
@@ -323,6 +324,7 @@ ARM_VERBS = table(
         ),
         GET_FEATURES,
         GET_STATE,
+        *ARM_MOTION_VERBS.values(),
     ]
 )
 WORLD_VERBS = table(
@@ -366,6 +368,7 @@ WORLD_VERBS = table(
             run=_reset,
             critical=False,
         ),
+        *WORLD_MOTION_VERBS.values(),
     ]
 )
 
@@ -433,6 +436,7 @@ PEER_VERBS = table(
         ),
         _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
+        *(for_robot(verb, _PEER_ROBOT, drops_unknown=True) for verb in ARM_MOTION_VERBS.values()),
     ]
 )
 """The actions of the mesh; ``execute``, ``stop``, ``resume``, ``ping`` and teleoperation are the peer's own."""

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+from strands_robots.kinematics.arm import Arm
+from strands_robots.kinematics.chain import Chain
 from strands_robots.safety.gate import Permit
+from strands_robots.simulation.catalog import ModelSource
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.physics import Physics, Snapshot
@@ -56,6 +60,12 @@ class RobotBody:
         """Present setpoint of each action key."""
         setpoints = self._physics.setpoints
         return {key: float(setpoints[actuator.index]) for key, actuator in self.parts.actuators.items()}
+
+    @property
+    def arm(self) -> Arm:
+        """The robot's arm, planned in the frame of its base. Raises without one."""
+        plan = next(each for each in self._present()[0].stage.plan.robots if each.name == self.name)
+        return arm_of(plan.source, plan.position[2])
 
     @property
     def joint_units(self) -> dict[str, str]:
@@ -135,6 +145,16 @@ class RobotBody:
         if parts is None:
             raise ValidationError(f"robot {self.name} is not in the world any more.")
         return snapshot, parts
+
+
+@cache
+def arm_of(source: ModelSource, height: float) -> Arm:
+    """Return the arm of a model whose base stands ``height`` metres above the floor.
+
+    Raises:
+        ValidationError: the model has no arm.
+    """
+    return Arm.of(Chain(source.load(), source.label, -height))
 
 
 def _mobile(snapshot: Snapshot, robot: RobotParts) -> bool:

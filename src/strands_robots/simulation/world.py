@@ -12,8 +12,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from strands_robots import settings
+from strands_robots.arm_mixin import MOTION, ArmMixin
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.kinematics.arm import Arm
+from strands_robots.kinematics.motion import Motion
 from strands_robots.policies import create_policy
 from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options
 from strands_robots.safety.gate import MotionGate, Waiting, answered
@@ -54,7 +57,7 @@ class _CleanedUp:
         return error(f"{verb} is refused: this simulation was cleaned up; make a new one.")
 
 
-class Simulation(TeleopMixin):
+class Simulation(ArmMixin, TeleopMixin):
     """A world of simulated robots, each with its own rollout: a :class:`WorldRobot`.
 
     Physics keeps real time while a rollout or a teleoperation runs, and for a moment after a single command;
@@ -487,6 +490,47 @@ class Simulation(TeleopMixin):
         """Return the place of one robot's tip, as :meth:`RobotBody.tip_position`."""
         return self.body(robot_name).tip_position()
 
+    def arm(self, robot_name: str = "") -> Arm:
+        """Return the arm of one robot.
+
+        Raises:
+            ValidationError: no such robot, or one without an arm.
+        """
+        return self.body(robot_name).arm
+
+    def targets(self, robot_name: str = "") -> dict[str, float]:
+        """Return the setpoints of one robot, as :attr:`RobotBody.targets`."""
+        return self.body(robot_name).targets
+
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
+        """Plan and start a motion of one robot."""
+        hz = settings.number("STRANDS_CONTROL_HZ")
+        permit = self.gate.permit(verb)
+        with self._waiting.until_begun(permit, robot_name), self.starting:
+            body = self._free_body(robot_name)
+            motion = plan(hz)
+            permit.check()
+            rollout = Rollout(
+                body,
+                motion,
+                permit=permit,
+                instruction=motion.instruction,
+                policy_name=MOTION,
+                duration=motion.duration,
+                hz=hz,
+                observers=self.observers,
+                ends_at_rest=True,
+            )
+            self._rollouts[body.name] = rollout
+            rollout.start()
+            return rollout
+
+    def _free_body(self, robot_name: str) -> RobotBody:
+        self._require_open()
+        body = self.body(robot_name)
+        self._require_undriven(body.name)
+        return body
+
     def _require_open(self) -> None:
         if self._closed:
             raise ValidationError("this simulation was cleaned up; make a new one.")
@@ -533,9 +577,7 @@ class Simulation(TeleopMixin):
         with self._waiting.until_begun(permit, self.body(robot_name).name):
             policy = create_policy(provider, **options)
             with self.starting:
-                self._require_open()
-                body = self.body(robot_name)
-                self._require_undriven(body.name)
+                body = self._free_body(robot_name)
                 if not permit.valid:
                     raise ValidationError(f"start_policy: {body.name} was halted while its policy was made ready.")
                 rollout = Rollout(body, policy, permit=permit, policy_name=provider, observers=self.observers, **chosen)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -121,3 +122,38 @@ def joints(fleet: FleetClient) -> dict[str, float]:
 def largest_change(now: dict[str, float], then: dict[str, float]) -> float:
     assert now
     return max(abs(now[name] - then[name]) for name in now)
+
+
+def test_tip_is_moved_to_a_point_and_the_answer_tells_its_error(fleet: FleetClient) -> None:
+    goal = {"x": 0.26, "y": -0.05, "z": 0.08, "robot_name": "right"}
+    answer = fleet.call("sim-1", "moveTo", {**goal, "speed": 1.0}, 30.0)
+    assert (answer["status"], answer["task_status"]) == ("success", "completed"), answer
+    assert answer["error_mm"] < 3.0
+    pose = fleet.call("sim-1", "getPose", {"robot_name": "right"})
+    assert [pose[axis] for axis in "xyz"] == pytest.approx([0.26, -0.05, 0.08], abs=3e-3)
+
+
+def test_stop_is_carried_out_while_a_caller_waits_for_a_motion(fleet: FleetClient, sim: Simulation) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        goal = {"x": 0.25, "y": 0.2, "z": 0.06, "speed": 0.1, "robot_name": "left"}
+        waiting = pool.submit(fleet.call, "sim-1", "moveTo", goal, 40.0)
+        eventually(lambda: any(row["step"] > 5 for row in sim.list_policies_running()))
+        assert fleet.stop("sim-1")["status"] == "success"
+        ended = waiting.result(10.0)
+    assert (ended["status"], ended["task_status"], ended["why"]) == ("error", "stopped", "it was stopped")
+
+
+@pytest.mark.parametrize(
+    ("goal", "reason"),
+    [
+        ({"x": 0.25, "y": 0.0}, "z is missing"),
+        ({"x": 0.25, "y": True, "z": 0.1}, "y must be a finite number"),
+        ({"x": 0.25, "y": 0.0, "z": 0.1, "speed": 0}, "speed must be a finite number above 0"),
+        ({"x": 0.25, "y": 0.0, "z": 0.1, "approach": 100}, "approach must be a finite number from -90 to 90"),
+        ({"x": 0.9, "y": 0.0, "z": 0.1}, "out of reach; the nearest reachable point is"),
+    ],
+)
+def test_goal_that_cannot_be_is_refused_by_name(fleet: FleetClient, goal: dict[str, Any], reason: str) -> None:
+    answer = fleet.call("sim-1", "moveTo", {**goal, "robot_name": "left"})
+    assert answer["status"] == "error"
+    assert reason in answer["reason"]

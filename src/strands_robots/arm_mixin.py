@@ -1,0 +1,299 @@
+"""Motions of an arm for any robot: planned, run as a rollout, reported."""
+
+from __future__ import annotations
+
+import itertools
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.contract import RUNNING
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.policies.rollout import Body, Rollout
+from strands_robots.safety.gate import answered
+from strands_robots.utils import ValidationError, choice, identifier, number, shown
+
+if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
+    from strands_robots.kinematics.arm import Arm
+    from strands_robots.kinematics.motion import Motion
+    from strands_robots.kinematics.moves import Start
+
+WAIT_S = 25.0
+"""Longest time for which an answer waits for the end of a motion; the networks wait for 30 s."""
+
+HOME = "home"
+"""Place that every arm has: the home pose of its model."""
+
+MOTION = "motion"
+"""What a planned motion is called where a policy's name stands."""
+
+PlanMotion = Callable[["Start"], "Motion"]
+
+
+@dataclass(frozen=True)
+class ArmTask:
+    """One motion, running or ended."""
+
+    task_id: str
+    rollout: Rollout
+    motion: Motion
+
+
+class ArmMixin:
+    """Verbs of an arm for a host that has the members declared here.
+
+    Positions are metres and angles degrees in the base frame of the arm, x forward; the gripper's opening is 0 closed
+    to 1 open. ``robot_name`` names one robot of a world; empty for the first.
+    """
+
+    @abstractmethod
+    def body(self, robot_name: str | None = None) -> Body:
+        """Return the body of that name, or the first; raises :class:`ValidationError`."""
+
+    @abstractmethod
+    def arm(self, robot_name: str = "") -> Arm:
+        """Return the arm of a body; raises :class:`ValidationError` without one."""
+
+    @abstractmethod
+    def targets(self, robot_name: str = "") -> Mapping[str, float]:
+        """Return what a body was told last, by action key; empty where it is not known."""
+
+    @abstractmethod
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
+        """Plan with the control rate (Hz) and start, once the body is found free."""
+
+    @answered
+    def arm_pose(self, robot_name: str = "") -> Envelope:
+        """Return the pose of the tip, the joints (degrees) and the gripper's opening.
+
+        ``x``, ``y``, ``z`` in metres, ``approach`` in degrees below the horizontal, and ``holding``.
+        """
+        import numpy as np  # noqa: PLC0415 - loaded with the first motion
+
+        arm, body = self.arm(robot_name), self.body(robot_name)
+        state = arm.state(body.get_joints())
+        pose = arm.chain.forward(state.joints)
+        x, y, z = (round(float(v), 5) for v in pose.position)
+        joints = {
+            joint.name: round(float(np.degrees(at)) if joint.turns else float(at), 3)
+            for joint, at in zip(arm.chain.joints, state.joints, strict=True)
+        }
+        approach = round(pose.approach_deg, 2)
+        return success(
+            f"The tip is at ({x:.3f}, {y:.3f}, {z:.3f}) m, {approach:.0f} degrees below the horizontal.",
+            x=x,
+            y=y,
+            z=z,
+            approach=approach,
+            joints=joints,
+            gripper=None if state.opening is None else round(min(max(state.opening, 0.0), 1.0), 4),
+            holding=self._holding(body.name, arm),
+            frame="base",
+        )
+
+    @answered
+    def move_joints(
+        self, joints: Mapping[str, float], speed: float = 0.5, wait: bool = True, robot_name: str = ""
+    ) -> Envelope:
+        """Move joints to positions in degrees, by name; the others stay."""
+        from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
+
+        return self._move("moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name)
+
+    @answered
+    def move_to(
+        self,
+        x: float,
+        y: float,
+        z: float,
+        *,
+        approach: float | None = None,
+        speed: float = 0.5,
+        wait: bool = True,
+        robot_name: str = "",
+    ) -> Envelope:
+        """Move the tip to a point; ``approach`` is the steepest reachable by default."""
+        from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
+
+        plan = partial(moves.move_to, position=_vector(x, y, z), approach=approach)
+        return self._move("moveTo", plan, speed, wait, robot_name)
+
+    @answered
+    def move_by(
+        self,
+        dx: float = 0.0,
+        dy: float = 0.0,
+        dz: float = 0.0,
+        *,
+        direction: str = "",
+        distance: float = 0.05,
+        speed: float = 0.5,
+        wait: bool = True,
+        robot_name: str = "",
+    ) -> Envelope:
+        """Move the tip on a straight line, by an offset or a distance in a direction."""
+        from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
+
+        offset = _vector(dx, dy, dz)
+        if direction:
+            if offset.any():
+                raise ValidationError("moveBy takes dx, dy and dz, or direction and distance, not both.")
+            offset = distance * _vector(*moves.DIRECTIONS[choice("direction", direction, tuple(moves.DIRECTIONS))])
+        if not offset.any():
+            raise ValidationError("moveBy needs dx, dy or dz, or a direction.")
+        return self._move("moveBy", partial(moves.move_by, offset=offset), speed, wait, robot_name)
+
+    @answered
+    def set_gripper(self, opening: float, wait: bool = True, robot_name: str = "") -> Envelope:
+        """Move the gripper; ``holding`` says whether something is between the jaws."""
+        from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
+
+        return self._move("setGripper", partial(moves.set_gripper, opening=opening), 1.0, wait, robot_name)
+
+    @answered
+    def go_to(self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "") -> Envelope:
+        """Move to the joints of a saved place, or to ``home``."""
+        from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
+
+        name = identifier("place", place)
+        arm = self.arm(robot_name)
+        places: dict[str, dict[str, float]] = {HOME: _degrees(arm, arm.chain.rest)}
+        places |= self._places.get(self.body(robot_name).name, {})
+        if name not in places:
+            raise ValidationError(f"place must be one of {', '.join(places)}, not {shown(name)}.")
+        return self._move("goTo", partial(moves.go_to, place=name, degrees=places[name]), speed, wait, robot_name)
+
+    @answered
+    def save_place(self, place: str, robot_name: str = "") -> Envelope:
+        """Save the present joints as a place of :meth:`go_to` in this process."""
+        name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name)
+        joints = _degrees(arm, arm.state(body.get_joints()).joints)
+        self._places.setdefault(body.name, {})[name] = joints
+        return success(f"Saved {name}.", place=name, joints=joints, places=[HOME, *self._places[body.name]])
+
+    @answered
+    def wait_for(self, task_id: str = "", seconds: float = WAIT_S, robot_name: str = "") -> Envelope:
+        """Wait for the end of a motion, the last one by default, and return its result."""
+        name = self.body(robot_name).name
+        task = self._tasks.get(name)
+        if task_id:
+            task = next((each for each in self._recent if each.task_id == task_id), None)
+        if task is None:
+            known = ", ".join(each.task_id for each in self._recent) or "none"
+            raise ValidationError(f"task_id must be a motion of this robot ({known}), not {shown(task_id)}.")
+        task.rollout.join(number("seconds", seconds, low=0, high=WAIT_S))
+        return self._result(task)
+
+    def last_motion(self, robot_name: str = "") -> dict[str, Any] | None:
+        """Return the outcome of a body's last motion, None before the first."""
+        task = self._tasks.get(self.body(robot_name).name)
+        return None if task is None else self._outcome(task)
+
+    @cached_property
+    def _tasks(self) -> dict[str, ArmTask]:
+        return {}
+
+    @cached_property
+    def _recent(self) -> list[ArmTask]:
+        return []
+
+    @cached_property
+    def _places(self) -> dict[str, dict[str, dict[str, float]]]:
+        return {}
+
+    @cached_property
+    def _task_numbers(self) -> itertools.count[int]:
+        return itertools.count(1)
+
+    def _move(self, verb: str, plan: PlanMotion, speed: float, wait: bool, robot_name: str) -> Envelope:
+        from strands_robots.kinematics.moves import Start  # noqa: PLC0415 - loaded with the first motion
+
+        body, arm = self.body(robot_name), self.arm(robot_name)
+        planned: list[Motion] = []
+
+        def planned_at(hz: float) -> Motion:
+            state = arm.state(body.get_joints()).told(arm.told(self.targets(body.name)))
+            planned.append(plan(Start(arm, state, hz, speed)))
+            return planned[-1]
+
+        rollout = self.start_motion(body.name, verb, planned_at)
+        task = ArmTask(f"{verb}-{next(self._task_numbers)}", rollout, planned[-1])
+        self._tasks[body.name] = task
+        self._recent[:] = [*self._recent[-15:], task]
+        if wait:
+            rollout.join(WAIT_S)
+        return self._result(task)
+
+    def _result(self, task: ArmTask) -> Envelope:
+        outcome = self._outcome(task)
+        if outcome["task_status"] in RUNNING:
+            return success(f"{task.motion.verb} is under way; wait for {task.task_id}.", **outcome)
+        text = f"{task.motion.verb} {outcome['task_status']}: {outcome['why']}."
+        return success(text, **outcome) if outcome["task_status"] == "completed" else error(text, **outcome)
+
+    def _outcome(self, task: ArmTask) -> dict[str, Any]:
+        """Return what was asked, what was reached, and why the motion ended."""
+        rollout, motion = task.rollout, task.motion
+        running, state = rollout.running, rollout.state
+        reached, error_mm = self._reached(motion)
+        why = "it is under way"
+        if not running:
+            why = rollout.error or "it was stopped"
+            if state == "completed":
+                problem = motion.problem(error_mm) if motion.finished else "its time was over before it was done"
+                state, why = ("error", problem) if problem else (state, "it is done")
+        return {
+            "task_id": task.task_id,
+            "verb": motion.verb,
+            "task_status": "running" if running else state,
+            "asked": dict(motion.asked),
+            "reached": reached,
+            "error_mm": error_mm,
+            "holding": None if running else self._holding(rollout.robot, motion.arm),
+            "duration": round(rollout.elapsed_s, 3),
+            "why": why,
+        }
+
+    def _reached(self, motion: Motion) -> tuple[dict[str, float] | None, float | None]:
+        if motion.state is None:
+            return None, None
+        pose = motion.arm.chain.forward(motion.state.joints)
+        x, y, z = (round(float(v), 5) for v in pose.position)
+        reached = {"x": x, "y": y, "z": z, "approach": round(pose.approach_deg, 2)}
+        if motion.state.opening is not None:
+            reached["gripper"] = round(motion.state.opening, 4)
+        if motion.goal is None:
+            return reached, None
+        offset = pose.position - motion.goal
+        return reached, round(1000 * float(offset @ offset) ** 0.5, 2)
+
+    def _holding(self, name: str, arm: Arm) -> bool | None:
+        """Return what the jaw tells, None while it moves or was told otherwise since."""
+        task = next((each for each in reversed(self._recent) if self._gripped(each, name)), None)
+        if task is None or task.motion.told is None or arm.jaw is None or task.rollout.running:
+            return None
+        told = self.targets(name).get(arm.jaw.commanded)
+        if told is None or not arm.jaw.says(told, task.motion.told):
+            return None
+        return arm.holding(arm.state(self.body(name).get_joints()), task.motion.told)
+
+    @staticmethod
+    def _gripped(task: ArmTask, name: str) -> bool:
+        return task.rollout.robot == name and task.motion.told is not None
+
+
+def _vector(x: float, y: float, z: float) -> Any:
+    import numpy as np  # noqa: PLC0415 - loaded with the first motion
+
+    return np.array([x, y, z], dtype=np.float64)
+
+
+def _degrees(arm: Arm, joints: Any) -> dict[str, float]:
+    import numpy as np  # noqa: PLC0415 - loaded with the first motion
+
+    return {
+        joint.name: float(np.degrees(at)) if joint.turns else float(at)
+        for joint, at in zip(arm.chain.joints, joints, strict=True)
+    }

@@ -1,0 +1,159 @@
+"""An arm of a body: its chain, and the body's numbers as joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from strands_robots.kinematics.chain import Chain, Floats
+from strands_robots.kinematics.trajectory import Bounds
+from strands_robots.utils import ValidationError
+
+SPEED_RAD_S = 2.0
+ACCELERATION_RAD_S2 = 8.0
+"""Bounds of a planned motion at full speed."""
+
+GRIP_MARGIN = 0.03
+"""Share of the gripper's range by which an object keeps the jaws from where they are told to go."""
+
+SAG_RAD = 0.06
+"""Greatest distance of a resting joint from where it was told to be."""
+
+Action = dict[str, float]
+"""Targets by action key, in the body's own units."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointMap:
+    """Linear map of one joint: ``value = offset + factor * radians``.
+
+    Attributes:
+        observed: key of the joint in an observation of the body.
+        commanded: its action key.
+    """
+
+    observed: str
+    commanded: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def value(self, radians: float) -> float:
+        """Return the body's value of a joint position."""
+        return self.offset + self.factor * radians
+
+    def radians(self, value: float) -> float:
+        """Return the joint position of a body's value."""
+        return (value - self.offset) / self.factor
+
+
+@dataclass(frozen=True, slots=True)
+class JawMap:
+    """Keys of the gripper, and its closed and open values."""
+
+    observed: str
+    commanded: str
+    seen: tuple[float, float]
+    told: tuple[float, float]
+
+    def opening(self, observed: float) -> float:
+        """Return an observation as an opening from 0 (closed) to 1 (open)."""
+        closed, opened = self.seen
+        return (observed - closed) / (opened - closed)
+
+    def says(self, command: float, opening: float) -> bool:
+        """True where a command is that of an opening."""
+        return abs(command - self.command(opening)) <= 1e-3 * abs(self.told[1] - self.told[0])
+
+    def command(self, opening: float) -> float:
+        """Return the command of an opening."""
+        closed, opened = self.told
+        return closed + (opened - closed) * opening
+
+
+@dataclass(frozen=True, slots=True)
+class ArmState:
+    """Joint positions (rad), and the gripper's opening from 0 to 1, None without one."""
+
+    joints: Floats
+    opening: float | None
+
+    def told(self, targets: Floats) -> ArmState:
+        """Return this state with the joints where they were told to be, if they are near.
+
+        A motion that began where the arm sags to would sag further with every motion.
+        """
+        near = np.abs(targets - self.joints) <= SAG_RAD
+        return ArmState(np.where(near, targets, self.joints), self.opening)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One arm of a body.
+
+    Attributes:
+        chain: its kinematics.
+        maps: of the chain's joints, in their order.
+        jaw: of its gripper.
+    """
+
+    chain: Chain
+    maps: tuple[JointMap, ...]
+    jaw: JawMap | None
+    bounds: Bounds = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.chain.joints)
+        bounds = Bounds(np.full(count, SPEED_RAD_S), np.full(count, ACCELERATION_RAD_S2))
+        object.__setattr__(self, "bounds", bounds)
+
+    @classmethod
+    def of(cls, chain: Chain) -> Arm:
+        """Return the arm of a body whose numbers are the model's own."""
+        maps = tuple(JointMap(joint.name, joint.key) for joint in chain.joints)
+        gripper = chain.gripper
+        if gripper is None:
+            return cls(chain, maps, None)
+        seen = (gripper.joint.low, gripper.joint.high)
+        return cls(chain, maps, JawMap(gripper.joint.name, gripper.joint.key, seen, (gripper.closed, gripper.opened)))
+
+    def state(self, observation: Mapping[str, float]) -> ArmState:
+        """Return the arm's state in an observation of its body.
+
+        Raises:
+            ValidationError: the observation lacks one of the joints.
+        """
+        missing = [each.observed for each in self.maps if each.observed not in observation]
+        if missing:
+            raise ValidationError(f"the arm's {', '.join(missing)} could not be read.")
+        joints = np.array([each.radians(observation[each.observed]) for each in self.maps])
+        jaw = self.jaw
+        known = jaw is not None and jaw.observed in observation
+        return ArmState(joints, jaw.opening(observation[jaw.observed]) if jaw is not None and known else None)
+
+    def told(self, targets: Mapping[str, float]) -> Floats:
+        """Return the joints that a body was told; NaN where that is not known."""
+        return np.array([each.radians(targets.get(each.commanded, np.nan)) for each in self.maps])
+
+    def action(self, joints: Floats) -> Action:
+        """Return the targets of joint positions (rad)."""
+        return {each.commanded: each.value(float(at)) for each, at in zip(self.maps, joints, strict=True)}
+
+    def grip(self, opening: float) -> Action:
+        """Return the target of a gripper's opening; nothing without a gripper."""
+        return {} if self.jaw is None else {self.jaw.commanded: self.jaw.command(opening)}
+
+    def jaw_radians(self, opening: float | None) -> float | None:
+        """Return the position of the gripper's joint for an opening."""
+        gripper = self.chain.gripper
+        if gripper is None or opening is None:
+            return None
+        return gripper.joint.low + (gripper.joint.high - gripper.joint.low) * min(max(opening, 0.0), 1.0)
+
+    def holding(self, state: ArmState, told: float) -> bool | None:
+        """Return True where something keeps still jaws from their ``told`` opening.
+
+        None without a gripper.
+        """
+        return None if state.opening is None else state.opening > told + GRIP_MARGIN

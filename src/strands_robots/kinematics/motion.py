@@ -1,0 +1,124 @@
+"""A planned motion as a policy: segments of setpoints, played one a control step."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from strands_robots.kinematics.arm import Action, Arm, ArmState
+from strands_robots.kinematics.chain import Floats
+from strands_robots.policies.base import Ranges, numbers
+from strands_robots.utils import shown
+
+SETTLE_S = 1.0
+"""Longest wait after a segment for the arm to stand still."""
+
+STILL_RAD = 3e-3
+STILL_STEPS = 5
+"""The arm stands still when no joint moves by more in so many control steps."""
+
+NEAR_MM = 15.0
+"""A motion that ends further from its goal has failed."""
+
+MARGIN_S = 5.0
+"""Seconds beyond its plan that a motion may take."""
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """Setpoints by control step, and the name of this part of the motion."""
+
+    name: str
+    frames: Sequence[Action]
+    settles: bool = False
+
+
+@dataclass
+class Motion:
+    """Policy that plays planned segments; its rollout has permit and events.
+
+    Attributes:
+        verb: what was asked for.
+        asked: the caller's goal, as it is answered.
+        goal: where the tip shall be in the end (m), None for a motion of the gripper alone.
+        told: the last opening that the gripper is told, None for none.
+        state: what was observed last.
+        segment: name of the segment that is played.
+    """
+
+    arm: Arm
+    verb: str
+    asked: Mapping[str, Any]
+    segments: Sequence[Segment]
+    hz: float
+    goal: Floats | None = None
+    told: float | None = None
+    state: ArmState | None = field(default=None, init=False)
+    segment: str = field(default="", init=False)
+    uses_cameras: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self._left = deque(self.segments)
+        self._frames: deque[Action] = deque()
+        self._settling = 0
+        self._still = 0
+
+    @property
+    def instruction(self) -> str:
+        """Return the motion in one line, as events name it."""
+        return f"{self.verb} {' '.join(f'{name}={shown(value)}' for name, value in self.asked.items())}".strip()
+
+    @property
+    def duration(self) -> float:
+        """Longest time that the motion may take, in seconds."""
+        frames = sum(len(segment.frames) for segment in self.segments)
+        return frames / self.hz + SETTLE_S * sum(segment.settles for segment in self.segments) + MARGIN_S
+
+    @property
+    def finished(self) -> bool:
+        """True once every setpoint was played."""
+        return not self._left and not self._frames
+
+    def problem(self, error_mm: float | None) -> str:
+        """Return why a motion that was played did not do what was asked; empty if it did."""
+        if error_mm is not None and error_mm > NEAR_MM:
+            return f"the tip is {error_mm:.0f} mm from where it was told to go"
+        return ""
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        """Do nothing: the motion was planned before it started."""
+
+    def act(self, observation: Mapping[str, Any]) -> Action | Sequence[Action] | None:
+        """Return the next setpoints, nothing while the arm settles, None at the end."""
+        before, self.state = self.state, self.arm.state(numbers(observation))
+        while not self._frames:
+            if self._settling > 0:
+                self._settling -= 1
+                self._still = self._still + 1 if self._stands(before) else 0
+                if self._still < STILL_STEPS:
+                    return ()
+            if not self._left:
+                return None
+            segment = self._left.popleft()
+            self.segment = segment.name
+            self._frames.extend(segment.frames)
+            self._settling = int(SETTLE_S * self.hz) if segment.settles else 0
+            self._still = 0
+        return self._frames.popleft()
+
+    def interrupt(self) -> None:
+        """Do nothing: this policy never waits."""
+
+    def close(self) -> None:
+        """Do nothing: this policy has no resources."""
+
+    def _stands(self, before: ArmState | None) -> bool:
+        now = self.state
+        if before is None or now is None:
+            return False
+        jaw = abs((now.opening or 0.0) - (before.opening or 0.0))
+        return bool(np.abs(now.joints - before.joints).max() <= STILL_RAD and jaw <= STILL_RAD)

@@ -1,0 +1,195 @@
+"""Verbs of an arm: where its tip is, moving it, and its gripper.
+
+Metres and degrees in the base frame, x forward; the gripper's opening is 0 closed to 1 open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from strands_robots.arm_mixin import WAIT_S
+from strands_robots.contract import Robot, body_of
+from strands_robots.envelope import Envelope, error
+from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Check, Kind, Parameter, Verb, table
+from strands_robots.utils import ValidationError, flag, identifier, mapping, number, shown, text
+
+REACH_MAX_M = 3.0
+"""Largest coordinate of a goal."""
+
+JOINTS_MAX = 64
+
+
+def within(low: float, high: float) -> Check:
+    """Check a number within these bounds."""
+    return lambda name, value: number(name, value, low=low, high=high)
+
+
+def optional(check: Check) -> Check:
+    """Let None pass, which stands for an argument that was not given."""
+    return lambda name, value: None if value is None else check(name, value)
+
+
+def _positions(name: str, value: object) -> dict[str, float]:
+    given = mapping(name, value)
+    if not 0 < len(given) <= JOINTS_MAX:
+        raise ValidationError(f"{name} must name 1 to {JOINTS_MAX} joints, not {shown(value)}.")
+    return {joint: number(f"{name}[{joint!r}]", at, low=-7200, high=7200) for joint, at in given.items()}
+
+
+def _coordinate(name: str) -> Parameter:
+    return Parameter(name, float, f"{name} of the tip in the base frame, in metres", within(-REACH_MAX_M, REACH_MAX_M))
+
+
+def _offset(axis: str, direction: str) -> Parameter:
+    meaning = f"Metres {direction}, negative for the other way"
+    return Parameter(f"d{axis}", float, meaning, within(-REACH_MAX_M, REACH_MAX_M), default=0.0)
+
+
+APPROACH = Parameter(
+    "approach",
+    float,
+    "Degrees of the gripper below the horizontal, -90 to 90; left out for the steepest that is reachable",
+    optional(within(-90, 90)),
+    default=None,
+)
+SPEED = Parameter(
+    "speed",
+    float,
+    "Share of the arm's full speed, above 0 and at most 1",
+    lambda name, value: number(name, value, above=0, high=1),
+    default=0.5,
+)
+WAIT = Parameter(
+    "wait",
+    bool,
+    f"Whether to answer at the end of the motion, after at most {WAIT_S:g} s, or at once with its task_id",
+    flag,
+    default=True,
+)
+PLACE = Parameter("place", str, "Name of a saved place; home is always there", identifier)
+RESULT = "task_id, task_status, asked, reached, error_mm, holding, duration, why"
+
+_DIRECTION = Parameter(
+    "direction",
+    str,
+    "In place of an offset: forward, back, left, right, up or down",
+    lambda name, value: text(name, value, longest=16, empty=True),
+    default="",
+)
+_DISTANCE = Parameter("distance", float, "Metres in that direction, 0 to 1", within(0, 1), default=0.05)
+
+
+def of_arm(method: str) -> Callable[[Robot, Arguments], Envelope]:
+    """Carry a verb out by a method of the robot, refused where it has none."""
+
+    def run(robot: Any, arguments: Arguments) -> Envelope:
+        carried_out = getattr(body_of(robot), method, None)
+        if not callable(carried_out):
+            return error("This robot has no arm whose motions can be planned here.")
+        answer: Envelope = carried_out(**arguments)
+        return answer
+
+    return run
+
+
+_VERBS = (
+    Verb(
+        "getPose",
+        Kind.READ,
+        "Read where the tip of the gripper is, its approach and the joints, in metres and degrees in the base frame.",
+        returns="x, y, z, approach, joints, gripper, holding",
+        run=of_arm("arm_pose"),
+    ),
+    Verb(
+        "moveJoints",
+        Kind.MOTION,
+        "Move joints to positions; the way is checked for limits and contacts before anything moves.",
+        (Parameter("joints", dict, "Degrees by joint name; joints left out stay", _positions), SPEED, WAIT),
+        returns=RESULT,
+        run=of_arm("move_joints"),
+        lasts=True,
+    ),
+    Verb(
+        "moveTo",
+        Kind.MOTION,
+        "Move the tip of the gripper to a point; the way is checked for limits and contacts before anything moves.",
+        (*(_coordinate(axis) for axis in "xyz"), APPROACH, SPEED, WAIT),
+        returns=RESULT,
+        run=of_arm("move_to"),
+        lasts=True,
+    ),
+    Verb(
+        "moveBy",
+        Kind.MOTION,
+        "Move the tip of the gripper on a straight line, by an offset or in a direction.",
+        (
+            *(_offset(axis, way) for axis, way in zip("xyz", ("forward", "to the left", "up"), strict=True)),
+            _DIRECTION,
+            _DISTANCE,
+            SPEED,
+            WAIT,
+        ),
+        returns=RESULT,
+        run=of_arm("move_by"),
+        lasts=True,
+    ),
+    Verb(
+        "setGripper",
+        Kind.MOTION,
+        "Open or close the gripper; holding says whether something is between the jaws.",
+        (Parameter("opening", float, "From 0 (closed) to 1 (open)", within(0, 1)), WAIT),
+        returns=RESULT,
+        run=of_arm("set_gripper"),
+        lasts=True,
+    ),
+    Verb(
+        "goTo",
+        Kind.MOTION,
+        "Move to a place that was saved, or to home.",
+        (PLACE, SPEED, WAIT),
+        returns=RESULT,
+        run=of_arm("go_to"),
+        lasts=True,
+    ),
+    Verb(
+        "savePlace",
+        Kind.MOTION,
+        "Save the present joints as a place for goTo; nothing moves.",
+        (PLACE,),
+        returns="place, joints, places",
+        run=of_arm("save_place"),
+        critical=False,
+    ),
+    Verb(
+        "wait",
+        Kind.READ,
+        "Wait for the end of a motion and read its result.",
+        (
+            Parameter(
+                "task_id",
+                str,
+                "The motion's task_id; empty for the last one",
+                lambda name, value: text(name, value, longest=64, empty=True),
+                default="",
+            ),
+            Parameter("seconds", float, f"Longest wait, 0 to {WAIT_S:g}", within(0, WAIT_S), default=WAIT_S),
+        ),
+        returns=RESULT,
+        run=of_arm("wait_for"),
+        lasts=True,
+    ),
+)
+
+ARM_MOTION_VERBS = table(_VERBS)
+"""The verbs of a robot with one body."""
+
+
+def for_robot(verb: Verb, robot_name: Parameter, **changes: Any) -> Verb:
+    """Return a verb that names one robot of a world besides."""
+    return replace(verb, parameters=(*verb.parameters, robot_name), **changes)
+
+
+WORLD_MOTION_VERBS = table([for_robot(verb, ROBOT_NAME) for verb in _VERBS])
+"""The same for a robot of a simulated world."""

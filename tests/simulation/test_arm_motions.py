@@ -1,0 +1,115 @@
+"""A simulated arm is moved to points, and told the truth about what it reached."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.simulation import Simulation
+
+
+@pytest.fixture
+def world() -> Iterator[Simulation]:
+    simulation = Simulation()
+    assert simulation.add_robot("arm", "so100")["status"] == "success"
+    yield simulation
+    simulation.cleanup()
+
+
+def pose(world: Simulation, name: str = "") -> dict[str, Any]:
+    return world.arm_pose(name)
+
+
+def test_pose_is_that_of_the_tip_in_the_frame_of_the_base(world: Simulation) -> None:
+    world.add_robot("turned", "so100", position=(1.0, 0.5, 0.0), yaw=1.5707963)
+    here, there = pose(world, "arm"), pose(world, "turned")
+    assert (here["x"], here["y"], here["z"]) == pytest.approx((0.299, 0.0, 0.116), abs=2e-3)
+    assert (there["x"], there["y"], there["z"]) == pytest.approx((here["x"], here["y"], here["z"]), abs=2e-3)
+    assert here["approach"] == pytest.approx(51.6, abs=0.5)
+    assert set(here["joints"]) == {"shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"}
+    assert here["gripper"] == pytest.approx(0.227, abs=0.01)
+
+
+def test_tip_moves_to_a_point_and_the_answer_has_its_error(world: Simulation) -> None:
+    answer = world.move_to(0.25, 0.1, 0.06, speed=1.0)
+    assert answer["status"] == "success"
+    assert answer["task_status"] == "completed"
+    assert answer["asked"] == {"x": 0.25, "y": 0.1, "z": 0.06, "approach": 90.0}
+    assert answer["error_mm"] < 3.0
+    tip = world.tip_position("arm")
+    assert tip == pytest.approx((0.25, 0.1, 0.06), abs=3e-3)
+    assert tip == pytest.approx([answer["reached"][axis] for axis in "xyz"], abs=1e-3)
+
+
+def test_refused_goals_name_the_reason_and_nothing_moves(world: Simulation) -> None:
+    before = world.body("arm").targets
+    assert "out of reach; the nearest reachable point is" in world.move_to(0.9, 0.0, 0.1)["reason"]
+    assert "touches the table" in world.move_to(0.25, 0.0, -0.05)["reason"]
+    assert "elbow_flex must be from 0.0 to 180.0 degrees" in world.move_joints({"elbow_flex": -20.0})["reason"]
+    assert "there is no knee" in world.move_joints({"knee": 1.0})["reason"]
+    assert "place must be one of home" in world.go_to("nowhere")["reason"]
+    assert "moveBy needs" in world.move_by()["reason"]
+    assert world.body("arm").targets == before
+
+
+def test_robot_without_an_arm_is_refused_by_reason() -> None:
+    world = Simulation()
+    world.add_robot("rover")
+    assert "rover has no" in world.move_to(0.2, 0.0, 0.1)["reason"]
+    world.cleanup()
+
+
+def test_saved_place_is_gone_to(world: Simulation) -> None:
+    world.move_joints({"shoulder_pan": 20.0}, speed=1.0)
+    assert world.save_place("there")["places"] == ["home", "there"]
+    world.go_to("home", speed=1.0)
+    assert world.go_to("there", speed=1.0)["asked"] == {"place": "there"}
+    assert pose(world)["joints"]["shoulder_pan"] == pytest.approx(20.0, abs=1.0)
+
+
+def test_line_goes_up_by_its_distance(world: Simulation) -> None:
+    before = pose(world)
+    assert world.move_by(direction="up", distance=0.04, speed=1.0)["error_mm"] < 3.0
+    assert pose(world)["z"] == pytest.approx(before["z"] + 0.04, abs=3e-3)
+
+
+def test_running_motion_is_told_by_its_task_and_waited_for(world: Simulation) -> None:
+    started = world.move_to(0.25, 0.1, 0.06, wait=False)
+    assert started["task_status"] == "running"
+    assert "is driven by" in world.move_to(0.2, 0.0, 0.1)["reason"]
+    assert world.wait_for(started["task_id"], 0.0)["task_status"] == "running"
+    assert world.wait_for(started["task_id"])["task_status"] == "completed"
+    assert world.last_motion()["task_id"] == started["task_id"]  # type: ignore[index]
+
+
+def test_stop_ends_a_motion_in_its_middle_and_the_answer_says_so(world: Simulation) -> None:
+    started = world.move_to(0.25, 0.15, 0.06, speed=0.3, wait=False)
+    eventually(lambda: world.list_policies_running()[0]["step"] > 5)
+    assert world.stop_policy("arm")["stopped"]
+    ended = world.wait_for(started["task_id"])
+    assert ended["status"] == "error"
+    assert (ended["task_status"], ended["why"]) == ("stopped", "it was stopped")
+    assert ended["error_mm"] > 10
+    still = world.body("arm").targets
+    assert world.move_by(direction="up", distance=0.01, wait=False)["status"] == "success"
+    assert world.halt("test").stopped
+    assert world.body("arm").targets != still
+
+
+def test_jaws_without_an_object_are_empty(world: Simulation) -> None:
+    assert world.set_gripper(1.0)["holding"] is False
+    closed = world.set_gripper(0.0)
+    assert closed["holding"] is False
+    assert closed["reached"]["gripper"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_jaws_around_an_object_hold_it_and_a_stop_makes_that_unknown(world: Simulation) -> None:
+    world.set_gripper(1.0)
+    world.add_object("bar", "box", (0.05, 0.012, 0.012), world.tip_position("arm"), fixed=True)
+    assert world.set_gripper(0.0)["holding"] is True
+    assert pose(world)["holding"] is True
+    world.halt("test")
+    assert pose(world)["holding"] is None
