@@ -3,6 +3,7 @@
 import asyncio
 import json
 
+import psutil
 import pytest
 from device_connect_edge.messaging.exceptions import MessagingError
 from fixtures.bare_caller import Caller
@@ -12,7 +13,7 @@ from fixtures.nats_credentials import NatsAccounts, credentials_file
 from fixtures.nats_server import NatsServer
 from fixtures.waiting import until
 
-from strands_robots.device_connect.backends import LinkConfig, link_from_environment, open_client
+from strands_robots.device_connect.backends import LinkConfig, backend_for, link_from_environment, open_client
 
 
 def link_to(server, **fields):
@@ -98,3 +99,67 @@ async def test_server_of_another_authority_is_refused(tmp_path):
     with NatsServer(theirs.issue("nats")) as server:
         with pytest.raises(MessagingError, match="no NATS connection"):
             await open_client(link_to(server, ca=str(ours.ca), connect_timeout_s=2.0))
+
+
+def connections_to(server):
+    """Return the number of connections of this process to the server."""
+    mine = psutil.Process().net_connections("tcp")
+    return sum(bool(each.raddr) and each.raddr.port == server.port for each in mine)
+
+
+async def test_clients_of_one_link_share_one_connection(server):
+    clients = [await open_client(link_to(server)) for _ in range(10)]
+    try:
+        assert connections_to(server) == 1
+        await clients[0].close()
+        received = [[] for _ in clients]
+
+        async def subscribed(number):
+            async def keep(data, _reply):
+                received[number].append(data)
+
+            await clients[number].subscribe("beat", keep, subscribe_only=True)
+
+        for number in range(1, 10):
+            await subscribed(number)
+        await clients[1].publish("beat", b"1")
+        await until(lambda: all(each == [b"1"] for each in received[1:]))
+        await clients[2].close()
+        await clients[1].publish("beat", b"2")
+        await until(lambda: all(each == [b"1", b"2"] for each in (received[1], *received[3:])))
+        assert received[2] == [b"1"]
+    finally:
+        for each in clients:
+            await each.close()
+    await until(lambda: connections_to(server) == 0)
+
+
+async def test_clients_that_wait_for_a_server_share_its_refusal_and_try_anew():
+    server = NatsServer()
+    link = link_to(server, connect_timeout_s=1.0)
+    refused = await asyncio.gather(*(open_client(link) for _ in range(5)), return_exceptions=True)
+    assert all(isinstance(each, MessagingError) for each in refused)
+    with server:
+        client = await open_client(link)
+        assert client.is_connected
+        await client.close()
+
+
+async def test_every_client_of_a_shared_connection_is_told_of_its_loss_and_return(server):
+    told = [[], []]
+    clients = [backend_for(link_to(server)) for _ in told]
+    for client, events in zip(clients, told, strict=True):
+
+        async def lost(events=events):
+            events.append("lost")
+
+        async def back(events=events):
+            events.append("back")
+
+        await client.connect([], reconnect_cb=back, disconnect_cb=lost)
+    server.kill()
+    await until(lambda: told == [["lost"], ["lost"]])
+    server.start()
+    await until(lambda: told == [["lost", "back"], ["lost", "back"]])
+    for client in clients:
+        await client.close()

@@ -1,0 +1,235 @@
+"""NATS connections, one for each event loop and link, shared by their devices.
+
+A ``nats-py`` client belongs to one event loop, and credentials to one link. Devices that have both in common need one
+connection: one descriptor, and one subscription for a subject that all of them follow.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import logging
+import ssl
+import tempfile
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import nats.errors
+from device_connect_edge.messaging.exceptions import AuthenticationError, MessagingConnectionError
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+
+from ._compat import EncryptedClient
+from .config import LinkConfig
+from .dispatch import Throttled
+
+logger = logging.getLogger(__name__)
+
+RECONNECT_WAIT_S = 0.5
+"""Seconds between attempts to reach a server that went away."""
+
+DEFAULT_URL = "nats://127.0.0.1:4222"
+
+Sign = Callable[[str | bytes], bytes]
+OnLink = Callable[[bool], Awaitable[None]]
+"""Awaited with True when the server is back, with False when it is lost."""
+
+Sink = Callable[[Msg], None]
+"""Takes a message over on the loop; returns at once."""
+
+
+class NatsConnection:
+    """One connection with its users, and its subscriptions by subject."""
+
+    def __init__(self, link: LinkConfig, sign: Sign | None) -> None:
+        self.link = link
+        self.client = Client()
+        self._sign = sign
+        self._users: dict[object, OnLink] = {}
+        self._opening: asyncio.Task[None] | None = None
+        self._closing = False
+        self._declaring = asyncio.Lock()
+        self._topics: dict[str, _Topic] = {}
+        self._log = Throttled(logger)
+
+    async def enter(self, user: object, on_link: OnLink) -> None:
+        """Add a user; the first one connects, and the others wait for it.
+
+        Raises:
+            AuthenticationError: the server refuses the credentials.
+            MessagingConnectionError: no server answered within the link's ``connect_timeout_s``.
+        """
+        self._users[user] = on_link
+        if self._opening is None:
+            self._opening = asyncio.create_task(self._open())
+        try:
+            await asyncio.shield(self._opening)
+        except BaseException:
+            await self.leave(user)
+            raise
+
+    async def leave(self, user: object) -> None:
+        """Remove a user; the last one closes the connection."""
+        if self._users.pop(user, None) is None or self._users:
+            return
+        self._closing = True
+        key = (asyncio.get_running_loop(), self.link)
+        if _CONNECTIONS.get(key) is self:
+            del _CONNECTIONS[key]
+        if self._opening is not None and not self._opening.done():
+            self._opening.cancel()
+            await asyncio.gather(self._opening, return_exceptions=True)
+        # A client that was never connected has nothing to close, and nats-py trips over it.
+        if self.client.is_connected or self.client.is_reconnecting:
+            await self.client.close()
+
+    async def subscribe(self, subject: str, queue: str, sink: Sink) -> Callable[[], Awaitable[None]]:
+        """Have ``sink`` called for every message on ``subject``; the result undoes it.
+
+        Raises:
+            nats.errors.Error: the server would refuse it.
+        """
+        if queue:
+            subscription = await self.client.subscribe(subject, queue=queue, cb=_handing(lambda: (sink,)))
+            return partial(_unsubscribe, subscription)
+        async with self._declaring:
+            topic = self._topics.get(subject)
+            if topic is None:
+                topic = _Topic()
+                topic.subscription = await self.client.subscribe(subject, cb=_handing(lambda: topic.sinks))
+                self._topics[subject] = topic
+            topic.sinks = (*topic.sinks, sink)
+        return partial(self._forget, subject, topic, sink)
+
+    async def _forget(self, subject: str, topic: _Topic, sink: Sink) -> None:
+        async with self._declaring:
+            topic.sinks = tuple(each for each in topic.sinks if each is not sink)
+            if topic.sinks or self._topics.get(subject) is not topic:
+                return
+            del self._topics[subject]
+            await _unsubscribe(topic.subscription)
+
+    async def _open(self) -> None:
+        link, problems = self.link, list[str]()
+
+        async def on_error(error: Exception) -> None:
+            problems.append(str(error))
+            del problems[:-PROBLEMS_KEPT]
+            self._log.warning("NATS: %s", error)
+
+        options: dict[str, Any] = {
+            "servers": list(link.connect) or [DEFAULT_URL],
+            "connect_timeout": link.connect_timeout_s,
+            "reconnect_time_wait": RECONNECT_WAIT_S,
+            "max_reconnect_attempts": -1,
+            "disconnected_cb": partial(self._report_link, False),
+            "reconnected_cb": partial(self._report_link, True),
+            "error_cb": on_error,
+        }
+        if link.jwt:
+            options["user_jwt_cb"] = lambda: bytearray(link.jwt.encode())
+            options["signature_cb"] = self._sign or partial(_signed, link.nkey_seed)
+        if link.encrypted:
+            self.client = EncryptedClient()
+            options["tls"] = _tls_context(link)
+        where = ", ".join(link.connect) or DEFAULT_URL
+        try:
+            async with asyncio.timeout(link.connect_timeout_s):
+                await self.client.connect(**options)
+        except (TimeoutError, OSError, nats.errors.Error) as error:
+            await self._abandon()
+            refused = [each for each in problems if "authorization" in each.lower()]
+            reasons = refused or problems
+            reason = reasons[-1] if reasons else str(error) or f"no answer within {link.connect_timeout_s:g} s"
+            kind = AuthenticationError if "authorization" in reason.lower() else MessagingConnectionError
+            raise kind(f"no NATS connection to {where}: {reason}") from error
+        except asyncio.CancelledError:
+            await self._abandon()
+            raise
+
+    async def _abandon(self) -> None:
+        self._closing = True
+        await self.client.close()
+
+    async def _report_link(self, back: bool) -> None:
+        if self._closing:
+            return
+        logger.log(*(_BACK if back else _LOST))
+        for on_link in tuple(self._users.values()):
+            await on_link(back)
+
+
+class _Topic:
+    """One subscription and the sinks that share it."""
+
+    __slots__ = ("sinks", "subscription")
+
+    def __init__(self) -> None:
+        self.sinks: tuple[Sink, ...] = ()
+        self.subscription: Any = None
+
+
+PROBLEMS_KEPT = 8
+"""Errors of a connection that are kept, to name the last one where it cannot be made."""
+
+_BACK = (logging.INFO, "NATS connection is back")
+_LOST = (logging.WARNING, "NATS connection lost")
+
+_CONNECTIONS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], NatsConnection] = {}
+
+
+def connection_for(link: LinkConfig, sign: Sign | None = None) -> NatsConnection:
+    """Return the connection of the running loop for ``link``; one of its own with ``sign``."""
+    if sign is not None:
+        return NatsConnection(link, sign)
+    key = (asyncio.get_running_loop(), link)
+    if key not in _CONNECTIONS:
+        _CONNECTIONS[key] = NatsConnection(link, None)
+    return _CONNECTIONS[key]
+
+
+def _handing(sinks: Callable[[], tuple[Sink, ...]]) -> Callable[[Msg], Awaitable[None]]:
+    async def on_message(message: Msg) -> None:
+        for sink in sinks():
+            sink(message)
+
+    return on_message
+
+
+async def _unsubscribe(subscription: Any) -> None:
+    # A closed connection has dropped its subscriptions already.
+    with contextlib.suppress(nats.errors.Error):
+        await subscription.unsubscribe()
+
+
+def _signed(seed: str, nonce: str | bytes) -> bytes:
+    """Sign the server's nonce with the seed's key; in base64."""
+    import nkeys  # type: ignore[import-untyped]  # noqa: PLC0415 - only credentials need it
+
+    challenge = nonce.encode() if isinstance(nonce, str) else nonce
+    return base64.b64encode(nkeys.from_seed(seed.encode()).sign(challenge))
+
+
+def _tls_context(link: LinkConfig) -> ssl.SSLContext:
+    """Return a context that trusts the stated authority alone, else the system's."""
+    stated = {"cadata" if link.ca.lstrip().startswith("-----BEGIN") else "cafile": link.ca} if link.ca else {}
+    context = ssl.create_default_context(**stated)  # type: ignore[arg-type]  # both keys take text
+    context.check_hostname = link.verify_hostname
+    if link.cert:
+        _load_identity(context, link.cert, link.key)
+    return context
+
+
+def _load_identity(context: ssl.SSLContext, cert: str, key: str) -> None:
+    """Load certificate and key, which the standard library reads from files only."""
+    if not cert.lstrip().startswith("-----BEGIN"):
+        context.load_cert_chain(cert, key)
+        return
+    with tempfile.TemporaryDirectory(prefix="strands-") as folder:
+        both = Path(folder, "identity.pem")
+        both.touch(mode=0o600)
+        both.write_text(f"{cert}\n{key}\n")
+        context.load_cert_chain(both)
