@@ -23,6 +23,7 @@ from benchmarks.table import Row, markdown
 PARTS = {
     "rpc": "Calls and events over Zenoh and NATS",
     "device": "Bring-up, import and fleets in one process",
+    "fleet": "Hundreds of devices",
     "simulation": "Physics",
     "reach": "Arms that reach and grasp",
     "safety": "From the controller's call to the last write",

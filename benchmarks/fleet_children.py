@@ -1,0 +1,156 @@
+"""Many devices in one process, for :mod:`benchmarks.fleet`: ``python -m benchmarks.fleet_children KIND ...``.
+
+``KIND FIRST COUNT TRANSPORT ENDPOINT``: joins ``COUNT`` devices, ``ours`` or ``bare`` (the framework's runtimes on one
+loop), reports, and then obeys lines on its standard input: ``idle SECONDS``, ``halts`` and ``end``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import sys
+import threading
+import time
+from typing import Any
+
+import psutil
+from device_connect_edge import DeviceRuntime
+from fixtures.echo_device import EchoDriver
+
+from strands_robots.device_connect import LinkConfig, init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.envelope import Envelope, success
+
+GROUP = 25
+HALTS: dict[str, float] = {}
+
+
+class Idle:
+    """The smallest robot: four methods; it notes when it was stopped."""
+
+    def __init__(self, name: str) -> None:
+        self.tool_name_str = name
+
+    def start_task(self, instruction: str, **options: Any) -> Envelope:
+        return success("started")
+
+    def stop_task(self) -> Envelope:
+        HALTS[self.tool_name_str] = time.monotonic()
+        return success("stopped")
+
+    def get_task_status(self) -> Envelope:
+        return success("idle", task_status="idle")
+
+    def get_features(self) -> Envelope:
+        return success("none")
+
+
+def snapshot() -> dict[str, float]:
+    me = psutil.Process()
+    cpu = me.cpu_times()
+    return {
+        "cpu": cpu.user + cpu.system,
+        "mb": me.memory_info().rss / 1e6,
+        "threads": me.num_threads(),
+        "fds": me.num_fds(),
+    }
+
+
+def report(**facts: Any) -> None:
+    print(json.dumps(facts), flush=True)
+
+
+def link_to(transport: str, endpoint: str) -> LinkConfig:
+    if transport == "meet":
+        return loopback_config(int(endpoint))
+    return LinkConfig(transport=transport, connect=(endpoint,))
+
+
+def ours(first: int, count: int, link: LinkConfig) -> None:
+    marks, runtimes = [snapshot()], []
+    for number in range(first, first + count):
+        name = f"arm-{number}"
+        runtimes.append(init_device_connect_sync(Idle(name), peer_id=name, link=link, allow_insecure=True))
+        if len(runtimes) % GROUP == 0:
+            marks.append(snapshot())
+    report(marks=marks, at=time.monotonic())
+    obey()
+    for each in runtimes:
+        stop_device_connect(each)
+    report(after=snapshot())
+
+
+def rounds(turns: int, count: int, link: LinkConfig) -> None:
+    """Join and leave, again and again."""
+    marks = []
+    for _ in range(turns):
+        runtimes = [
+            init_device_connect_sync(Idle(f"arm-{each}"), peer_id=f"arm-{each}", link=link, allow_insecure=True)
+            for each in range(count)
+        ]
+        for each in runtimes:
+            stop_device_connect(each)
+        marks.append(snapshot())
+    # The pool's workers end after two idle seconds.
+    time.sleep(3.0)
+    report(marks=[*marks, snapshot()])
+
+
+def bare(first: int, count: int, transport: str, endpoint: str) -> None:
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, daemon=True).start()
+    marks = [snapshot()]
+
+    async def join(name: str) -> None:
+        logging.getLogger(f"device_connect_edge.device.{name}").addHandler(logging.NullHandler())
+        runtime = DeviceRuntime(
+            driver=EchoDriver(),
+            device_id=name,
+            messaging_backend="nats" if transport == "nats" else "zenoh",
+            messaging_urls=[endpoint],
+            allow_insecure=True,
+        )
+        tasks.append(asyncio.ensure_future(runtime.run()))
+        # The framework has no public sign that a runtime is up.
+        while not runtime._background_tasks:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+
+    tasks: list[asyncio.Future[None]] = []
+    for number in range(first, first + count):
+        asyncio.run_coroutine_threadsafe(join(f"bare-{number}"), loop).result(60.0)
+        if (number - first + 1) % GROUP == 0:
+            marks.append(snapshot())
+    report(marks=marks, at=time.monotonic())
+    obey()
+    os._exit(0)
+
+
+def obey() -> None:
+    for line in sys.stdin:
+        command, *arguments = line.split()
+        if command == "idle":
+            before, began = snapshot(), time.monotonic()
+            time.sleep(float(arguments[0]))
+            after = snapshot()
+            report(share=(after["cpu"] - before["cpu"]) / (time.monotonic() - began), **after)
+        elif command == "halts":
+            halts = dict(HALTS)
+            HALTS.clear()
+            report(halts=halts)
+        else:
+            return
+
+
+def main() -> None:
+    logging.disable(logging.ERROR)
+    os.environ["DEVICE_CONNECT_DISCOVERY_MODE"] = "d2d"
+    kind, first, count, transport, endpoint = sys.argv[1:]
+    if kind == "bare":
+        bare(int(first), int(count), transport, endpoint)
+    else:
+        (rounds if kind == "rounds" else ours)(int(first), int(count), link_to(transport, endpoint))
+
+
+if __name__ == "__main__":
+    main()
