@@ -34,6 +34,7 @@ system:
 	@./scripts/real-arm.sh
 	@./scripts/models.sh
 	@./scripts/rosbridge.sh
+	@./scripts/registry.sh
 	@./scripts/dds-peers.sh
 	@./scripts/dds-security.sh
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from strands_robots.cli.app import build
 from strands_robots.cli.network import Network
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.device_connect.client import Peer
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, success
 
 Run = Callable[..., Result]
@@ -38,6 +38,7 @@ class FakeFleet:
         self.answer: Envelope | Exception = success("done")
         self.stops: dict[str, Envelope] = {}
         self.called: list[tuple[Any, ...]] = []
+        self.stale = ""
 
     def peers(self, timeout: float = 2.0) -> list[Peer]:
         return self.found

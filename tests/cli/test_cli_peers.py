@@ -5,7 +5,8 @@ import json
 import pytest
 from tests.cli.conftest import FakeFleet, Run
 
-from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError, Peer
+from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error
 
 

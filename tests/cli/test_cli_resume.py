@@ -12,7 +12,8 @@ from strands_robots.cli import resume
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.device_connect.client import DeviceTimeoutError, Peer
+from strands_robots.device_connect.client import DeviceTimeoutError
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.approval import Grants
 from strands_robots.safety.ed25519 import keygen
@@ -28,6 +29,7 @@ class FakeFleet:
 
     def __init__(self) -> None:
         self.link = loopback_config()
+        self.stale = ""
         self.lockouts: dict[str, list[str]] = {}
         self.silent: set[str] = set()
         self.refuses: set[str] = set()

@@ -17,7 +17,7 @@ from strands_robots.envelope import is_error, text_of
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
-    from strands_robots.device_connect.client import Peer
+    from strands_robots.device_connect.discovery import Peer
 
 
 def register(app: typer.Typer) -> None:
@@ -44,8 +44,8 @@ def peers(
         found = [peer for peer in found if peer.id == device]
     if not found:
         who = "No robot" if device is None else f"No {device!r}"
-        raise CliError(f"{who} answered. {describe(fleet.link)}", Exit.SILENT, peers=[])
-    screen.data({"status": "success", "peers": [_facts(peer) for peer in found]})
+        raise CliError(f"{who} answered. {describe(fleet.link)}", Exit.SILENT, peers=[], stale=fleet.stale)
+    screen.data({"status": "success", "peers": [_facts(peer) for peer in found], "stale": fleet.stale})
     if device is not None:
         _show_functions(screen, found[0])
         return

@@ -87,7 +87,7 @@ def lockout(
 ) -> None:
     """List locked robots, since when and by whom: live ones, and those in this machine's lockout file."""
     seconds = number("--timeout", timeout, above=0, high=60)
-    stored, live, note = _stored_lockouts(), list[LockoutReport](), ""
+    stored, live, note, stale = _stored_lockouts(), list[LockoutReport](), "", ""
     if not local:
         try:
             if on_mesh:
@@ -95,6 +95,7 @@ def lockout(
             else:
                 with network.fleet() as fleet:
                     live = ask_robots(fleet, lockable_robots(fleet, seconds), seconds)
+                stale = fleet.stale
             note = "" if live else "No robot answered on the network. "
         except CliError as failure:
             if failure.code is Exit.USAGE:
@@ -116,6 +117,7 @@ def lockout(
                 for each in live
             },
             "kept": {name: [lockout.fields() for lockout in lockouts] for name, lockouts in stored.items()},
+            "stale": stale,
         }
     )
     if cells:

@@ -73,6 +73,8 @@ def stop(
         raise CliError(f"DID NOT STOP: {', '.join(moving)}.", Exit.REFUSED, devices=devices)
     if silent:
         raise CliError(f"It is unknown whether these stopped: {', '.join(silent)}.", Exit.SILENT, devices=devices)
+    if everything and fleet.stale:
+        raise CliError(f"These stopped: {', '.join(outcomes)}. {fleet.stale}", Exit.SILENT, devices=devices)
     screen.data({"status": "success", "devices": devices})
 
 

@@ -13,12 +13,14 @@ import threading
 import uuid
 from collections.abc import Callable, Coroutine, Generator, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Self, TypeVar
 
-from device_connect_edge.messaging import MessagingError
+from device_connect_edge.messaging.exceptions import MessagingError, RequestTimeoutError
 
 from strands_robots.device_connect.backends import LinkConfig, open_client
+from strands_robots.device_connect.backends.base import NoResponderError
+from strands_robots.device_connect.discovery import HEARTBEATS_S, Discovery, Peer, parts
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
@@ -27,11 +29,8 @@ from strands_robots.utils import device_id, shown, text
 
 T = TypeVar("T")
 
-PROBE_EVERY_S = 0.25
-"""Seconds between two probes while peers are collected: the first one may leave before every link is up."""
-
-SETTLED_S = 0.5
-"""Seconds without a new peer after which a collection ends early, where at least one has answered."""
+COLLECT_MARGIN_S = 3.0
+"""Seconds that a discovery may last beyond its own deadline, on a loaded machine."""
 
 EVENTS_MAX = 10_000
 """Events that wait for a slow reader; a further one displaces the oldest."""
@@ -42,7 +41,7 @@ class NoSuchDeviceError(StrandsRobotsError, LookupError):
 
 
 class DeviceTimeoutError(StrandsRobotsError, TimeoutError):
-    """The device is announced and did not answer in time."""
+    """The device is on the network and did not answer in time."""
 
 
 class CallRefusedError(StrandsRobotsError, RuntimeError):
@@ -51,42 +50,6 @@ class CallRefusedError(StrandsRobotsError, RuntimeError):
     def __init__(self, message: str, code: int = 0) -> None:
         super().__init__(message)
         self.code = code
-
-
-@dataclass(frozen=True, slots=True)
-class Peer:
-    """A device as it announces itself."""
-
-    id: str
-    type: str = ""
-    model: str = ""
-    status: Mapping[str, Any] = field(default_factory=dict)
-    functions: tuple[Mapping[str, Any], ...] = ()
-    events: tuple[str, ...] = ()
-    location: str = ""
-
-    @property
-    def stop_verb(self) -> str | None:
-        """The function that stops it: ``stop``, else ``stopMotion``, else None."""
-        names = {str(each.get("name", "")) for each in self.functions}
-        return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
-
-    @classmethod
-    def of(cls, presence: Mapping[str, Any]) -> Peer:
-        """Read a presence message; a field that it lacks is empty."""
-        identity, status = _object(presence, "identity"), _object(presence, "status")
-        capabilities = _object(presence, "capabilities")
-        functions = [each for each in capabilities.get("functions") or () if isinstance(each, Mapping)]
-        events = [each for each in capabilities.get("events") or () if isinstance(each, Mapping)]
-        return cls(
-            id=str(presence.get("device_id", "")),
-            type=str(identity.get("device_type", "")),
-            model=str(identity.get("model") or ""),
-            status=status,
-            functions=tuple(functions),
-            events=tuple(str(each.get("name", "")) for each in events),
-            location=str(status.get("location") or ""),
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +78,14 @@ class FleetClient:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="fleet-client", daemon=True)
         self._messaging: Any = None
-        self._seen: dict[str, Peer] = {}
+        self._discovery: Discovery | None = None
 
     def __enter__(self) -> Self:
         self._thread.start()
         try:
             self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + 1.0)
-            self.run(self._subscribe("*.presence", self._on_presence), 5.0)
+            self._discovery = Discovery(self._messaging)
+            self.run(self._discovery.start(), 5.0)
         except BaseException:
             self.close()
             raise
@@ -143,16 +107,22 @@ class FleetClient:
             self._loop.close()
 
     def peers(self, timeout: float = 2.0) -> list[Peer]:
-        """Return the devices that answer a probe, sorted by id.
+        """Return the devices of the tenant, sorted by id.
 
         Args:
-            timeout: seconds at most; the collection ends half a second after the last new device.
+            timeout: seconds at most, but :data:`~discovery.HEARTBEATS_S` where the registry is expected and gives no
+                list; :attr:`stale` says so then. The collection ends early once no more devices come.
         """
-        return self.run(self._collect(timeout), timeout + 1.0)
+        return self.run(self._found.collect(timeout), max(timeout, HEARTBEATS_S) + COLLECT_MARGIN_S)
+
+    @property
+    def stale(self) -> str:
+        """Empty, or the reason why the last discovery may be incomplete."""
+        return self._found.stale
 
     def known(self) -> tuple[str, ...]:
         """Return the ids of live devices announced since the last :meth:`peers`."""
-        return tuple(sorted(self._seen))
+        return self._found.known
 
     def call(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0
@@ -209,14 +179,22 @@ class FleetClient:
         return self.run(self._stop(device, timeout), 2 * timeout + 4.0)
 
     def stop_all(self, timeout: float = 5.0) -> dict[str, Envelope]:
-        """Stop every device that answers a probe, all at once; return the answers by id."""
-        peers = [peer.id for peer in self.peers() if peer.stop_verb]
+        """Stop each device when it is found; return the answers by id.
+
+        :attr:`stale` says when devices may have been missed.
+        """
 
         async def all_of_them() -> dict[str, Envelope]:
-            answers = await asyncio.gather(*(self._stop(peer, timeout) for peer in peers))
-            return dict(zip(peers, answers, strict=True))
+            stops: dict[str, asyncio.Task[Envelope]] = {}
 
-        return self.run(all_of_them(), 2 * timeout + 4.0)
+            def found(peer: Peer) -> None:
+                if peer.stop_verb:
+                    stops[peer.id] = asyncio.create_task(self._stop(peer.id, timeout))
+
+            await self._found.collect(2.0, found, thorough=True)
+            return {name: await stops[name] for name in sorted(stops)}
+
+        return self.run(all_of_them(), HEARTBEATS_S + COLLECT_MARGIN_S + 2 * timeout)
 
     def run(self, work: Coroutine[Any, Any, T], within: float) -> T:
         """Run a coroutine on the client's loop and wait for it."""
@@ -227,39 +205,17 @@ class FleetClient:
             done.cancel()
             raise
 
+    @property
+    def _found(self) -> Discovery:
+        if self._discovery is None:
+            raise RuntimeError("the client is not connected; use it as a context manager")
+        return self._discovery
+
     def _subject(self, rest: str) -> str:
         return f"device-connect.{self.link.tenant}.{rest}"
 
     async def _subscribe(self, rest: str, callback: Callable[[bytes, str, str | None], Any]) -> Any:
         return await self._messaging.subscribe_with_subject(self._subject(rest), callback, subscribe_only=True)
-
-    async def _on_presence(self, data: bytes, subject: str, reply: str | None) -> None:
-        try:
-            presence = json.loads(data)
-        except ValueError:
-            return
-        # Access rules guard the topic, so it outranks the id in the message.
-        name = _parts(subject)[2]
-        if not isinstance(presence, Mapping) or presence.get("device_id") != name:
-            return
-        if presence.get("departing"):
-            self._seen.pop(name, None)
-        else:
-            self._seen[name] = Peer.of(presence)
-
-    async def _collect(self, within: float) -> list[Peer]:
-        loop = asyncio.get_running_loop()
-        self._seen.clear()
-        began = changed = loop.time()
-        count = 0
-        while loop.time() < began + within:
-            await self._messaging.publish(self._subject("discovery.probe"), b'{"probe": true}')
-            await asyncio.sleep(min(PROBE_EVERY_S, within))
-            if len(self._seen) != count:
-                count, changed = len(self._seen), loop.time()
-            elif count and loop.time() - changed >= SETTLED_S:
-                break
-        return [self._seen[name] for name in sorted(self._seen)]
 
     async def _call(self, device: str, function: str, params: dict[str, Any], within: float) -> Envelope:
         name, verb = device_id("device", device), text("function", function, longest=100)
@@ -273,16 +229,16 @@ class FleetClient:
         try:
             data = await self._messaging.request(self._subject(f"{name}.cmd"), encoded, timeout=within)
         except MessagingError as exc:
-            raise await self._unanswered(name, within, exc) from exc
+            raise self._unanswered(name, within, exc) from exc
         return _answer(name, verb, data)
 
-    async def _unanswered(self, device: str, within: float, exc: Exception) -> Exception:
+    def _unanswered(self, device: str, within: float, exc: Exception) -> Exception:
         """Return the error for an unanswered call."""
-        if not self._messaging.is_connected:
-            return exc
-        if any(peer.id == device for peer in await self._collect(1.0)):
-            return DeviceTimeoutError(f"{device} is announced and did not answer within {within:g} s ({exc}).")
-        return NoSuchDeviceError(f"No device {device!r} in tenant {self.link.tenant!r}.")
+        if isinstance(exc, NoResponderError):
+            return NoSuchDeviceError(f"No device {device!r} in tenant {self.link.tenant!r}.")
+        if isinstance(exc, RequestTimeoutError):
+            return DeviceTimeoutError(f"{device} is on the network and did not answer within {within:g} s ({exc}).")
+        return exc
 
     async def _stop(self, device: str, within: float) -> Envelope:
         try:
@@ -320,24 +276,14 @@ class EventSubscription:
         self.close()
 
 
-def _object(presence: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    value = presence.get(key)
-    return value if isinstance(value, Mapping) else {}
-
-
-def _parts(subject: str) -> list[str]:
-    parts = subject.split("/" if "/" in subject else ".")
-    return parts if len(parts) > 3 else ["", "", "", ""]
-
-
 def _event(data: bytes, subject: str) -> DeviceEvent | None:
-    parts = _parts(subject)
+    tokens = parts(subject)
     try:
         notification = json.loads(data)
     except ValueError:
         return None
     payload = notification.get("params") if isinstance(notification, Mapping) else None
-    return DeviceEvent(parts[2], parts[-1], payload if isinstance(payload, Mapping) else {})
+    return DeviceEvent(tokens[2], tokens[-1], payload if isinstance(payload, Mapping) else {})
 
 
 def _push(arrived: queue.Queue[DeviceEvent], event: DeviceEvent) -> None:

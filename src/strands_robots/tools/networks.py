@@ -52,15 +52,20 @@ def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
     return stopped, text_of(answer) or ("" if stopped else explain(answer))
 
 
-def combined_verdict(answers: Mapping[str, Envelope]) -> Envelope:
-    """Return one answer for several stops: success when all were confirmed."""
+def combined_verdict(answers: Mapping[str, Envelope], stale: str = "") -> Envelope:
+    """Return one answer for several stops: success when all were confirmed.
+
+    Args:
+        answers: by robot.
+        stale: why there may be more robots than these; then it is unknown whether all have stopped.
+    """
     if not answers:
-        return error("No robot that can be stopped answered.", stopped=None, robots={})
+        return error(f"No robot that can be stopped answered. {stale}".strip(), stopped=None, robots={})
     outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
     moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
     silent = [name for name, (stopped, _) in outcomes.items() if stopped is None]
     fields: dict[str, Any] = {
-        "stopped": False if moving else None if silent else True,
+        "stopped": False if moving else None if silent or stale else True,
         "not_stopped": moving,
         "silent": silent,
         "robots": {name: said for name, (_, said) in outcomes.items()},
@@ -69,6 +74,7 @@ def combined_verdict(answers: Mapping[str, Envelope]) -> Envelope:
         return success(f"Stopped: {', '.join(answers)}.", **fields)
     problems = [f"DID NOT STOP: {', '.join(moving)}"] if moving else []
     problems += [f"no answer, state unknown: {', '.join(silent)}"] if silent else []
+    problems += [f"stopped: {', '.join(answers)}. {stale.rstrip('.')}"] if not problems else []
     return error("; ".join(problems) + ".", **fields)
 
 
@@ -248,17 +254,16 @@ class DeviceConnect:
         """List every device that answers, with its type, state and functions."""
 
         def listed(fleet: FleetClient) -> Envelope:
-            return _peer_list(
-                [
-                    {
-                        "id": peer.id,
-                        "type": peer.type,
-                        "status": peer.status.get("availability", ""),
-                        "functions": [str(each.get("name", "")) for each in peer.functions],
-                    }
-                    for peer in fleet.peers()
-                ]
-            )
+            rows = [
+                {
+                    "id": peer.id,
+                    "type": peer.type,
+                    "status": peer.status.get("availability", ""),
+                    "functions": [str(each.get("name", "")) for each in peer.functions],
+                }
+                for peer in fleet.peers()
+            ]
+            return _peer_list(rows, fleet.stale)
 
         return _on_fleet(listed)
 
@@ -279,7 +284,10 @@ class DeviceConnect:
         """Stop one device, or every device at once; answers by name."""
 
         def stopped(fleet: FleetClient) -> Envelope:
-            return combined_verdict({target: fleet.stop(target, STOP_S)} if target else fleet.stop_all(STOP_S))
+            if target:
+                return combined_verdict({target: fleet.stop(target, STOP_S)})
+            answers = fleet.stop_all(STOP_S)
+            return combined_verdict(answers, fleet.stale)
 
         return _on_fleet(stopped, stopped=None)
 
@@ -314,10 +322,10 @@ class DeviceConnect:
         return _on_fleet(stopped, stopped=None)
 
 
-def _peer_list(rows: list[dict[str, Any]]) -> Envelope:
+def _peer_list(rows: list[dict[str, Any]], stale: str = "") -> Envelope:
     if not rows:
-        return error("No robot answered.", peers=[])
-    return success(f"{len(rows)} robots: {', '.join(row['id'] for row in rows)}.", peers=rows)
+        return error(f"No robot answered. {stale}".strip(), peers=[])
+    return success(f"{len(rows)} robots: {', '.join(row['id'] for row in rows)}. {stale}".strip(), peers=rows)
 
 
 def _on_fleet(work: Callable[[FleetClient], Envelope], **fields: Any) -> Envelope:

@@ -9,6 +9,7 @@ from device_connect_edge.messaging.exceptions import MessagingError
 from fixtures.bare_caller import Caller
 from fixtures.certificates import Authority
 from fixtures.echo_device import EchoDevice
+from fixtures.lying_nats import LyingNatsServer
 from fixtures.nats_credentials import NatsAccounts, credentials_file
 from fixtures.nats_server import NatsServer
 from fixtures.waiting import until
@@ -163,3 +164,16 @@ async def test_every_client_of_a_shared_connection_is_told_of_its_loss_and_retur
     await until(lambda: told == [["lost", "back"], ["lost", "back"]])
     for client in clients:
         await client.close()
+
+
+async def test_flush_returns_after_the_server_has_the_subscriptions():
+    async def ignore(data, reply):
+        pass
+
+    with LyingNatsServer() as server:
+        client = await open_client(LinkConfig("nats", connect=(f"nats://127.0.0.1:{server.port}",)))
+        await client.subscribe("arm-1.stop", ignore)
+        await client.flush()
+        sent = bytes(server.received)
+        await client.close()
+    assert sent.index(b"SUB arm-1.stop") < sent.rindex(b"PING")

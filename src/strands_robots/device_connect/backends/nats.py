@@ -99,9 +99,11 @@ class NatsBackend(Backend):
         return payload
 
     async def flush(self) -> None:
-        """Wait until the server has everything published so far."""
+        """Wait until the server has everything sent so far, subscriptions too."""
         if self.is_connected:
             with contextlib.suppress(nats.errors.Error):  # a connection that is lost has nothing to flush
+                # nats-py writes its PING before what it still holds back; only the second one follows all of that.
+                await self._connected.flush(timeout=2)
                 await self._connected.flush(timeout=2)
 
     async def close(self) -> None:

@@ -1,0 +1,276 @@
+"""Discovery of devices by presence, by the registry service, by heartbeats.
+
+A device in d2d mode answers a probe with its presence. One in registry mode is silent there and registers with the
+registry service instead, which lists it for as long as its heartbeats go on. Both kinds are looked for at once. While
+the registry is expected and gives no list, devices are found by their heartbeats and asked to describe themselves.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import uuid
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from device_connect_edge.messaging.exceptions import MessagingError
+
+from strands_robots import settings
+from strands_robots.device_connect.backends.base import Backend
+from strands_robots.errors import StrandsRobotsError
+
+logger = logging.getLogger(__name__)
+
+PROBE_EVERY_S = 0.25
+"""Seconds between two probes while peers are collected: the first one may leave before every link is up."""
+
+SETTLED_S = 0.5
+"""Seconds without a new device after which a collection ends early, where at least one has answered."""
+
+REGISTRY_S = 0.5
+"""Seconds in which a registry that is not known to exist has to answer, where devices answered otherwise."""
+
+HEARTBEATS_S = 6.0
+"""Seconds in which every live device sends a heartbeat; the framework's default is one in 5 s."""
+
+DESCRIBE_S = 1.0
+"""Seconds in which a device describes itself when asked."""
+
+PAGE = 100
+"""Devices of one answer of the registry; NATS carries 1 MiB by default and a rich description takes 10 kB."""
+
+PAGES_MAX = 1000
+
+Found = Callable[["Peer"], None]
+
+
+class RegistryError(StrandsRobotsError, RuntimeError):
+    """The registry answered with an error, as it does while its database is gone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A device as it describes itself."""
+
+    id: str
+    type: str = ""
+    model: str = ""
+    status: Mapping[str, Any] = field(default_factory=dict)
+    functions: tuple[Mapping[str, Any], ...] = ()
+    events: tuple[str, ...] = ()
+    location: str = ""
+
+    @property
+    def stop_verb(self) -> str | None:
+        """The function that stops it: ``stop``, else ``stopMotion``, else None."""
+        names = {str(each.get("name", "")) for each in self.functions}
+        return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
+
+    @classmethod
+    def of(cls, description: Mapping[str, Any]) -> Peer:
+        """Read a presence message or a registration; a field that it lacks is empty."""
+        identity, status = _object(description, "identity"), _object(description, "status")
+        capabilities = _object(description, "capabilities")
+        functions = [each for each in capabilities.get("functions") or () if isinstance(each, Mapping)]
+        events = [each for each in capabilities.get("events") or () if isinstance(each, Mapping)]
+        return cls(
+            id=str(description.get("device_id", "")),
+            type=str(identity.get("device_type", "")),
+            model=str(identity.get("model") or ""),
+            status=status,
+            functions=tuple(functions),
+            events=tuple(str(each.get("name", "")) for each in events),
+            location=str(status.get("location") or ""),
+        )
+
+
+class Discovery:
+    """Devices of one tenant, found on one connection; used on the connection's loop."""
+
+    def __init__(self, messaging: Backend) -> None:
+        self.stale = ""
+        """Empty, or one sentence on why the last collection may lack devices or name some that are gone."""
+        self._messaging = messaging
+        self._root = f"device-connect.{messaging.link.tenant}"
+        self._present: dict[str, Peer] = {}
+        self._listed: dict[str, Peer] = {}
+        self._listed_at: float | None = None
+        self._described: dict[str, Peer] = {}
+        self._beats: dict[str, float] = {}
+        self._listens_since = 0.0
+        self._changed_at = 0.0
+        self._found: Found = lambda peer: None
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Ids of the devices that were announced since the last collection."""
+        return tuple(sorted(self._present))
+
+    async def start(self) -> None:
+        """Receive presence and heartbeats from now on."""
+        self._listens_since = asyncio.get_running_loop().time()
+        for leaf, take in (("presence", self._on_presence), ("heartbeat", self._on_heartbeat)):
+            await self._messaging.subscribe_with_subject(f"{self._root}.*.{leaf}", take, subscribe_only=True)
+
+    async def collect(self, within: float, found: Found = lambda peer: None, *, thorough: bool = False) -> list[Peer]:
+        """Return the devices of the tenant, sorted by id.
+
+        Args:
+            within: seconds at most. Where the registry is expected and gives no list, it lasts until heartbeats were
+                received for ``HEARTBEATS_S``. It ends early, half a second after the last new device.
+            found: called once with each device, when it is found.
+            thorough: where nothing was found, wait for heartbeats in any case.
+        """
+        loop = asyncio.get_running_loop()
+        self._present.clear()
+        self._described.clear()
+        named: set[str] = set()
+
+        def found_once(peer: Peer) -> None:
+            if peer.id not in named:
+                named.add(peer.id)
+                self._changed_at = loop.time()
+                found(peer)
+
+        self._found = found_once
+        began = self._changed_at = loop.time()
+        listing = asyncio.create_task(self._list(within))
+        try:
+            while loop.time() < began + within:
+                await self._messaging.publish(f"{self._root}.discovery.probe", b'{"probe": true}')
+                await asyncio.sleep(min(PROBE_EVERY_S, within))
+                heard = listing.done() or not (self._expects_registry or loop.time() - began < REGISTRY_S)
+                if named and heard and loop.time() - self._changed_at >= SETTLED_S:
+                    break
+            await self._settle_registry(listing, began, sure=thorough and not named)
+        finally:
+            listing.cancel()
+            await asyncio.gather(listing, return_exceptions=True)
+            self._found = lambda peer: None
+        # A device's own word is newer than the registry's.
+        everyone = {**self._listed, **self._described, **self._present}
+        return [everyone[name] for name in sorted(everyone)]
+
+    @property
+    def _expects_registry(self) -> bool:
+        return self._listed_at is not None or settings.raw("DEVICE_CONNECT_DISCOVERY_MODE").lower() == "registry"
+
+    async def _settle_registry(self, listing: asyncio.Task[dict[str, Peer]], began: float, *, sure: bool) -> None:
+        """Take the registry's list; without one, find devices by their heartbeats.
+
+        Args:
+            listing: the task of the list.
+            began: start of the collection.
+            sure: wait for heartbeats though nothing speaks for a registry.
+        """
+        loop = asyncio.get_running_loop()
+        problem = listing.exception() if listing.done() else None
+        if listing.done() and problem is None:
+            self._listed, self._listed_at, self.stale = listing.result(), loop.time(), ""
+            return
+        asked: dict[str, asyncio.Task[None]] = {}
+        while True:
+            alive = {name for name, at in self._beats.items() if at >= began - HEARTBEATS_S}
+            for name in alive - self._present.keys() - asked.keys():
+                asked[name] = asyncio.create_task(self._describe(name))
+            # A device that sends heartbeats and no presence is in registry mode.
+            if self._expects_registry or asked or isinstance(problem, RegistryError):
+                self._report_stale(str(problem or "no answer in time"), loop.time())
+            elif not sure:
+                return
+            if loop.time() >= self._listens_since + HEARTBEATS_S:
+                break
+            await asyncio.sleep(PROBE_EVERY_S)
+        await asyncio.gather(*asked.values())
+
+    def _report_stale(self, problem: str, now: float) -> None:
+        known_before = bool(self.stale)
+        self.stale = f"The registry gives no list ({problem}): devices may be missing"
+        if self._listed_at is None:
+            self.stale += "."
+        else:
+            self.stale += f", and what it listed {now - self._listed_at:.0f} s ago counts."
+        if not known_before:
+            logger.warning("%s", self.stale)
+
+    async def _list(self, within: float) -> dict[str, Peer]:
+        """Return what the registry lists.
+
+        Raises:
+            NoResponderError: there is none.
+            RegistryError: it answered with an error.
+            MessagingError: no answer within ``within`` seconds.
+        """
+        devices = {}
+        async for row in self._rows(within):
+            peer = Peer.of(row)
+            devices[peer.id] = peer
+            self._found(peer)
+        return devices
+
+    async def _rows(self, within: float) -> AsyncIterator[Mapping[str, Any]]:
+        offset: Any = 0
+        for _ in range(PAGES_MAX):
+            answer = await self._ask("discovery", "discovery/listDevices", {"offset": offset, "limit": PAGE}, within)
+            rows = answer.get("devices")
+            for row in rows if isinstance(rows, list) else ():
+                if isinstance(row, Mapping) and row.get("device_id"):
+                    yield row
+            before, offset = offset, answer.get("next_offset")
+            if not isinstance(offset, int) or offset <= before:
+                return
+
+    async def _describe(self, name: str) -> None:
+        try:
+            answer = await self._ask(f"{name}.cmd", "requestRegistration", {}, DESCRIBE_S)
+        except (MessagingError, RegistryError) as exc:
+            logger.debug("%s sent a heartbeat and does not describe itself: %s", name, exc)
+            return
+        if answer.get("device_id") == name:
+            peer = self._described[name] = Peer.of(answer)
+            self._found(peer)
+
+    async def _ask(self, leaf: str, method: str, params: Mapping[str, Any], within: float) -> Mapping[str, Any]:
+        request = {"jsonrpc": "2.0", "id": uuid.uuid4().hex, "method": method, "params": params}
+        data = await self._messaging.request(f"{self._root}.{leaf}", json.dumps(request).encode(), timeout=within)
+        reply = _read(data)
+        result = reply.get("result")
+        if not isinstance(result, Mapping):
+            raise RegistryError(str(_object(reply, "error").get("message") or "an answer without a result")[:200])
+        return result
+
+    async def _on_presence(self, data: bytes, subject: str, reply: str | None) -> None:
+        presence, name = _read(data), parts(subject)[2]
+        # Access rules guard the topic, so it outranks the id in the message.
+        if presence.get("device_id") != name:
+            return
+        if presence.get("departing"):
+            self._present.pop(name, None)
+            self._beats.pop(name, None)
+        else:
+            peer = self._present[name] = Peer.of(presence)
+            self._found(peer)
+
+    async def _on_heartbeat(self, data: bytes, subject: str, reply: str | None) -> None:
+        self._beats[parts(subject)[2]] = asyncio.get_running_loop().time()
+
+
+def parts(subject: str) -> list[str]:
+    """Return the tokens of a subject or a key, at least four."""
+    tokens = subject.split("/" if "/" in subject else ".")
+    return tokens if len(tokens) > 3 else ["", "", "", ""]
+
+
+def _read(data: bytes) -> Mapping[str, Any]:
+    try:
+        message = json.loads(data)
+    except (ValueError, RecursionError):
+        return {}
+    return message if isinstance(message, Mapping) else {}
+
+
+def _object(message: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = message.get(key)
+    return value if isinstance(value, Mapping) else {}
