@@ -1,8 +1,10 @@
 """A robot of your own: give it LeRobot's five verbs, and agents find it, drive it and stop it.
 
-It counts as real hardware: it moves only for callers that you allow, and only with your approval::
+It counts as real hardware: it moves only for callers that you allow, and only with your approval. Without a trained
+policy it is moved by ``mock``, in slow waves, which you allow as well::
 
-    DEVICE_CONNECT_RPC_ALLOW=strands-robots STRANDS_ROBOT_COMMAND_ALLOW=execute .venv/bin/python examples/own_driver.py
+    export DEVICE_CONNECT_RPC_ALLOW=strands-robots STRANDS_ROBOT_COMMAND_ALLOW=execute STRANDS_ALLOW_MOCK=true
+    .venv/bin/python examples/own_driver.py
     strands-robots call pan-tilt execute instruction="look around" duration=5      # in another terminal
 """
 

@@ -35,6 +35,8 @@ def main() -> int:
     # This process is the operator's: it approves what an agent may do with the arm.
     os.environ.setdefault("DEVICE_CONNECT_RPC_ALLOW", "*,anonymous")
     os.environ.setdefault("STRANDS_ROBOT_COMMAND_ALLOW", "execute")
+    # No policy is trained here: slow waves show the way of a command.
+    os.environ.setdefault("STRANDS_ALLOW_MOCK", "true")
     twin = ArmTwin("so101")
     with tempfile.TemporaryDirectory() as folder, FeetechBus(arm_servos(), plant=twin) as bus:
         print(f"Six servos answer on {bus.port}.")

@@ -20,6 +20,9 @@ for setting in settings.declared():
     if setting.name not in {"DISPLAY", "MUJOCO_GL"}:
         os.environ.pop(setting.name, None)
 
+# What moves in the tests is no metal.
+os.environ["STRANDS_ALLOW_MOCK"] = "true"
+
 # An example takes as long as a busy machine lets it; the environments of real arms and DDS Security have no examples.
 if find_spec("hypothesis"):
     import hypothesis

@@ -46,7 +46,8 @@ class RolloutEvent:
     """An event of a rollout, given to observers from the control thread.
 
     ``kind`` is started, step or finished; ``state`` of a finished one is completed, stopped or error.
-    ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units.
+    ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units. ``follows_instruction``
+    is False for a policy that moves by itself, whatever it was told, as ``mock`` does.
     """
 
     kind: Literal["started", "step", "finished"]
@@ -59,6 +60,7 @@ class RolloutEvent:
     error: str = ""
     observation: Mapping[str, float] = field(default_factory=dict)
     action: Mapping[str, float] = field(default_factory=dict)
+    follows_instruction: bool = True
 
 
 Observer = Callable[[RolloutEvent], None]

@@ -100,6 +100,9 @@ _declare(
     Setting("ROS_SECURITY_STRATEGY", "text", "", "ROS 2's own rule for a node without keys: Enforce refuses it."),
     Setting("ROS_SECURITY_KEYSTORE", "path", "", "ROS 2's own folder of keys and permissions."),
     Setting("CYCLONEDDS_URI", "text", "", "Configuration of Cyclone DDS; the library reads it."),
+    Setting(
+        "STRANDS_ALLOW_MOCK", "boolean", "false", "Let the policy mock, which follows no instruction, move hardware."
+    ),
     Setting("BYPASS_TOOL_CONSENT", "boolean", "false", "Approve every motion verb on real hardware."),
     Setting("STRANDS_DC_PORT", "integer", "7447", "Loopback port where local robots meet.", 1, 65535),
     Setting("STRANDS_DC_STATE_HZ", "number", "1", "stateUpdate events a second while idle.", 0.01, 100),

@@ -298,3 +298,32 @@ def test_policy_that_raises_system_exit_ends_in_error_and_the_body_holds() -> No
     one, body = run(ScriptedPolicy([{"a": 0.1}, SystemExit("a library gave up")]))
     assert (one.state, body.holds) == ("error", 1)
     assert "SystemExit" in one.error
+
+
+class Unready(ScriptedPolicy):
+    """Cannot be made ready, or only when it is interrupted."""
+
+    def __init__(self, problem: Exception | None = None) -> None:
+        super().__init__([], always={"a": 1.0})
+        self._problem = problem
+
+    def reset(self, instruction: str, ranges: Any) -> None:
+        if self._problem is not None:
+            raise self._problem
+        assert self.interrupted.wait(20)
+
+
+def test_a_policy_that_is_not_ready_in_time_is_given_up_and_nothing_starts() -> None:
+    body = RecordingBody()
+    slow = rollout(body, Unready(), policy_name="slow")
+    slow.start()
+    assert "the policy slow was not ready in 0.05 s" in slow.not_begun(0.05)
+    assert slow.join(20)
+    assert body.writes == []
+
+
+def test_a_policy_that_fails_at_once_is_told_with_its_reason() -> None:
+    bare = rollout(RecordingBody(), Unready(OSError("no weights")), policy_name="bare")
+    bare.start()
+    assert "the policy bare failed: OSError: no weights" in bare.not_begun(20)
+    assert bare.join(20)

@@ -74,6 +74,9 @@ def serve(
     command_allow: Annotated[
         str | None, _allow("--command-allow", "Verbs approved on real hardware: verb or verb@peer.")
     ] = None,
+    allow_mock: Annotated[
+        bool, typer.Option("--allow-mock", help="Let the policy mock, which follows no instruction, move hardware.")
+    ] = False,
     state_hz: Annotated[float | None, typer.Option("--state-hz", help="stateUpdate events a second, idle.")] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Also record joints, pictures and events: a new .mcap file.")
@@ -90,6 +93,7 @@ def serve(
         "DEVICE_CONNECT_ESTOP_ALLOW": estop_allow,
         "STRANDS_MESH_POLICY_TYPE_ALLOW": policy_allow,
         "STRANDS_ROBOT_COMMAND_ALLOW": command_allow,
+        "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
     }
     for name, value in flags.items():

@@ -65,12 +65,13 @@ class RobotDeviceDriver(RobotDriver):
         self._provider = arguments.get("policy_provider", self._provider)
 
     @emit()
-    async def taskStarted(self, instruction: str, policy_provider: str) -> None:
+    async def taskStarted(self, instruction: str, policy_provider: str, follows_instruction: bool = True) -> None:
         """A task began.
 
         Args:
             instruction: What the robot was told
             policy_provider: Policy that decides the actions
+            follows_instruction: False for a policy that moves by itself, as mock does
         """
 
     @emit()
@@ -139,7 +140,11 @@ class RobotDeviceDriver(RobotDriver):
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit ``taskStarted``, ``streamStep`` or ``taskComplete``."""
         if event.kind == "started":
-            await self.taskStarted(instruction=event.instruction, policy_provider=event.policy)
+            await self.taskStarted(
+                instruction=event.instruction,
+                policy_provider=event.policy,
+                follows_instruction=event.follows_instruction,
+            )
         elif event.kind == "step":
             await self.streamStep(step=event.step, observation=numbers(event.observation), action=numbers(event.action))
         else:

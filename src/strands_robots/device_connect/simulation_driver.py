@@ -64,13 +64,16 @@ class SimulationDeviceDriver(RobotDriver):
         return world_stop_answer(verdict)
 
     @emit()
-    async def policyStarted(self, robot_name: str, instruction: str, policy_provider: str) -> None:
+    async def policyStarted(
+        self, robot_name: str, instruction: str, policy_provider: str, follows_instruction: bool = True
+    ) -> None:
         """A policy began.
 
         Args:
             robot_name: The simulated robot
             instruction: What it was told
             policy_provider: Policy that decides the actions
+            follows_instruction: False for a policy that moves by itself, as mock does
         """
 
     @emit()
@@ -176,7 +179,10 @@ class SimulationDeviceDriver(RobotDriver):
         """Emit ``policyStarted``, ``streamStep`` or ``policyComplete``."""
         if event.kind == "started":
             await self.policyStarted(
-                robot_name=event.robot, instruction=event.instruction, policy_provider=event.policy
+                robot_name=event.robot,
+                instruction=event.instruction,
+                policy_provider=event.policy,
+                follows_instruction=event.follows_instruction,
             )
         elif event.kind == "step":
             await self.streamStep(

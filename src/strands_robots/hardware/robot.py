@@ -21,7 +21,7 @@ from strands_robots.hardware.device_facts import has_temperatures, joint_units, 
 from strands_robots.hardware.settling import Settling, checked_rest_pose
 from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action
-from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options
+from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options, unfollowed
 from strands_robots.recording.cameras import LazyFrames
 from strands_robots.safety.gate import (
     REFUSALS,
@@ -70,6 +70,9 @@ class HardwareRobot(TeleopMixin):
     Raises:
         ValidationError: an argument outside its domain, or a device that lacks a part of the interface.
     """
+
+    runs_policies = True
+    """Its ``policy_provider`` is one of :mod:`strands_robots.policies`, on real hardware."""
 
     def __init__(
         self,
@@ -250,9 +253,13 @@ class HardwareRobot(TeleopMixin):
             task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
         except REFUSALS as refused:
             return refusal_envelope("start_task", refused)
+        problem = task.not_begun()
+        if problem:
+            return error(f"start_task: {problem}.", **self._task_fields())
         return success(
-            f"{self.tool_name_str} started: {task.instruction}",
+            f"{self.tool_name_str} started: {task.instruction}.{unfollowed(task)}",
             task_status="running",
+            follows_instruction=task.follows_instruction,
             instruction=task.instruction,
             policy=task.policy_name,
             duration=task.duration,

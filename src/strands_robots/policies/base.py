@@ -24,7 +24,8 @@ class PolicyError(StrandsRobotsError, RuntimeError):
 class Policy(Protocol):
     """Source of a robot's actions; one object serves one rollout, on its thread.
 
-    ``uses_cameras`` is False for a policy that looks at numbers alone: it then works while a camera fails.
+    ``uses_cameras`` is False for a policy that looks at numbers alone: it then works while a camera fails. A policy
+    that does not do what the instruction says has ``follows_instruction = False`` besides.
     """
 
     uses_cameras: bool
@@ -44,6 +45,11 @@ class Policy(Protocol):
 
     def close(self) -> None:
         """Free the policy's resources. Called once, also after a failed reset."""
+
+
+def follows_instruction(policy: Policy) -> bool:
+    """Return False for a policy that moves by itself, whatever it was told."""
+    return getattr(policy, "follows_instruction", True) is not False
 
 
 def checked_action(action: object, ranges: Ranges) -> Action:

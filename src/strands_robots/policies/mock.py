@@ -30,6 +30,7 @@ class MockPolicy:
     """
 
     uses_cameras = False
+    follows_instruction = False
 
     def __init__(self, seed: int = 0, amplitude: float = 0.5, hz: float = 50.0, fade_s: float = 2.0) -> None:
         self._seed = whole("seed", seed)

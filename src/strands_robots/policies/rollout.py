@@ -17,7 +17,15 @@ from typing import Any, Literal, Protocol, TypedDict
 
 from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.policies.base import Action, Policy, PolicyError, Ranges, checked_action, numbers
+from strands_robots.policies.base import (
+    Action,
+    Policy,
+    PolicyError,
+    Ranges,
+    checked_action,
+    follows_instruction,
+    numbers,
+)
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
@@ -28,6 +36,9 @@ State = Literal["idle", "running", "completed", "stopped", "error"]
 
 STEPS_MAX = 10_000_000
 """Most actions of one rollout."""
+
+START_S = 2.0
+"""Seconds in which a policy has to be ready for its first step."""
 
 STOP_JOIN_S = 2.0
 """Seconds that a stop of one robot waits for its loop."""
@@ -144,6 +155,11 @@ class RolloutObservers:
                     logger.exception("An observer of %s raised; it stays subscribed.", event.robot)
 
 
+def unfollowed(rollout: Rollout) -> str:
+    """Return the sentence for the answer of a policy that follows no instruction."""
+    return "" if rollout.follows_instruction else f" The policy {rollout.policy_name} does not follow the instruction."
+
+
 class Rollout:
     """One run of one policy on one body, on its own thread. A rollout is used once.
 
@@ -192,7 +208,9 @@ class Rollout:
         self._clock = clock or Clock()
         self._ends_at_rest = ends_at_rest
         self._stop_requested = threading.Event()
-        self._loading = True
+        self._begun = threading.Event()
+        self.follows_instruction = follows_instruction(policy)
+        """False for a policy that moves by itself, whatever it was told."""
         self._started_at: float | None = None
         self._ended_at: float | None = None
         self._thread = threading.Thread(target=self.run, name=f"rollout-{body.name}", daemon=True)
@@ -226,6 +244,18 @@ class Rollout:
             "elapsed_s": round(self.elapsed_s, 3),
         }
 
+    def not_begun(self, within: float = START_S) -> str:
+        """Wait for the first step; return why there is none ``within`` seconds, if so.
+
+        A rollout whose policy is not ready by then is void: nothing starts after the reason was given.
+        """
+        if not self._begun.wait(within):
+            self.request_stop()
+            return f"the policy {self.policy_name} was not ready in {within:g} s, and was given up"
+        if self.state == "error":
+            return f"the policy {self.policy_name} failed: {self.error}"
+        return "it was stopped before its first step" if self.state == "stopped" and not self.step_count else ""
+
     def join(self, timeout: float | None = None) -> bool:
         """Wait for the end and return True when the loop has ended."""
         if self._thread.ident is not None and threading.current_thread() is not self._thread:
@@ -247,7 +277,7 @@ class Rollout:
         The caller has frozen the body, so a loop that outlives this sends no action any more. It counts as stopped
         while its policy is still loading, for it never moved the robot, and while the robot is locked.
         """
-        still = self._loading or self._permit.locked
+        still = not self._begun.is_set() or self._permit.locked
         patience = deadline - time.monotonic()
         if self.join(max(0.0, min(patience, STILL_JOIN_S) if still else patience)):
             return success("Stopped.", stopped=True)
@@ -264,11 +294,13 @@ class Rollout:
         state: State = "stopped"
         try:
             with self._body.running():
-                self._notify("started")
                 try:
                     bounds = dict(self._body.bounds)
-                    self._policy.reset(self.instruction, bounds)
-                    self._loading = False
+                    try:
+                        self._policy.reset(self.instruction, bounds)
+                        self._begun.set()
+                    finally:
+                        self._notify("started")
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"
@@ -339,6 +371,7 @@ class Rollout:
             logger.exception("The policy %s of %s raised when closed.", self.policy_name, self.robot)
         self._ended_at = self._clock.now()
         self.state = state
+        self._begun.set()
         self._notify("finished", state=state, error=self.error)
 
     def _notify(self, kind: Literal["started", "step", "finished"], **more: Any) -> None:
@@ -350,6 +383,7 @@ class Rollout:
                 policy=self.policy_name,
                 step=self.step_count,
                 elapsed_s=self.elapsed_s,
+                follows_instruction=self.follows_instruction,
                 **more,
             )
         )

@@ -21,6 +21,7 @@ from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
+from strands_robots.serving.policy_arguments import MOCK, mock_refusal
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.utils import ValidationError
@@ -194,7 +195,7 @@ class Pipeline:
             self.authorize(command, arguments)
             with self.pending.serving(command.asked):
                 if verb.kind is Kind.MOTION:
-                    claim = self._claim(verb)
+                    claim = self._claim(verb, arguments)
                 if verb.name in self.own:
                     result = self.own[verb.name](arguments)
                 elif self.robot is None:
@@ -245,8 +246,8 @@ class Pipeline:
         except ValidationError as exc:
             raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None
 
-    def _claim(self, verb: Verb) -> Claim:
-        """Check the lockout and, for hardware, claim the operator's approval."""
+    def _claim(self, verb: Verb, arguments: Arguments) -> Claim:
+        """Check the lockout and, for hardware, the policy and the operator's approval."""
         if self.robot is not None and not verb.while_locked:
             locked = self.robot.gate.lockout(verb.name)
             if locked is not None:
@@ -261,6 +262,10 @@ class Pipeline:
                 raise MotionRefused(late)
         if not self.hardware:
             return Claim()
+        if arguments.get("policy_provider") == MOCK and getattr(self.robot, "runs_policies", False):
+            refusal = mock_refusal()
+            if refusal is not None:
+                raise Refused(RefusalReason.APPROVAL, f"{verb.name} is refused: {refusal}", reason="mock on hardware")
         claim = self.approval.claim(verb.name, self.peer_id())
         if claim is None:
             text = Approval.refusal(verb.name, self.peer_id())

@@ -18,7 +18,8 @@ POLICY_TYPE_NOT_ALLOWED = "POLICY_TYPE_NOT_ALLOWED"
 
 BUILT_IN_ORGS = frozenset({"nvidia", "huggingface", "lerobot"})
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
-PROVIDERS = frozenset({"mock", "remote", "lerobot_local", "lerobot"})
+MOCK = "mock"
+PROVIDERS = frozenset({MOCK, "remote", "lerobot_local", "lerobot"})
 FOREIGN_PROVIDERS = frozenset(
     {"act", "cosmos", "cosmos3", "diffusion", "dreamgen", "dreamzero", "gr00t", "groot", "lerobot_async", "openpi"}
     | {"openvla", "pi0", "pi05", "pi0_fast", "pi0fast", "rdt", "sac", "smolvla", "sonic", "tdmpc", "vqbet", "wbc"}
@@ -29,6 +30,16 @@ An operator adds a name to the table by ``STRANDS_MESH_POLICY_TYPE_ALLOW``, a pl
 """
 
 _REPO = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,95})/([A-Za-z0-9][A-Za-z0-9._-]{0,95})\Z")
+
+
+def mock_refusal() -> str | None:
+    """Return why the policy ``mock`` may not move real hardware, or None."""
+    if settings.boolean("STRANDS_ALLOW_MOCK"):
+        return None
+    return (
+        "the policy mock plays slow waves and follows no instruction. Name a trained one as policy_provider; to let "
+        "mock move real hardware, serve the robot with --allow-mock (STRANDS_ALLOW_MOCK=true)."
+    )
 
 
 @lru_cache(maxsize=1)

@@ -196,6 +196,7 @@ def _status(robot: Robot, arguments: Arguments) -> Envelope:
         task_status="running" if running else "idle",
         robots=robot.list_robots(),
         policies=running,
+        **({"failed_policies": robot.failed_policies()} if hasattr(robot, "failed_policies") else {}),
     )
 
 

@@ -139,7 +139,7 @@ INSTRUCTION = Parameter("instruction", str, "What to do, in plain language, 1 to
 POLICY_PROVIDER = Parameter(
     "policy_provider",
     str,
-    "Policy that decides the actions, such as mock, remote or lerobot_local",
+    "Policy that decides the actions, such as remote or lerobot_local; mock moves by itself and follows no instruction",
     identifier,
     default="mock",
 )

@@ -18,7 +18,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm import Arm
 from strands_robots.kinematics.motion import Motion
 from strands_robots.policies import create_policy
-from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options
+from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options, unfollowed
 from strands_robots.safety.gate import MotionGate, Waiting, answered
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.simulation import projection
@@ -261,7 +261,7 @@ class Simulation(ArmMixin, TeleopMixin):
         """Return the state of physics and of every robot.
 
         ``sim_time`` (s), ``step_count``, ``robots`` (name to joints in radians), ``running_policies`` (rows by robot),
-        ``real_time_factor`` and ``diverged``.
+        ``failed_policies`` (reason by robot, until its next policy), ``real_time_factor`` and ``diverged``.
         """
         snapshot = self.physics.snapshot
         robots = {name: snapshot.observation(parts) for name, parts in snapshot.stage.robots.items()}
@@ -271,6 +271,7 @@ class Simulation(ArmMixin, TeleopMixin):
             step_count=snapshot.steps,
             robots=robots,
             running_policies={row["robot"]: row for row in self.list_policies_running()},
+            failed_policies=self.failed_policies(),
             real_time_factor=round(self._clock.real_time_factor, 4),
             diverged=self.physics.diverged,
         )
@@ -359,11 +360,15 @@ class Simulation(ArmMixin, TeleopMixin):
                 rate) and ``n_steps`` (actions after which it ends).
         """
         rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
+        problem = rollout.not_begun()
+        if problem:
+            return error(f"start_policy: {problem}.", **_row(rollout))
         return success(
-            f"{rollout.robot} started: {rollout.instruction}",
+            f"{rollout.robot} started: {rollout.instruction}.{unfollowed(rollout)}",
             robot=rollout.robot,
             instruction=rollout.instruction,
             policy_provider=rollout.policy_name,
+            follows_instruction=rollout.follows_instruction,
             duration=rollout.duration,
         )
 
@@ -411,6 +416,10 @@ class Simulation(ArmMixin, TeleopMixin):
     def list_policies_running(self) -> list[dict[str, Any]]:
         """Return one row for each running rollout, as :meth:`Rollout.row`."""
         return [rollout.row() for rollout in self._running().values()]
+
+    def failed_policies(self) -> dict[str, str]:
+        """Return why the last policy of a robot failed, by robot, until its next one."""
+        return {name: rollout.error for name, rollout in list(self._rollouts.items()) if rollout.state == "error"}
 
     def occupied(self, robot: str) -> str:
         """Name the rollout that drives this robot, for a refusal; empty without one."""

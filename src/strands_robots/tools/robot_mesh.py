@@ -40,7 +40,8 @@ def robot_mesh(
             release_torque stops one and switches its motors off, so that it falls, once its operator approved that.
         target: The robot's id, as peers lists it. Needed by tell, status and release_torque.
         instruction: What to do, in plain language, 1 to 2000 characters. For emergency_stop: the reason.
-        policy_provider: Policy that decides the actions, such as mock, remote or lerobot_local.
+        policy_provider: Policy that decides the actions, such as remote or lerobot_local; mock moves by itself and
+            follows no instruction.
         duration: Longest time the motion may take, in seconds, above 0 and at most 3600.
     """
     try:
