@@ -22,6 +22,7 @@ from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.resume import sign
+from strands_robots.safety.state_files import boot, uptime
 
 Add = Callable[..., RecordingRobot]
 
@@ -160,7 +161,9 @@ def test_order_from_another_time_is_void_and_not_reported_as_cleared(
     def order_an_hour_ago(who: str, names: list[str]) -> list[Path]:
         clearance.clearances().mkdir(mode=0o700, parents=True)
         order = clearance.clearances() / "a.draft"
-        order.write_text(json.dumps({"who": who, "robot_id": names[0], "t": time.time() - 3600}), encoding="utf-8")
+        order.write_text(
+            json.dumps({"who": who, "robot_id": names[0], "boot": boot(), "t": uptime() - 3600}), encoding="utf-8"
+        )
         return [order.replace(order.with_suffix(".json"))]
 
     monkeypatch.setattr(clearance, "order_clearance", order_an_hour_ago)

@@ -22,7 +22,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.audit.head import log_id
 from strands_robots.audit.journal import NAME, AuditEntry, Journal
-from strands_robots.audit.verification import verify
+from strands_robots.audit.lasting import LastingRecords, identity, lasting_journal, rotated_out, verify_both
 from strands_robots.safety.approval import state_dir
 from strands_robots.utils import shown
 
@@ -63,7 +63,9 @@ def flush_audit(timeout: float = FLUSH_S) -> bool:
 def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
     """Return every record, oldest first; with ``since`` (wall-clock s) newer ones."""
     flush_audit(FLUSH_S)
-    records = _journal(_journal_key()).records()
+    main, kept = _journals(_journal_key())
+    newer = list(main.records())
+    records = [*rotated_out(kept.records(), newer), *newer]
     return [each for each in records if since is None or _time(each) >= since]
 
 
@@ -72,10 +74,11 @@ def verify_audit_integrity() -> dict[str, Any]:
 
     Counts ``total``, ``signed``, ``verified``, ``bad``, ``missing``, ``gaps``, ``torn``, ``broken``, ``tampered``,
     the list ``breaks`` that says where, ``head``, and ``ok``; see :func:`strands_robots.audit.verification.verify`.
+    ``kept`` are the records that are never rotated out.
     """
     flush_audit(FLUSH_S)
     key = _journal_key()
-    return verify(_journal(key), keyed=key[1] is not None)
+    return verify_both(*_journals(key), keyed=key[1] is not None)
 
 
 _Key = tuple[Path, bytes | None]
@@ -86,10 +89,12 @@ def _journal_key() -> _Key:
     return audit_directory(), secret.encode() if secret else None
 
 
-def _journal(key: _Key) -> Journal:
+def _journals(key: _Key) -> tuple[Journal, Journal]:
+    """Return the log, and the one of the records that are never rotated out."""
     directory, secret = key
     # The anchor is not beside the log, so that a copy of the log and its head does not bring it along.
-    return Journal(directory, secret, anchor=state_dir() / "anchors" / log_id(directory / NAME))
+    anchor = state_dir() / "anchors" / log_id(directory / NAME)
+    return Journal(directory, secret, anchor=anchor), lasting_journal(directory, secret, anchor)
 
 
 def _text(value: object) -> str:
@@ -106,7 +111,8 @@ class _Pending:
 
     def __init__(self, key: _Key) -> None:
         self.directory = key[0]
-        self.journal = _journal(key)
+        self.journal, kept = _journals(key)
+        self._lasting = LastingRecords(kept)
         self.entries: deque[AuditEntry] = deque()
         self.waiting: list[threading.Event] = []
         self.failing = False
@@ -118,6 +124,7 @@ class _Pending:
         batch = list(self.entries)
         try:
             if batch:
+                self._lasting.write(batch)
                 self.journal.append(batch)
         except Exception as exc:  # noqa: BLE001 - whatever stops the record is reported, and the record is kept
             self._complain(exc)
@@ -144,11 +151,13 @@ class _Pending:
         lost = len(self.entries) - PENDING_MAX
         if lost <= 0:
             return
-        counted = 1
-        for _ in range(lost + 1):
-            gone = self.entries.popleft()
-            counted += gone.payload["lost"] - 1 if gone.event == LOST else 0
-        self.entries.appendleft(AuditEntry(time.time(), LOST, "audit", {"lost": lost + counted}))
+        # One more makes room for the record that says so. Noise goes first, the oldest of it.
+        by_worth = sorted(self.entries, key=lambda each: identity(each.event, each.peer_id, each.payload) is not None)
+        gone = by_worth[: lost + 1]
+        away = {id(each) for each in gone}
+        counted = sum(each.payload["lost"] if each.event == LOST else 1 for each in gone)
+        self.entries = deque(each for each in self.entries if id(each) not in away)
+        self.entries.appendleft(AuditEntry(time.time(), LOST, "audit", {"lost": counted}))
         self._reported = min(self._reported, len(self.entries))
 
 

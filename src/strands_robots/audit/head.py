@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots.safety.ed25519 import canonical
+from strands_robots.safety.state_files import make_private
 
 GENESIS = "0" * 64
 BREAKS_KEPT = 20
@@ -153,7 +154,7 @@ def read_anchor(path: Path, seal: Seal, log: str) -> Anchor | None:
 
 def write_anchor(path: Path, seal: Seal, anchor: Anchor) -> None:
     """Write the anchor in place, within one sector, and wait for the disk."""
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    make_private(path.parent)
     data = canonical(seal.sign(asdict(anchor)))
     with opened(path, os.O_WRONLY | os.O_CREAT) as descriptor:
         fresh = os.fstat(descriptor).st_size == 0

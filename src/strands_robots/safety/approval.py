@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import secrets
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from strands_robots import settings
+from strands_robots.safety.state_files import boot, make_private, read_private, require_private, uptime
 from strands_robots.utils import identifier, number
+
+logger = logging.getLogger(__name__)
 
 GRANT_S = 300.0
 """Seconds for which a grant is good when the operator states nothing else."""
@@ -64,11 +67,13 @@ class Grants:
 
     Args:
         folder: made on the first grant, readable by its owner alone.
-        clock: wall-clock seconds; a grant outlives the process that issued it.
+        clock: seconds since boot, which cannot be set; a grant outlives the process that issued it, and no restart
+            of the machine.
     """
 
-    def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, folder: Path, clock: Callable[[], float] = uptime) -> None:
         self.folder = folder
+        self._root = folder.parent
         self._clock = clock
 
     def grant(self, verb: str, peer: str, seconds: float = GRANT_S) -> Path:
@@ -76,16 +81,16 @@ class Grants:
 
         Raises:
             ValidationError: ``verb`` or ``peer`` is no identifier, or ``seconds`` is not above 0 and at most a day.
+            StateFileError: the folder is not this user's alone.
         """
         name = f"{identifier('verb', verb)}@{identifier('peer', peer)}"
         lasts = number("seconds", seconds, above=0, high=GRANT_MAX_S)
-        # The audit, which others must not read, is kept beside this folder; a mode does not reach parents by itself.
-        self.folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self.folder.mkdir(mode=0o700, exist_ok=True)
+        make_private(self.folder)
+        require_private(self.folder, self._root)
         path = self.folder / f"{name}+{secrets.token_hex(8)}"
         writing = path.with_name(f".{path.name}")
         with os.fdopen(os.open(writing, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            json.dump({"verb": verb, "peer": peer, "expires": self._clock() + lasts}, file)
+            json.dump({"verb": verb, "peer": peer, "boot": boot(), "until": self._clock() + lasts}, file)
         writing.rename(path)
         return path
 
@@ -106,13 +111,14 @@ class Grants:
 
     def _good(self, path: Path, verb: str, peer: str) -> bool:
         try:
-            grant = json.loads(path.read_text(encoding="utf-8"))
-            expires = number("expires", grant["expires"])
-        except (OSError, ValueError, KeyError, TypeError):
+            grant = json.loads(read_private(path, self._root))
+            until = number("until", grant["until"])
+        except (OSError, ValueError, KeyError, TypeError) as exc:
+            logger.warning("The grant %s is void: %s", path.name.removesuffix(_CLAIMED), exc)
             return False
+        named = (grant.get("verb"), grant.get("peer"), grant.get("boot")) == (verb, peer, boot())
         now = self._clock()
-        # A clock set back must not stretch a grant beyond the longest that can be issued.
-        return grant.get("verb") == verb and grant.get("peer") == peer and now < expires <= now + GRANT_MAX_S
+        return named and now < until <= now + GRANT_MAX_S
 
 
 class Approval:

@@ -22,6 +22,14 @@ from strands_robots.audit import flush_audit, log_safety_event
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import LockoutState
 from strands_robots.safety.persistence import LockoutStore
+from strands_robots.safety.state_files import (
+    StateFileError,
+    boot,
+    make_private,
+    read_private,
+    require_private,
+    uptime,
+)
 from strands_robots.utils import identifier, text
 
 logger = logging.getLogger(__name__)
@@ -50,8 +58,9 @@ def order_clearance(who: str, robot_ids: Iterable[str]) -> list[Path]:
     text("who", who, longest=200)
     names = [identifier("robot_id", each) for each in robot_ids]
     directory = clearances()
-    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    return [_write_order(directory, {"who": who, "robot_id": name, "t": time.time()}) for name in names]
+    make_private(directory)
+    asked = {"who": who, "boot": boot(), "t": uptime()}
+    return [_write_order(directory, {**asked, "robot_id": name}) for name in names]
 
 
 def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[str, str]:
@@ -156,7 +165,7 @@ class ClearanceInbox:
                 taken = path.replace(_taken(path))
             except FileNotFoundError:
                 continue  # another process took it
-            valid = -5.0 < time.time() - order["t"] < VALID_S
+            valid = order["boot"] == boot() and 0 <= uptime() - order["t"] < VALID_S
             answer = self._clear(order["who"], order["robot_id"]) if valid else VOID
             with contextlib.suppress(FileNotFoundError):  # no caller waits for it any more
                 with taken.open("r+", encoding="utf-8") as file:
@@ -168,16 +177,18 @@ class ClearanceInbox:
 def _orders() -> Iterator[tuple[Path, dict[str, Any]]]:
     directory = clearances()
     with contextlib.suppress(FileNotFoundError):  # there was no order yet
-        status = directory.lstat()
-        if status.st_uid != os.getuid() or status.st_mode & 0o022:
-            logger.error("%s may be written by others; no clearance is taken from it.", directory)
+        directory.lstat()
+        try:
+            require_private(directory, state_dir())
+        except StateFileError as exc:
+            logger.critical("No clearance is taken: %s", exc)
             return
         _sweep(directory)
         for path in sorted(directory.glob("*.json")):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # taken by another, or no order
-                if not path.is_symlink():
-                    order = json.loads(path.read_text())
-                    yield path, {"who": str(order["who"]), "robot_id": str(order["robot_id"]), "t": float(order["t"])}
+                order = json.loads(read_private(path, state_dir()))
+                names = {name: str(order[name]) for name in ("who", "robot_id", "boot")}
+                yield path, {**names, "t": float(order["t"])}
 
 
 def _sweep(directory: Path) -> None:

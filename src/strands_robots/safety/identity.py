@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import secrets
-import stat
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from typing import Any
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.state_files import OPEN, StateFileError, make_private, read_private, require_private
 from strands_robots.utils import identifier
 
 ROBOTS = "robots"
@@ -32,7 +32,7 @@ FILE_MAX_BYTES = 2**20
 SEED_BYTES = 32
 
 
-class KeyFileError(StrandsRobotsError, ValueError):
+class KeyFileError(StateFileError):
     """A key file that cannot be trusted; the message names it and says why."""
 
 
@@ -85,7 +85,8 @@ class KeyFile:
 
     def __init__(self, folder: str, name: str, directory: Path | None = None) -> None:
         self.name = identifier("name", name)
-        self.path = (directory or state_dir()) / "keys" / identifier("folder", folder) / f"{name}.key"
+        self._root = directory or state_dir()
+        self.path = self._root / "keys" / identifier("folder", folder) / f"{name}.key"
 
     def load(self) -> SigningIdentity | None:
         """Return the identity, or None while there is no key.
@@ -95,7 +96,7 @@ class KeyFile:
             OSError: it cannot be read.
         """
         try:
-            content = _read_private(self.path)
+            content = _read_private(self.path, self._root)
         except FileNotFoundError:
             return None
         seed = ed25519.decode(content.decode("ascii", "replace").strip(), SEED_BYTES)
@@ -115,7 +116,7 @@ class KeyFile:
         """
         known = self.load()
         if known is None:
-            _make_folder(self.path.parent)
+            _make_folder(self.path.parent, self._root)
             _write_once(self.path, ed25519.encode(secrets.token_bytes(SEED_BYTES)).encode() + b"\n")
             known = self.load()
         if known is None:
@@ -131,7 +132,8 @@ class EnrolledKeys:
     """
 
     def __init__(self, directory: Path | None = None) -> None:
-        self.path = (directory or state_dir()) / "enrolled.json"
+        self._root = directory or state_dir()
+        self.path = self._root / "enrolled.json"
 
     def load(self) -> dict[str, bytes]:
         """Return the public keys by robot.
@@ -141,7 +143,7 @@ class EnrolledKeys:
             OSError: it cannot be read.
         """
         try:
-            content = _read_private(self.path)
+            content = _read_private(self.path, self._root)
         except FileNotFoundError:
             return {}
         try:
@@ -186,30 +188,14 @@ class EnrolledKeys:
         _draft(self.path, content).replace(self.path)
 
 
-def _read_private(path: Path) -> bytes:
+def _read_private(path: Path, root: Path) -> bytes:
     """Return the content of a file that is this user's alone."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
-    with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise KeyFileError(f"{path} is no plain file.")
-        _require_own(path, status, 0o077, "read or write it; run chmod 600 on it")
-        _require_own(path.parent, path.parent.stat(), 0o022, "write there; run chmod 700 on it")
-        return file.read(FILE_MAX_BYTES)
+    return read_private(path, root, forbidden=OPEN, longest=FILE_MAX_BYTES, error=KeyFileError)
 
 
-def _require_own(path: Path, status: os.stat_result, forbidden: int, problem: str) -> None:
-    if status.st_uid != os.getuid():
-        raise KeyFileError(f"{path} belongs to uid {status.st_uid} and not to you (uid {os.getuid()}).")
-    if stat.S_IMODE(status.st_mode) & forbidden:
-        raise KeyFileError(f"{path} has mode {stat.S_IMODE(status.st_mode):04o}: others may {problem}.")
-
-
-def _make_folder(folder: Path) -> None:
-    # A mode does not reach the parents that mkdir makes by itself.
-    for each in (*reversed(folder.parents[:2]), folder):
-        each.mkdir(mode=0o700, parents=True, exist_ok=True)
-    _require_own(folder, folder.stat(), 0o022, "write there; run chmod 700 on it")
+def _make_folder(folder: Path, root: Path) -> None:
+    make_private(folder)
+    require_private(folder, root, error=KeyFileError)
 
 
 def _draft(path: Path, content: bytes) -> Path:

@@ -24,14 +24,13 @@ from typing import Any
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.state_files import StateFileError, adopt, make_private, read_private, require_private
 
 logger = logging.getLogger(__name__)
 
 VERSION = 2
 VERSION_OF_ALL = 1
 """Version of ``lockouts.json``, in which earlier releases kept all robots of a machine."""
-
-FILE_MAX_BYTES = 16 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +63,14 @@ class LockoutStore:
         self._state = state
 
     @property
+    def root(self) -> Path:
+        """The state directory."""
+        return self._state or state_dir()
+
+    @property
     def directory(self) -> Path:
         """The directory of the files."""
-        return (self._state or state_dir()) / "lockouts"
+        return self.root / "lockouts"
 
     @property
     def file_of_all(self) -> Path:
@@ -81,6 +85,7 @@ class LockoutStore:
     def load(self, key: str) -> StoredLockout:
         """Return the record of ``key``: empty if absent, locked if unreadable.
 
+        A file of another user, or in a folder that others may write, locks as well: what it does not say counts least.
         A robot without a record is locked as well while a ``lockouts.json`` that could not be read lies there, or lies
         aside as ``lockouts.unreadable``.
         """
@@ -88,7 +93,9 @@ class LockoutStore:
             return self._found(key)
         except (OSError, ValueError) as exc:
             logger.critical("The lockout file of %s cannot be read (%s): it comes up locked.", key, exc)
-            unreadable = Lockout(OVERFLOW, "this machine", "the lockout file is unreadable", time.time())
+            foreign = isinstance(exc, StateFileError)
+            why = "the lockout file is not this user's alone" if foreign else "the lockout file is unreadable"
+            unreadable = Lockout(OVERFLOW, "this machine", why, time.time())
             return StoredLockout(LockoutState(overflow=unreadable))
 
     def load_all(self) -> dict[str, StoredLockout]:
@@ -99,7 +106,7 @@ class LockoutStore:
         """
         found = {key: _kept(record) for key, record in self._of_all().items()}
         for path in self._files():
-            record = _read(path, VERSION)
+            record = self._read(path, VERSION)
             if record is not None:
                 found[str(record.get("key", path.name))] = _kept(record)
         return found
@@ -112,8 +119,8 @@ class LockoutStore:
         """
         directory = self.directory
         if not directory.exists():
-            directory.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            directory.mkdir(mode=0o700, exist_ok=True)
+            adopt(self.root)
+            make_private(directory)
             _sync(directory.parent)
         self._put_aside()
         with ExitStack() as files:
@@ -127,8 +134,11 @@ class LockoutStore:
         _sync(directory)
 
     def _found(self, key: str) -> StoredLockout:
+        adopt(self.root)
+        # A folder that others may write says nothing by what is not in it.
+        require_private(self.directory, self.root)
         path = self.file(key)
-        record = _read(path, VERSION)
+        record = self._read(path, VERSION)
         if record is not None:
             if record.get("key") != key:
                 raise ValueError(f"{path.name} is of another robot")
@@ -159,7 +169,7 @@ class LockoutStore:
             return []
 
     def _of_all(self) -> dict[str, Any]:
-        data = _read(self.file_of_all, VERSION_OF_ALL)
+        data = self._read(self.file_of_all, VERSION_OF_ALL)
         if data is None:
             return {}
         robots = data.get("robots")
@@ -167,22 +177,19 @@ class LockoutStore:
             raise ValueError(f"{self.file_of_all.name} is no record of lockouts")
         return robots
 
+    def _read(self, path: Path, version: int) -> dict[str, Any] | None:
+        """Return what a file of lockouts holds, None where there is no file.
 
-def _read(path: Path, version: int) -> dict[str, Any] | None:
-    """Return what a file of lockouts holds, None where there is no file.
-
-    Raises:
-        OSError, ValueError: it cannot be read, or is none of this version.
-    """
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return None
-    with os.fdopen(descriptor, "rb") as file:
-        data = json.loads(file.read(FILE_MAX_BYTES))
-    if not isinstance(data, dict) or data.get("v") != version:
-        raise ValueError(f"{path.name} is no record of lockouts")
-    return data
+        Raises:
+            OSError, ValueError: it cannot be read, is not this user's alone, or is none of this version.
+        """
+        try:
+            data = json.loads(read_private(path, self.root))
+        except FileNotFoundError:
+            return None
+        if not isinstance(data, dict) or data.get("v") != version:
+            raise ValueError(f"{path.name} is no record of lockouts")
+        return data
 
 
 def _record(kept: StoredLockout) -> dict[str, Any]:

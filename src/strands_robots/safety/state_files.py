@@ -1,0 +1,109 @@
+"""Owner, mode and age of the state files: lockouts, grants, clearances, keys.
+
+A file counts only when it and every folder up to the state directory belong to this user and nobody else may write
+them. What a program does with a file that does not count is its own: a robot comes up locked, a grant is void. Ages are
+taken from the clock since boot, which nobody can set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import stat
+import time
+from pathlib import Path
+
+from strands_robots.errors import StrandsRobotsError
+
+logger = logging.getLogger(__name__)
+
+FILE_MAX_BYTES = 16 * 2**20
+WRITABLE = 0o022
+OPEN = 0o077
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+class StateFileError(StrandsRobotsError, ValueError):
+    """A state file that does not count; the message names it and says why."""
+
+
+def make_private(folder: Path) -> None:
+    """Make ``folder`` and the parents that are missing, for this user alone."""
+    # A mode does not reach the parents that mkdir makes by itself.
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    for each in reversed(missing):
+        each.mkdir(mode=0o700, exist_ok=True)
+
+
+def adopt(root: Path) -> None:
+    """Close an empty state directory that this user made by hand and left open."""
+    with contextlib.suppress(OSError):  # it is not there yet, or not this user's
+        status = root.lstat()
+        theirs = status.st_uid != os.getuid() or status.st_mode & stat.S_ISVTX
+        if stat.S_ISDIR(status.st_mode) and status.st_mode & WRITABLE and not theirs and not any(root.iterdir()):
+            root.chmod(0o700)
+            logger.warning("%s was open to other users; it is this user's alone now.", root)
+
+
+def read_private(
+    path: Path,
+    root: Path,
+    *,
+    forbidden: int = WRITABLE,
+    longest: int = FILE_MAX_BYTES,
+    error: type[StateFileError] = StateFileError,
+) -> bytes:
+    """Return the content of a file of this user in the state directory ``root``.
+
+    Args:
+        forbidden: mode bits that the file must not have: :data:`WRITABLE`, or :data:`OPEN` for a secret.
+        error: what is raised.
+
+    Raises:
+        StateFileError: the file or a folder around it belongs to another user or is open to others.
+        OSError: it is not there, is a link, or cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise error(f"{path} is no plain file.")
+        _require_own(path, status, forbidden, "read or write it; run chmod 600 on it", error)
+        require_private(path.parent, root, error=error)
+        return file.read(longest)
+
+
+def require_private(folder: Path, root: Path, *, error: type[StateFileError] = StateFileError) -> None:
+    """Check ``folder`` and those around it up to ``root``.
+
+    What is missing is made privately later.
+
+    Raises:
+        StateFileError: one of them belongs to another user, or others may write there.
+    """
+    around = [folder, *folder.parents]
+    for each in around[: around.index(root) + 1] if root in around else around[:1]:
+        with contextlib.suppress(FileNotFoundError):
+            _require_own(each, each.stat(), WRITABLE, "write there; run chmod 700 on it", error)
+
+
+def boot() -> str:
+    """Return the id of this boot of the machine; empty where the system has none."""
+    with contextlib.suppress(OSError):
+        return _BOOT_ID.read_text(encoding="ascii").strip()
+    return ""
+
+
+def uptime() -> float:
+    """Return seconds since boot, those asleep included where the system counts them."""
+    clock = getattr(time, "CLOCK_BOOTTIME", None)
+    return time.monotonic() if clock is None else time.clock_gettime(clock)
+
+
+def _require_own(path: Path, status: os.stat_result, forbidden: int, problem: str, error: type[StateFileError]) -> None:
+    if status.st_uid != os.getuid():
+        raise error(f"{path} belongs to uid {status.st_uid} and not to you (uid {os.getuid()}).")
+    if stat.S_IMODE(status.st_mode) & forbidden:
+        raise error(f"{path} has mode {stat.S_IMODE(status.st_mode):04o}: others may {problem}.")
