@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from strands_robots.utils import ValidationError, choice, identifier, number, sh
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm
+    from strands_robots.kinematics.grasp import Held, SeenObject
     from strands_robots.kinematics.motion import Motion
     from strands_robots.kinematics.moves import Start
 
@@ -59,6 +61,14 @@ class ArmMixin:
     @abstractmethod
     def targets(self, robot_name: str = "") -> Mapping[str, float]:
         """Return what a body was told last, by action key; empty where it is not known."""
+
+    def objects(self, robot_name: str = "") -> list[SeenObject]:
+        """Return the objects in the base frame of a body, as a detector sees them.
+
+        Raises:
+            ValidationError: nothing here can tell.
+        """
+        raise ValidationError(f"{self.body(robot_name).name} has no detector of objects; give a position instead.")
 
     @abstractmethod
     def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
@@ -153,6 +163,93 @@ class ArmMixin:
         return self._move("setGripper", partial(moves.set_gripper, opening=opening), 1.0, wait, robot_name)
 
     @answered
+    def get_objects(self, robot_name: str = "") -> Envelope:
+        """Return the objects by name: centre, extents (m) and yaw (degrees)."""
+        import numpy as np  # noqa: PLC0415 - loaded with the first motion
+
+        rows = {
+            each.name: {
+                **{axis: round(float(value), 4) for axis, value in zip("xyz", each.position, strict=True)},
+                "yaw": round(float(np.degrees(each.yaw)), 1),
+                "size": [round(float(value), 4) for value in each.size],
+                "fixed": each.fixed,
+            }
+            for each in self.objects(robot_name)
+        }
+        return success(f"{len(rows)} objects: {', '.join(rows) or 'none'}.", objects=rows, frame="base")
+
+    @answered
+    def pick(
+        self,
+        object: str = "",  # noqa: A002 - the verb's parameter is called so
+        x: float | None = None,
+        y: float | None = None,
+        z: float | None = None,
+        *,
+        width: float = 0.025,
+        yaw: float = 0.0,
+        approach: float | None = None,
+        speed: float = 0.5,
+        wait: bool = True,
+        robot_name: str = "",
+    ) -> Envelope:
+        """Pick up an object by its name, or one of a width at a point."""
+        from strands_robots.kinematics import grasp  # noqa: PLC0415 - loaded with the first motion
+
+        body = self.body(robot_name)
+        if object:
+            target = self._object(object, body.name)
+        elif x is None or y is None or z is None:
+            raise ValidationError("pick needs object, or x, y and z.")
+        else:
+            target = grasp.SeenObject("", _vector(x, y, z), math.radians(yaw), _vector(width, width, 2 * min(z, width)))
+        held: list[Held] = []
+
+        def plan(start: Start) -> Motion:
+            motion, grasped = grasp.pick(start, target, approach)
+            held.append(grasped)
+            return motion
+
+        return self._move(
+            "pick", plan, speed, wait, robot_name, started=lambda: self._held.update({body.name: held[-1]})
+        )
+
+    @answered
+    def place(
+        self,
+        x: float | None = None,
+        y: float | None = None,
+        z: float | None = None,
+        *,
+        on: str = "",
+        approach: float | None = None,
+        speed: float = 0.5,
+        wait: bool = True,
+        robot_name: str = "",
+    ) -> Envelope:
+        """Put the held object down on the table at a point, or on another object."""
+        from strands_robots.kinematics import grasp  # noqa: PLC0415 - loaded with the first motion
+
+        body = self.body(robot_name)
+        held = self._held.get(body.name)
+        holding = self._holding(body.name, self.arm(robot_name))
+        if held is None or holding is False:
+            raise ValidationError(f"{body.name} holds nothing that it picked up.")
+        if holding is None:
+            raise ValidationError(
+                f"{body.name} was stopped, so what it holds is not known; setGripper with opening 0 tells."
+            )
+        if on:
+            under = self._object(on, body.name)
+            position = under.position + _vector(0.0, 0.0, float(under.size[2]) / 2)
+        elif x is None or y is None:
+            raise ValidationError("place needs on, or x and y.")
+        else:
+            position = _vector(x, y, self.arm(robot_name).chain.table_z if z is None else z)
+        plan = partial(grasp.place, position=position, approach=approach, held=held)
+        return self._move("place", plan, speed, wait, robot_name)
+
+    @answered
     def go_to(self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "") -> Envelope:
         """Move to the joints of a saved place, or to ``home``."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
@@ -204,10 +301,29 @@ class ArmMixin:
         return {}
 
     @cached_property
+    def _held(self) -> dict[str, Held]:
+        return {}
+
+    @cached_property
     def _task_numbers(self) -> itertools.count[int]:
         return itertools.count(1)
 
-    def _move(self, verb: str, plan: PlanMotion, speed: float, wait: bool, robot_name: str) -> Envelope:
+    def _object(self, name: str, robot_name: str) -> SeenObject:
+        known = {each.name: each for each in self.objects(robot_name)}
+        if name not in known:
+            raise ValidationError(f"object must be one of {', '.join(known) or 'none'}, not {shown(name)}.")
+        return known[name]
+
+    def _move(
+        self,
+        verb: str,
+        plan: PlanMotion,
+        speed: float,
+        wait: bool,
+        robot_name: str,
+        *,
+        started: Callable[[], object] = lambda: None,
+    ) -> Envelope:
         from strands_robots.kinematics.moves import Start  # noqa: PLC0415 - loaded with the first motion
 
         body, arm = self.body(robot_name), self.arm(robot_name)
@@ -215,13 +331,16 @@ class ArmMixin:
 
         def planned_at(hz: float) -> Motion:
             state = arm.state(body.get_joints()).told(arm.told(self.targets(body.name)))
-            planned.append(plan(Start(arm, state, hz, speed)))
-            return planned[-1]
+            motion = plan(Start(arm, state, hz, speed))
+            motion.clock = getattr(body, "clock", motion.clock)
+            planned.append(motion)
+            return motion
 
         rollout = self.start_motion(body.name, verb, planned_at)
         task = ArmTask(f"{verb}-{next(self._task_numbers)}", rollout, planned[-1])
         self._tasks[body.name] = task
         self._recent[:] = [*self._recent[-15:], task]
+        started()
         if wait:
             rollout.join(WAIT_S)
         return self._result(task)
@@ -239,10 +358,13 @@ class ArmMixin:
         running, state = rollout.running, rollout.state
         reached, error_mm = self._reached(motion)
         why = "it is under way"
+        holding = None if running else self._holding(rollout.robot, motion.arm)
         if not running:
             why = rollout.error or "it was stopped"
             if state == "completed":
-                problem = motion.problem(error_mm) if motion.finished else "its time was over before it was done"
+                problem = (
+                    motion.problem(error_mm, holding) if motion.finished else "its time was over before it was done"
+                )
                 state, why = ("error", problem) if problem else (state, "it is done")
         return {
             "task_id": task.task_id,
@@ -251,7 +373,7 @@ class ArmMixin:
             "asked": dict(motion.asked),
             "reached": reached,
             "error_mm": error_mm,
-            "holding": None if running else self._holding(rollout.robot, motion.arm),
+            "holding": holding,
             "duration": round(rollout.elapsed_s, 3),
             "why": why,
         }

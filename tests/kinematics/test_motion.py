@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -19,15 +21,45 @@ def start(speed: float = 1.0) -> Start:
     return Start(ARM, ARM.state(HOME), 50.0, speed)
 
 
-def test_setpoints_are_played_in_order_and_then_the_arm_settles() -> None:
+def settling() -> tuple[Motion, list[float]]:
+    """Return a motion that has played its setpoints, and its clock, a step of 20 ms further with each look."""
+    times = [0.0]
     motion = Motion(ARM, "go", {}, [Segment("one", [{"gripper": 1.0}, {"gripper": 2.0}], settles=True)], 50.0)
+    motion.clock = lambda: times[0]
     assert motion.act(HOME) == {"gripper": 1.0}
     assert motion.act(HOME) == {"gripper": 2.0}
-    moved = [HOME | {"gripper": 0.3 + 0.1 * i} for i in range(3)]
-    assert [motion.act(each) for each in moved] == [(), (), ()]
-    waits = [motion.act(moved[-1]) for _ in range(STILL_STEPS)]
-    assert waits == [()] * (STILL_STEPS - 1) + [None]
+    return motion, times
+
+
+def looks(
+    motion: Motion, times: list[float], observation: dict[str, float], count: int, step: float = 0.02
+) -> list[Any]:
+    answers = []
+    for _ in range(count):
+        answers.append(motion.act(observation))
+        times[0] += step
+    return answers
+
+
+def test_setpoints_are_played_in_order_and_then_the_arm_settles() -> None:
+    motion, times = settling()
+    for shift in (0.1, 0.2, 0.3):
+        assert looks(motion, times, HOME | {"gripper": 0.3 + shift}, 1) == [()]
+    assert looks(motion, times, HOME | {"gripper": 0.6}, STILL_STEPS) == [()] * (STILL_STEPS - 1) + [None]
     assert motion.finished
+
+
+def test_body_whose_time_stands_still_has_not_settled() -> None:
+    motion, times = settling()
+    assert looks(motion, times, HOME, 100, step=0.0) == [()] * 100
+    assert looks(motion, times, HOME, STILL_STEPS + 1)[-1] is None
+
+
+def test_arm_that_never_stands_still_is_waited_for_a_second() -> None:
+    motion, times = settling()
+    answers = [looks(motion, times, HOME | {"gripper": 0.1 * (i % 2)}, 1)[0] for i in range(52)]
+    assert answers[:50] == [()] * 50
+    assert None in answers[50:]
 
 
 def test_motion_keeps_the_speed_of_every_joint_in_every_step() -> None:

@@ -37,7 +37,8 @@ def test_a_world_names_the_robot_besides() -> None:
 
 
 def test_reads_need_no_leave_to_move() -> None:
-    assert {name for name, verb in ARM_MOTION_VERBS.items() if verb.kind is Kind.READ} == {"getPose", "wait"}
+    reads = {name for name, verb in ARM_MOTION_VERBS.items() if verb.kind is Kind.READ}
+    assert reads == {"getPose", "getObjects", "wait"}
 
 
 def test_robot_without_an_arm_says_so() -> None:

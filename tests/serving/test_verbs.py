@@ -67,7 +67,7 @@ def test_the_mesh_knows_the_documented_actions() -> None:
         *ARM_MOTION_VERBS,
     }
     moving = {name for name, verb in PEER_VERBS.items() if verb.kind is Kind.MOTION}
-    arm = {"moveJoints", "moveTo", "moveBy", "setGripper", "goTo", "savePlace"}
+    arm = {"moveJoints", "moveTo", "moveBy", "setGripper", "goTo", "savePlace", "pick", "place"}
     assert moving == {"execute", "start", "step", "reset", "teleop_receive", "releaseTorque"} | arm
 
 

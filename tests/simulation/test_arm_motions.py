@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -113,3 +114,52 @@ def test_jaws_around_an_object_hold_it_and_a_stop_makes_that_unknown(world: Simu
     assert pose(world)["holding"] is True
     world.halt("test")
     assert pose(world)["holding"] is None
+
+
+def test_objects_are_told_in_the_frame_of_each_base(world: Simulation) -> None:
+    world.add_robot("turned", "so100", position=(1.0, 0.5, 0.0), yaw=1.5707963)
+    world.add_object("cube", "box", (0.0125, 0.01, 0.015), (0.25, 0.1, 0.015))
+    cube = world.get_objects("arm")["objects"]["cube"]
+    assert [cube[axis] for axis in "xyz"] == pytest.approx([0.25, 0.1, 0.015], abs=1e-3)
+    assert cube["size"] == pytest.approx([0.025, 0.02, 0.03])
+    turned = world.get_objects("turned")["objects"]["cube"]
+    assert [turned[axis] for axis in "xyz"] == pytest.approx([-0.4, 0.75, 0.015], abs=1e-3)
+    assert turned["yaw"] == pytest.approx(-90.0, abs=0.5)
+
+
+def test_object_may_be_turned(world: Simulation) -> None:
+    world.add_object("cube", "box", (0.0125,) * 3, (0.25, 0.05, 0.0125), yaw=0.5)
+    assert world.get_objects()["objects"]["cube"]["yaw"] == pytest.approx(28.6, abs=0.5)
+    refused = world.add_object("other", "box", (0.0125,) * 3, (0.1, 0.1, 0.0125), yaw=float("nan"))
+    assert "yaw must be a finite number" in refused["reason"]
+
+
+def test_cube_is_picked_up_and_put_on_the_plate(world: Simulation) -> None:
+    world.add_object("cube", "box", (0.0125,) * 3, (0.25, 0.05, 0.0125))
+    world.add_object("plate", "cylinder", (0.05, 0.004), (0.24, -0.12, 0.004), fixed=True)
+    picked = world.pick("cube", speed=1.0)
+    assert (picked["task_status"], picked["holding"]) == ("completed", True), picked
+    assert world.get_objects()["objects"]["cube"]["z"] > 0.05
+    placed = world.place(on="plate", speed=1.0)
+    assert (placed["task_status"], placed["holding"]) == ("completed", False), placed
+    cube = world.get_objects()["objects"]["cube"]
+    assert [cube["x"], cube["y"]] == pytest.approx([0.24, -0.12], abs=0.012)
+    assert cube["z"] == pytest.approx(0.0205, abs=2e-3)
+    assert "holds nothing" in world.place(on="plate")["reason"]
+
+
+def test_jaws_that_close_on_nothing_are_an_error(world: Simulation) -> None:
+    answer = world.pick(x=0.25, y=0.0, z=0.0125, speed=1.0)
+    assert (answer["status"], answer["holding"], answer["why"]) == ("error", False, "the jaws closed on nothing")
+
+
+def test_objects_that_cannot_be_picked_up_are_refused_by_reason(world: Simulation) -> None:
+    world.add_object("wide", "box", (0.04, 0.04, 0.02), (0.25, 0.0, 0.02))
+    world.add_object("far", "box", (0.01, 0.01, 0.01), (0.7, 0.0, 0.01))
+    world.add_object("plate", "cylinder", (0.02, 0.004), (0.24, -0.12, 0.004), fixed=True)
+    assert re.search(r"wide is 80 mm wide, and the gripper opens \d\d mm", world.pick("wide")["reason"])
+    assert "out of reach; the nearest reachable point is" in world.pick("far")["reason"]
+    assert "plate is fixed" in world.pick("plate")["reason"]
+    assert "object must be one of wide, far, plate" in world.pick("cup")["reason"]
+    assert "pick needs object, or x, y and z" in world.pick()["reason"]
+    assert world.list_policies_running() == []

@@ -95,7 +95,7 @@ def test_bad_picture_size_is_refused(world: Simulation, width: int, height: int)
 
 
 def test_unknown_camera_is_refused_with_the_known_ones(world: Simulation) -> None:
-    with pytest.raises(ValidationError, match="overview, front, side, top, arm/wrist"):
+    with pytest.raises(ValidationError, match="overview, front, side, top, table, arm/wrist"):
         world.project("nose")
 
 

@@ -107,6 +107,7 @@ class Chain:
         except (ValueError, mujoco.FatalError) as exc:
             raise ValidationError(f"model {label} does not compile: {' '.join(str(exc).split())[:300]}") from exc
         self.label = label
+        self.table_z = 0.0 if table_z is None else table_z
         name = tip_site(model)
         if not name:
             raise ValidationError(f"{label} has no site at its tip, so it cannot be moved to a point.")

@@ -72,7 +72,7 @@ def nearest(chain: Chain, goal: TipGoal, start: Floats, *, starts: int = STARTS)
 
 
 def rolled(chain: Chain, joints: Floats, closing: Floats) -> Floats | None:
-    """Turn the roll until the gripper closes along ``closing`` or against it.
+    """Turn the roll until the gripper closes along ``closing``.
 
     Args:
         chain: of an arm with a roll and a gripper.
@@ -80,7 +80,7 @@ def rolled(chain: Chain, joints: Floats, closing: Floats) -> Floats | None:
         closing: direction in the base frame; what of it lies along the approach does not count.
 
     Returns:
-        The joints of the smaller turn within the limits; None where neither is within.
+        The joints of the smaller turn within the limits; None where none is within.
     """
     if chain.roll is None or chain.gripper is None:
         return None
@@ -94,9 +94,9 @@ def rolled(chain: Chain, joints: Floats, closing: Floats) -> Floats | None:
     # A positive roll may turn against the approach.
     bumped = joints.copy()
     bumped[chain.roll] += 0.1
-    sign = np.sign(pose.approach @ np.cross(now, chain.forward(bumped).rotation @ chain.gripper.closing))
-    present = joints[chain.roll]
-    turns = [present + sign * (turn + k * np.pi) for k in range(-3, 4)]
+    sign = float(np.sign(pose.approach @ np.cross(now, chain.forward(bumped).rotation @ chain.gripper.closing)))
+    present = float(joints[chain.roll])
+    turns = [present + sign * turn + k * 2 * np.pi for k in range(-2, 3)]
     within = [value for value in turns if joint.low <= value <= joint.high]
     if not within:
         return None

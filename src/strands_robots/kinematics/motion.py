@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,10 +20,13 @@ SETTLE_S = 1.0
 
 STILL_RAD = 3e-3
 STILL_STEPS = 5
-"""The arm stands still when no joint moves by more in so many control steps."""
+"""The arm stands still when no joint moves by more in each of so many control steps of the body's own time."""
 
 NEAR_MM = 15.0
 """A motion that ends further from its goal has failed."""
+
+FRESH = 0.9
+"""Share of a control step by which the body's own time must have advanced between two looks."""
 
 MARGIN_S = 5.0
 """Seconds beyond its plan that a motion may take."""
@@ -46,6 +50,8 @@ class Motion:
         asked: the caller's goal, as it is answered.
         goal: where the tip shall be in the end (m), None for a motion of the gripper alone.
         told: the last opening that the gripper is told, None for none.
+        grasps: something shall be between the jaws in the end.
+        clock: the body's own time in seconds; a simulation's stands still with it.
         state: what was observed last.
         segment: name of the segment that is played.
     """
@@ -57,6 +63,8 @@ class Motion:
     hz: float
     goal: Floats | None = None
     told: float | None = None
+    grasps: bool = False
+    clock: Callable[[], float] = time.monotonic
     state: ArmState | None = field(default=None, init=False)
     segment: str = field(default="", init=False)
     uses_cameras: bool = field(default=False, init=False)
@@ -64,8 +72,9 @@ class Motion:
     def __post_init__(self) -> None:
         self._left = deque(self.segments)
         self._frames: deque[Action] = deque()
-        self._settling = 0
+        self._settles_until: float | None = None
         self._still = 0
+        self._seen: tuple[float, ArmState] | None = None
 
     @property
     def instruction(self) -> str:
@@ -83,8 +92,10 @@ class Motion:
         """True once every setpoint was played."""
         return not self._left and not self._frames
 
-    def problem(self, error_mm: float | None) -> str:
+    def problem(self, error_mm: float | None, holding: bool | None) -> str:
         """Return why a motion that was played did not do what was asked; empty if it did."""
+        if self.grasps and not holding:
+            return "the jaws closed on nothing"
         if error_mm is not None and error_mm > NEAR_MM:
             return f"the tip is {error_mm:.0f} mm from where it was told to go"
         return ""
@@ -94,20 +105,19 @@ class Motion:
 
     def act(self, observation: Mapping[str, Any]) -> Action | Sequence[Action] | None:
         """Return the next setpoints, nothing while the arm settles, None at the end."""
-        before, self.state = self.state, self.arm.state(numbers(observation))
+        self.state = self.arm.state(numbers(observation))
         while not self._frames:
-            if self._settling > 0:
-                self._settling -= 1
-                self._still = self._still + 1 if self._stands(before) else 0
-                if self._still < STILL_STEPS:
+            if self._settles_until is not None:
+                if not self._settled(self.state, self.clock()):
                     return ()
+                self._settles_until = None
             if not self._left:
                 return None
             segment = self._left.popleft()
             self.segment = segment.name
             self._frames.extend(segment.frames)
-            self._settling = int(SETTLE_S * self.hz) if segment.settles else 0
-            self._still = 0
+            self._settles_until = np.inf if segment.settles else None
+            self._still, self._seen = 0, None
         return self._frames.popleft()
 
     def interrupt(self) -> None:
@@ -116,9 +126,15 @@ class Motion:
     def close(self) -> None:
         """Do nothing: this policy has no resources."""
 
-    def _stands(self, before: ArmState | None) -> bool:
-        now = self.state
-        if before is None or now is None:
+    def _settled(self, state: ArmState, now: float) -> bool:
+        """Return True once the arm has stood still, or was waited for long enough."""
+        if self._seen is None:
+            self._seen, self._settles_until = (now, state), now + SETTLE_S
             return False
-        jaw = abs((now.opening or 0.0) - (before.opening or 0.0))
-        return bool(np.abs(now.joints - before.joints).max() <= STILL_RAD and jaw <= STILL_RAD)
+        seen_at, seen = self._seen
+        if now - seen_at < FRESH / self.hz:
+            return False
+        jaw = abs((state.opening or 0.0) - (seen.opening or 0.0))
+        still = float(np.abs(state.joints - seen.joints).max()) <= STILL_RAD and jaw <= STILL_RAD
+        self._seen, self._still = (now, state), self._still + 1 if still else 0
+        return self._still >= STILL_STEPS or (self._settles_until is not None and now >= self._settles_until)

@@ -14,7 +14,7 @@ import numpy as np
 
 from strands_robots.kinematics.chain import ArmJoint, Chain, Floats
 from strands_robots.kinematics.contacts import ContactCheck, new_contact
-from strands_robots.kinematics.inverse import TipGoal, nearest, rolled, solve
+from strands_robots.kinematics.inverse import TipGoal, nearest, solve
 from strands_robots.utils import ValidationError
 
 APPROACH_STEP_DEG = 5.0
@@ -79,26 +79,37 @@ class Planner:
         """
         start = self.start if near is None else near
         if approach_deg is not None:
-            direction = self._direction(position, approach_deg)
-            found = solve(self.chain, TipGoal(position, direction), start, accept=self._free)
+            direction = self.direction(position, approach_deg)
+            found = solve(self.chain, TipGoal(position, direction), start, accept=self.free)
             if found is None:
                 raise self._unreachable(TipGoal(position, direction), start, approach_deg)
             return Reached(found.joints, approach_deg)
-        anyhow = solve(self.chain, TipGoal(position), start, accept=self._free)
+        anyhow = solve(self.chain, TipGoal(position), start, accept=self.free)
         if anyhow is None:
             raise self._unreachable(TipGoal(position), start, None)
         for degrees in np.arange(90.0, APPROACH_LOWEST_DEG - 1, -APPROACH_STEP_DEG):
-            direction = self._direction(position, float(degrees))
+            direction = self.direction(position, float(degrees))
             for from_joints in (start, anyhow.joints):
-                found = solve(self.chain, TipGoal(position, direction), from_joints, starts=4, accept=self._free)
+                found = solve(self.chain, TipGoal(position, direction), from_joints, starts=4, accept=self.free)
                 if found is not None:
                     return Reached(found.joints, float(degrees))
         return Reached(anyhow.joints, self.chain.forward(anyhow.joints).approach_deg)
 
-    def turned(self, joints: Floats, closing: Floats) -> Floats | None:
-        """Return ``joints`` rolled to close along ``closing``, as :func:`rolled`."""
-        found = rolled(self.chain, joints, closing)
-        return found if found is not None and self._free(found) else None
+    def free(self, joints: Floats) -> bool:
+        """True for joints that bring no new contact."""
+        return not new_contact(self._check.at(joints), self._touching)
+
+    def direction(self, position: Floats, degrees: float) -> Floats:
+        """Return the approach away from the shoulder, ``degrees`` below level."""
+        away = position - self.chain.shoulder
+        azimuth, below = np.arctan2(away[1], away[0]), np.radians(degrees)
+        return np.array([np.cos(below) * np.cos(azimuth), np.cos(below) * np.sin(azimuth), -np.sin(below)])
+
+    def find(self, position: Floats, approach_deg: float) -> Reached | None:
+        """Return joints at a point with this approach, None where there are none."""
+        goal = TipGoal(position, self.direction(position, approach_deg))
+        found = solve(self.chain, goal, self.start, starts=6, accept=self.free)
+        return None if found is None else Reached(found.joints, approach_deg)
 
     def path(self, goal: Floats, start: Floats | None = None) -> list[Floats]:
         """Return joint paths to ``goal``, one after another, without contact.
@@ -142,7 +153,7 @@ class Planner:
         return points
 
     def _next(self, point: Floats, joints: Floats, approach_deg: float, direction: Floats | None) -> Floats:
-        wanted = self._direction(point, approach_deg) if direction is None else direction
+        wanted = self.direction(point, approach_deg) if direction is None else direction
         goals = [TipGoal(point, wanted)] if direction is not None else [TipGoal(point, wanted), TipGoal(point)]
         for goal in goals:
             found = solve(self.chain, goal, joints, starts=1)
@@ -153,17 +164,8 @@ class Planner:
     def _above(self, joints: Floats, height: float) -> Floats | None:
         """Return joints with the tip ``height`` metres higher, None where that cannot be."""
         point = self.chain.forward(joints).position + np.array([0.0, 0.0, height])
-        found = solve(self.chain, TipGoal(point), joints, starts=4, accept=self._free)
+        found = solve(self.chain, TipGoal(point), joints, starts=4, accept=self.free)
         return None if found is None else found.joints
-
-    def _free(self, joints: Floats) -> bool:
-        return not new_contact(self._check.at(joints), self._touching)
-
-    def _direction(self, position: Floats, degrees: float) -> Floats:
-        """Return the approach away from the shoulder, ``degrees`` below level."""
-        away = position - self.chain.shoulder
-        azimuth, below = np.arctan2(away[1], away[0]), np.radians(degrees)
-        return np.array([np.cos(below) * np.cos(azimuth), np.cos(below) * np.sin(azimuth), -np.sin(below)])
 
     def _unreachable(self, goal: TipGoal, start: Floats, approach_deg: float | None) -> ValidationError:
         best = nearest(self.chain, goal, start)

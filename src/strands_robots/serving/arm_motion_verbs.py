@@ -42,6 +42,15 @@ def _coordinate(name: str) -> Parameter:
     return Parameter(name, float, f"{name} of the tip in the base frame, in metres", within(-REACH_MAX_M, REACH_MAX_M))
 
 
+def _optional_coordinate(name: str, what: str) -> Parameter:
+    meaning = f"{name} of {what}, in metres in the base frame"
+    return Parameter(name, float, meaning, optional(within(-REACH_MAX_M, REACH_MAX_M)), default=None)
+
+
+def _name(name: str, value: object) -> str:
+    return text(name, value, longest=128, empty=True)
+
+
 def _offset(axis: str, direction: str) -> Parameter:
     meaning = f"Metres {direction}, negative for the other way"
     return Parameter(f"d{axis}", float, meaning, within(-REACH_MAX_M, REACH_MAX_M), default=0.0)
@@ -151,6 +160,45 @@ _VERBS = (
         (PLACE, SPEED, WAIT),
         returns=RESULT,
         run=of_arm("go_to"),
+        lasts=True,
+    ),
+    Verb(
+        "getObjects",
+        Kind.READ,
+        "Read the objects that can be seen: centre and extents in metres and yaw in degrees in the base frame.",
+        returns="objects",
+        run=of_arm("get_objects"),
+    ),
+    Verb(
+        "pick",
+        Kind.MOTION,
+        "Pick an object up, by its name in getObjects or by its place; holding says whether it is between the jaws.",
+        (
+            Parameter("object", str, "Name of the object; empty to give its place", _name, default=""),
+            *(_optional_coordinate(axis, "the object's centre") for axis in "xyz"),
+            Parameter("width", float, "Metres between the jaws, for a place", within(0.002, 0.2), default=0.025),
+            Parameter("yaw", float, "Degrees by which it is turned, for a place", within(-360, 360), default=0.0),
+            APPROACH,
+            SPEED,
+            WAIT,
+        ),
+        returns=RESULT,
+        run=of_arm("pick"),
+        lasts=True,
+    ),
+    Verb(
+        "place",
+        Kind.MOTION,
+        "Put the held object down at a point, or on another object.",
+        (
+            *(_optional_coordinate(axis, "the place; z is the table's height where left out") for axis in "xyz"),
+            Parameter("on", str, "Name of the object on which to put it; empty for a point", _name, default=""),
+            APPROACH,
+            SPEED,
+            WAIT,
+        ),
+        returns=RESULT,
+        run=of_arm("place"),
         lasts=True,
     ),
     Verb(

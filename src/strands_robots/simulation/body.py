@@ -74,6 +74,10 @@ class RobotBody:
         units = {key: _unit(snapshot.stage.model, actuator) for key, actuator in parts.actuators.items()}
         return {key: unit for key, unit in units.items() if unit}
 
+    def clock(self) -> float:
+        """Return the simulated time in seconds."""
+        return self._physics.snapshot.time
+
     def get_observation(self) -> dict[str, float]:
         """Return joint positions (rad; m for a slide) and the pose of a free base."""
         snapshot, parts = self._present()

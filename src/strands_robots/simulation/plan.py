@@ -19,6 +19,9 @@ SPACING_M = 0.45
 SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}
 """How many sizes each shape of an object has."""
 
+TURN_RAD = 6.2831853072
+"""Largest yaw of anything that is placed, in radians."""
+
 _RESERVED = ("floor", "world")
 
 
@@ -41,14 +44,14 @@ class RobotPlan:
             ValidationError: an argument outside its domain, or no such model.
         """
         label = identifier("name", name)
-        heading = number("yaw", yaw, low=-6.2831853072, high=6.2831853072)
+        heading = number("yaw", yaw, low=-TURN_RAD, high=TURN_RAD)
         source = find(name if model is None else model)
         return cls(label, source, (0.0, 0.0, 0.0) if position is None else _triple("position", position), heading)
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectPlan:
-    """One object of primitive shape: metres, kilograms, and colour from 0 to 1."""
+    """One object of primitive shape: metres, kilograms, radians, colour from 0 to 1."""
 
     name: str
     shape: str
@@ -57,10 +60,20 @@ class ObjectPlan:
     color: tuple[float, float, float, float]
     mass: float
     fixed: bool
+    yaw: float = 0.0
 
     @classmethod
     def checked(
-        cls, *, name: object, shape: object, size: object, position: object, color: object, mass: object, fixed: object
+        cls,
+        *,
+        name: object,
+        shape: object,
+        size: object,
+        position: object,
+        color: object,
+        mass: object,
+        fixed: object,
+        yaw: object = 0.0,
     ) -> ObjectPlan:
         """Check an object; see :meth:`Simulation.add_object` for the domains.
 
@@ -76,6 +89,7 @@ class ObjectPlan:
             _colour(color),
             number("mass", mass, low=1e-4, high=1000),
             flag("fixed", fixed),
+            number("yaw", yaw, low=-TURN_RAD, high=TURN_RAD),
         )
 
 

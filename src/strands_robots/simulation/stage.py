@@ -171,7 +171,8 @@ def _home(robot: RobotPlan) -> tuple[dict[str, Floats], dict[str, float]]:
 
 
 def _place(spec: Any, item: ObjectPlan) -> None:
-    body = spec.worldbody.add_body(name=item.name, pos=list(item.position))
+    turned = [float(np.cos(item.yaw / 2)), 0, 0, float(np.sin(item.yaw / 2))]
+    body = spec.worldbody.add_body(name=item.name, pos=list(item.position), quat=turned)
     if not item.fixed:
         body.add_freejoint(name=item.name)
     body.add_geom(
@@ -277,6 +278,8 @@ def _furnish(spec: Any, *, floor: bool, lights: bool) -> None:
     world.add_camera(name="front", pos=[0.95, 0, 0.28], xyaxes=[0, 1, 0, -0.16, 0, 0.987], fovy=45)
     world.add_camera(name="side", pos=[0.15, -0.85, 0.25], xyaxes=[1, 0, 0, 0, 0.12, 0.993], fovy=45)
     world.add_camera(name="top", pos=[0.12, 0, 1.1], xyaxes=[0, -1, 0, 1, 0, 0], fovy=45)
+    # Half a metre of the table, straight from above.
+    world.add_camera(name="table", pos=[0.24, 0, 0.61], xyaxes=[0, -1, 0, 1, 0, 0], fovy=45)
 
 
 def _lights(spec: Any) -> None:

@@ -16,6 +16,7 @@ from strands_robots.arm_mixin import MOTION, ArmMixin
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm import Arm
+from strands_robots.kinematics.grasp import SeenObject
 from strands_robots.kinematics.motion import Motion
 from strands_robots.policies import create_policy
 from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options, unfollowed
@@ -23,6 +24,7 @@ from strands_robots.safety.gate import MotionGate, Waiting, answered
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.simulation import projection
 from strands_robots.simulation.body import RobotBody
+from strands_robots.simulation.objects import targets_of
 from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.physics import CHUNK, Physics
 from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
@@ -194,6 +196,7 @@ class Simulation(ArmMixin, TeleopMixin):
         color: Any = (0.85, 0.2, 0.2, 1.0),
         mass: float = 0.05,
         fixed: bool = False,
+        yaw: float = 0.0,
     ) -> Envelope:
         """Put an object of primitive shape into the world.
 
@@ -205,9 +208,10 @@ class Simulation(ArmMixin, TeleopMixin):
             color: red, green, blue and alpha from 0 to 1.
             mass: kilograms, 0.0001 to 1000.
             fixed: true for an object that never moves.
+            yaw: its turn about z, radians from -2π to 2π.
         """
         item = ObjectPlan.checked(
-            name=name, shape=shape, size=size, position=position, color=color, mass=mass, fixed=fixed
+            name=name, shape=shape, size=size, position=position, color=color, mass=mass, fixed=fixed, yaw=yaw
         )
         with self.starting:
             self._require_idle("add_object")
@@ -510,6 +514,10 @@ class Simulation(ArmMixin, TeleopMixin):
     def targets(self, robot_name: str = "") -> dict[str, float]:
         """Return the setpoints of one robot, as :attr:`RobotBody.targets`."""
         return self.body(robot_name).targets
+
+    def objects(self, robot_name: str = "") -> list[SeenObject]:
+        """Return the objects of the world in the base frame of one robot."""
+        return targets_of(self.physics.snapshot, self.body(robot_name).base_pose())
 
     def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
         """Plan and start a motion of one robot."""
