@@ -52,6 +52,11 @@ class Subscriptions:
         except TransportError as exc:
             logger.warning("subscribe %s: %s", topic, exc)
             return False
+        refused = transport.refusals().get(topic)
+        if refused is not None:
+            logger.warning("subscribe %s: %s", topic, refused)
+            undeclare([declared])
+            return False
         self.remove(name)
         with self._lock:
             self._declared[name] = declared

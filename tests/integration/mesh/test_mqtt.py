@@ -129,6 +129,41 @@ def test_late_joiner_locks_on_a_retained_stop_unless_it_was_resumed(join: Join, 
 
 
 @pytest.mark.system
+def test_resumed_stop_locks_no_newcomer_and_leaves_the_broker(
+    join: Join, broker: MqttBroker, folder: Path, tmp_path: Path
+) -> None:
+    key = str(tmp_path / "operator.pem")
+    trusted = {"STRANDS_MESH_RESUME_PUBLIC_KEY": keygen(key, PASSPHRASE)}
+    first, console = join("sim-1", **trusted), join("console", "none", **trusted)
+    console.sees("sim-1")
+    console.ask("estop")
+    own = keys.issue(folder, "reader")
+    reader = IotMqttTransport(Account("localhost", broker.port, "reader", own.cert, own.key, own.ca))
+    reader.connect()
+    stored: list[bytes] = []
+    reader.declare_subscriber("strands/safety/estop", lambda sample: stored.append(sample.payload))
+    eventually(lambda: stored, what="the broker stores the stop")
+    assert console.ask("resume", key, PASSPHRASE) == {"status": "ok"}
+    eventually(lambda: stored[-1] == b"", what="the broker's copy is cleared")
+    reader.close()
+    eventually(lambda: first.ask("epoch") is None)
+    newcomer = join("sim-3", **trusted)
+    newcomer.sees("sim-1")
+    assert newcomer.ask("epoch") is None
+
+
+@pytest.mark.system
+def test_peer_that_starts_before_the_broker_joins_when_it_is_there(join: Join, broker: MqttBroker) -> None:
+    broker.stop()
+    sim = join("sim-1")
+    assert sim.ask("alive") is False
+    broker.start()
+    console = join("console", "none")
+    console.sees("sim-1", within=60)
+    assert console.ask("ping", "sim-1")["status"] == "ok"
+
+
+@pytest.mark.system
 def test_stop_crosses_the_bridge_in_both_directions(join: Join) -> None:
     local = {"STRANDS_MESH_PORT": str(free_port())}
     bridge = join("bridge", "none", STRANDS_MESH_BACKEND="bridge", **local)

@@ -134,6 +134,18 @@ class Transport(ABC):
             TransportError: the transport is closed.
         """
 
+    def refusals(self) -> Mapping[str, str]:
+        """Key expressions whose subscription the network refused, with the reason."""
+        return {}
+
+    def subscribe_again(self) -> int:
+        """Try the refused subscriptions again; return at once how many there are."""
+        return 0
+
+    def clear_retained(self, key: str) -> bool:
+        """Remove the message that a broker stores for late joiners; False without one."""
+        return False
+
     def put_confirmed(self, key: str, payload: bytes | Mapping[str, Any], timeout: float) -> bool | None:
         """Publish; return whether the topic has subscribers, None if unanswered."""
         self.put(key, payload)

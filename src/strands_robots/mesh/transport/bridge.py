@@ -216,6 +216,15 @@ class BridgeTransport(Transport):
         self._repair()
         return subscriber
 
+    def refusals(self) -> Mapping[str, str]:
+        return {**self._local.refusals(), **self._cloud.refusals()}
+
+    def subscribe_again(self) -> int:
+        return self._local.subscribe_again() + self._cloud.subscribe_again()
+
+    def clear_retained(self, key: str) -> bool:
+        return self._cloud.is_alive() and self._cloud.clear_retained(key)
+
     def declare_token(self, key: str) -> Declaration:
         return self._local.declare_token(key) if self._local.is_alive() else NoToken()
 

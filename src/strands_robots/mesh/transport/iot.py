@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from collections.abc import Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
@@ -30,6 +31,18 @@ KEEP_ALIVE_S = 35
 DEFAULT_PORT = 8883
 NO_SUBSCRIBERS = 16
 """MQTT 5 reason code of a PUBACK: the topic has no subscribers."""
+
+FAILED = 128
+"""The lowest MQTT 5 reason code that is a refusal."""
+
+MESSAGE_MAX_BYTES = 128 * topics.KIB
+RETAIN_EVERY_S = 1.05
+"""AWS takes messages of at most 128 KiB, and one retained message a second on a topic."""
+
+UNREACHABLE = ("AWS_IO_SOCKET", "AWS_IO_DNS")
+"""Failures of a broker that is not there yet; a refusal is something else."""
+
+SAFETY = frozenset({"estop", "resume"})
 
 CERT_NAMES = ("cert.pem", "certificate.pem.crt", "{thing}.pem", "{thing}.cert.pem")
 KEY_NAMES = ("key.pem", "private.pem.key", "{thing}.key", "{thing}.private.key")
@@ -93,8 +106,12 @@ class IotMqttTransport(Transport):
         self._crt: Any = None
         self._up = threading.Event()
         self._failed: str = ""
+        self._reachable = True
         self._lock = threading.Lock()
         self._subscribers: list[_Subscriber] = []
+        self._refusals: dict[str, str] = {}
+        self._retained: dict[str, float] = {}
+        self._unpublished: dict[str, int] = {}
 
     @property
     def session_id(self) -> str | None:
@@ -128,16 +145,21 @@ class IotMqttTransport(Transport):
             on_lifecycle_disconnection=self._disconnected,
         )
         self._client.start()
-        if not self._up.wait(CONNECT_S):
+        if self._up.wait(CONNECT_S):
+            return
+        problem = (
+            f"no MQTT connection to {account.host}:{account.port} in {CONNECT_S:g} s: {self._failed or 'no answer'}"
+        )
+        if self._reachable:
             self.close()
-            raise TransportError(
-                f"no MQTT connection to {account.host}:{account.port} in {CONNECT_S:g} s: {self._failed or 'no answer'}"
-            )
+            raise TransportError(problem)
+        logger.error("%s. The mesh connects when the broker is there.", problem)
 
     def close(self) -> None:
         client, self._client = self._client, None
         with self._lock:
             self._subscribers.clear()
+            self._refusals.clear()
         self._up.clear()
         if client is not None:
             client.stop()
@@ -159,16 +181,19 @@ class IotMqttTransport(Transport):
         except Exception as exc:  # noqa: BLE001 - the client raises errors of its own kind
             raise TransportError(f"{key}: {exc}") from None
         code = int(acknowledged.reason_code) if acknowledged is not None else 0
-        if code >= 128:
-            raise TransportError(f"{key}: the broker refused the message, reason {code}.")
+        if code >= FAILED:
+            raise TransportError(f"{key}: the broker refused the message, reason {_reason(code)}.")
         return code != NO_SUBSCRIBERS
 
     def declare_subscriber(self, key: str, callback: Callback) -> _Subscriber:
+        """Subscribe; a refusal of the broker is in :meth:`refusals`, and is tried again."""
         subscriber = _Subscriber(self, key, callback)
         with self._lock:
             self._subscribers.append(subscriber)
+        if not self._up.is_set() and self._client is not None:
+            return subscriber  # subscribed with the others when the broker is there
         try:
-            self._subscribe(key).result(ACKNOWLEDGE_S)
+            self._note_suback(key, self._subscribe(key).result(ACKNOWLEDGE_S))
         except TransportError:
             self._forget(subscriber)
             raise
@@ -176,6 +201,20 @@ class IotMqttTransport(Transport):
             self._forget(subscriber)
             raise TransportError(f"{key}: the broker did not take the subscription: {exc}") from None
         return subscriber
+
+    def refusals(self) -> Mapping[str, str]:
+        return dict(self._refusals)
+
+    def subscribe_again(self) -> int:
+        keys = self.refusals() if self._up.is_set() else {}
+        for key in keys:
+            self._subscribe_later(key)
+        return len(keys)
+
+    def clear_retained(self, key: str) -> bool:
+        packet = self._crt.PublishPacket(topic=key, payload=b"", qos=self._crt.QoS.AT_LEAST_ONCE, retain=True)
+        self._watched(key, self._require().publish(packet))
+        return True
 
     def leave(self, subscriber: _Subscriber) -> None:
         """Drop a subscriber, and the subscription with the last one of its topic."""
@@ -191,7 +230,10 @@ class IotMqttTransport(Transport):
             if subscriber not in self._subscribers:
                 return False
             self._subscribers.remove(subscriber)
-            return all(each.key != subscriber.key for each in self._subscribers)
+            last = all(each.key != subscriber.key for each in self._subscribers)
+            if last:
+                self._refusals.pop(subscriber.key, None)
+            return last
 
     def _subscribe(self, key: str) -> Future[Any]:
         client = self._require()
@@ -200,20 +242,81 @@ class IotMqttTransport(Transport):
         answer: Future[Any] = client.subscribe(self._crt.SubscribePacket(subscriptions=[wanted]))
         return answer
 
+    def _subscribe_later(self, key: str) -> None:
+        """Subscribe without waiting; the answer is read when it is there."""
+
+        def answered(future: Future[Any]) -> None:
+            if future.cancelled():
+                return
+            failure = future.exception()
+            if failure is None:
+                self._note_suback(key, future.result())
+            elif self._client is not None:
+                self._refuse(key, str(failure))
+
+        with contextlib.suppress(TransportError):  # closed meanwhile
+            self._subscribe(key).add_done_callback(answered)
+
+    def _note_suback(self, key: str, answer: Any) -> None:
+        packet = getattr(answer, "suback", answer)
+        refused = [code for code in getattr(packet, "reason_codes", None) or () if int(code) >= FAILED]
+        if refused:
+            self._refuse(key, f"the broker refused the subscription, reason {_reason(refused[0])}")
+        elif self._refusals.pop(key, None) is not None:
+            logger.warning("%s: the broker takes the subscription now.", key)
+
+    def _refuse(self, key: str, why: str) -> None:
+        with self._lock:
+            if all(each.key != key for each in self._subscribers):
+                return
+            known, self._refusals[key] = self._refusals.get(key), why
+        if known != why:
+            level = logging.CRITICAL if topics.topic_of(key).name in SAFETY else logging.ERROR
+            logger.log(level, "%s: %s; nothing is received there.", key, why)
+
+    def _watched(self, key: str, future: Future[Any]) -> Future[Any]:
+        """Read the broker's answer to a message; a refusal is logged once for each topic."""
+
+        def answered(done: Future[Any]) -> None:
+            if done.cancelled() or done.exception() is not None:
+                return
+            code = _puback_code(done.result())
+            topic = topics.topic_of(key)
+            if code >= FAILED and self._unpublished.get(topic.name) != code:
+                self._unpublished[topic.name] = code
+                level = logging.CRITICAL if topic.name in SAFETY else logging.ERROR
+                logger.log(level, "%s: the broker refused the message, reason %s.", key, _reason(code))
+            elif code < FAILED:
+                self._unpublished.pop(topic.name, None)
+
+        future.add_done_callback(answered)
+        return future
+
+    def _may_retain(self, key: str) -> bool:
+        now = time.monotonic()
+        if now - self._retained.get(key, -RETAIN_EVERY_S) < RETAIN_EVERY_S:
+            return False
+        self._retained[key] = now
+        return True
+
     def _publish(self, key: str, payload: bytes | Mapping[str, Any]) -> Future[Any] | None:
         topic = topics.topic_of(key)
         if topic.qos is None:
             return None
         data = payload if isinstance(payload, bytes) else wire.encode(payload, topic.max_bytes)
-        if len(data) > topic.max_bytes:
-            raise wire.TooLargeError(f"{key}: a message of {len(data)} bytes is above the topic's {topic.max_bytes}.")
+        most = min(topic.max_bytes, MESSAGE_MAX_BYTES)
+        if len(data) > most:
+            raise wire.TooLargeError(f"{key}: a message of {len(data)} bytes is above {most}, the most over MQTT.")
         client = self._require()
-        packet = self._crt.PublishPacket(topic=key, payload=data, qos=self._crt.QoS(topic.qos), retain=topic.retain)
+        if topic.name == "presence" and not self._up.is_set():
+            return None  # the client would store every heartbeat of an outage
+        retain = topic.retain and self._may_retain(key)
+        packet = self._crt.PublishPacket(topic=key, payload=data, qos=self._crt.QoS(topic.qos), retain=retain)
         try:
             future: Future[Any] = client.publish(packet)
         except Exception as exc:  # noqa: BLE001 - the client raises errors of its own kind
             raise TransportError(f"{key}: {exc}") from None
-        return future if topic.qos else None
+        return self._watched(key, future) if topic.qos else None
 
     def _require(self) -> Any:
         client = self._client
@@ -234,24 +337,34 @@ class IotMqttTransport(Transport):
                 logger.exception("A subscriber of %s failed.", each.key)
 
     def _connected(self, data: Any) -> None:
-        returning = self._up.is_set() or bool(self._failed)
-        self._up.set()
         settled = getattr(data, "negotiated_settings", None)
-        if returning and not getattr(settled, "rejoined_session", False):
-            with self._lock:
-                keys = {each.key for each in self._subscribers}
-            for key in keys:
-                self._subscribe(key)
+        with self._lock:
+            self._up.set()
+            rejoined = getattr(settled, "rejoined_session", False)
+            keys = {each.key for each in self._subscribers} if not rejoined else set(self._refusals)
+        for key in keys:
+            self._subscribe_later(key)
         self._failed = ""
 
     def _refused(self, data: Any) -> None:
-        self._failed = str(getattr(data, "exception", "refused"))
+        failure = getattr(data, "exception", "refused")
+        self._failed = str(failure)
+        self._reachable = not str(getattr(failure, "name", "")).startswith(UNREACHABLE)
 
     def _disconnected(self, data: Any) -> None:
         self._up.clear()
         self._failed = "disconnected"
         if self._client is not None:
             logger.warning("The MQTT broker is gone; the mesh connects again by itself.")
+
+
+def _puback_code(completed: Any) -> int:
+    acknowledged = getattr(completed, "puback", None)
+    return int(acknowledged.reason_code) if acknowledged is not None else 0
+
+
+def _reason(code: Any) -> str:
+    return f"0x{int(code):02x}{f' ({code.name})' if hasattr(code, 'name') else ''}"
 
 
 def filter_of(key: str) -> str:
