@@ -199,6 +199,12 @@ _declare(
         "Ed25519 keys (base64url) that an emergencyStop must be signed with. Unset: its source is self-asserted.",
     ),
     Setting(
+        "STRANDS_ESTOP_REQUIRE_SIGNED",
+        "boolean",
+        "false",
+        "Act on signed emergency stops alone, on both networks; DEVICE_CONNECT_ESTOP_PUBLIC_KEYS must hold a key.",
+    ),
+    Setting(
         "STRANDS_MESH_RESUME_PUBLIC_KEY",
         "list",
         "",

@@ -1,13 +1,48 @@
 """Check-in: a robot stops when its last safety controller falls silent.
 
-Pure: times come in (monotonic seconds), decisions go out. Off while the timeout is 0.
+Both networks carry it: Device Connect as the event ``safetyCheckIn`` of the controller, the mesh on
+``strands/P/checkin``. Pure: times come in (monotonic seconds), decisions go out. Off while the timeout is 0.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from strands_robots.safety.orders import StopRules
+from strands_robots.safety.statements import Purpose
 
 CONTROLLERS_MAX = 64
+SOURCES_MAX = 256
+AGE_S = 60.0
+"""Largest difference in seconds between a signed check-in's clock and ours."""
+
+
+class CheckInRules:
+    """Rules by which a check-in counts: those of a stop, and each signed one once.
+
+    Args:
+        stops: by which the controller's stops count.
+        clock: wall-clock seconds.
+    """
+
+    def __init__(self, stops: StopRules, clock: Callable[[], float] = time.time) -> None:
+        self._stops = stops
+        self._clock = clock
+        self._latest: dict[str, float] = {}
+
+    def refusal(self, source: str, params: Mapping[str, Any]) -> str | None:
+        """Return the reason why this check-in does not count, or None."""
+        why = self._stops.source_refusal(source) or self._stops.signature_refusal(source, params, Purpose.CHECK_IN)
+        t = params.get("t")
+        if why is None and self._stops.signed and isinstance(t, int | float):
+            # A recorded check-in played again must not keep a robot moving.
+            if t <= self._latest.get(source, 0.0) or abs(self._clock() - t) > AGE_S:
+                return "it was checked in before, or its clock is a minute off"
+            if len(self._latest) < SOURCES_MAX or source in self._latest:
+                self._latest[source] = t
+        return why
 
 
 class CheckIn:

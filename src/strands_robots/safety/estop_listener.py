@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.audit import log_safety_event
+from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.orders import RobotReport, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
-from strands_robots.safety.statements import Purpose
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,6 @@ ANSWER_AGAIN_S = 0.01
 REFUSAL_INTERVAL_S = 10.0
 SOURCES_MAX = 256
 """Sources remembered; past it the oldest is forgotten or all new ones share an entry, so that names take no memory."""
-CHECK_IN_AGE_S = 60.0
 
 SWITCH_S = 0.0005
 """Longest time in seconds that a busy Python thread may keep the interpreter from the stop's threads while the listener
@@ -219,7 +218,7 @@ class EstopListener:
         self._refusals = RefusalLog()
         self._budget = FailureBudget()
         self._rules = StopRules(allow=(), keys=())
-        self._checked_in: dict[str, float] = {}
+        self._check_ins = CheckInRules(self._rules)
         self._answered: dict[tuple[str, str], float] = {}
         self._redundant: dict[tuple[str, str], None] = {}
         self._queue: FairQueue | None = None
@@ -290,6 +289,8 @@ class EstopListener:
 
     def _start(self) -> None:
         self._rules = self._make_rules()
+        self._rules.require_keys()
+        self._check_ins = CheckInRules(self._rules)
         if not self._rules.signed:
             logger.warning(
                 "The source of an emergency stop is what it says it is: DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not set, "
@@ -317,14 +318,7 @@ class EstopListener:
 
     def _check_in(self, received: StopEvent) -> None:
         source, params = received.source, params_of(received.payload)
-        why = self._rules.source_refusal(source) or self._rules.signature_refusal(source, params, Purpose.CHECK_IN)
-        t = params.get("t")
-        if why is None and self._rules.signed and isinstance(t, int | float):
-            # A recorded check-in played again must not keep a robot moving.
-            if t <= self._checked_in.get(source, 0.0) or abs(time.time() - t) > CHECK_IN_AGE_S:
-                why = "it was checked in before, or its clock is a minute off"
-            elif len(self._checked_in) < SOURCES_MAX or source in self._checked_in:
-                self._checked_in[source] = t
+        why = self._check_ins.refusal(source, params)
         if why is not None:
             self._refusals.record(StopRefused(source, why), received.event)
         else:

@@ -20,6 +20,7 @@ from strands_robots.safety.clocks import ObservedClocks
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, covered
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import ValidationError
 
 LATE_S = 1.0
 """Time from the press to its receipt, above which a stop is late."""
@@ -33,6 +34,9 @@ PARSED_MAX_BYTES = 64 * 2**10
 """A message longer than this is not read; from a source that may stop, it stops all the same."""
 
 REASON_MAX = 200
+
+REQUIRE_SIGNED = "STRANDS_ESTOP_REQUIRE_SIGNED"
+ALLOW = "DEVICE_CONNECT_ESTOP_ALLOW"
 
 
 def new_epoch() -> str:
@@ -191,6 +195,9 @@ class StopRules:
         allow: sources that may stop, as globs; ``DEVICE_CONNECT_ESTOP_ALLOW`` by default.
         keys: public keys of which one must have signed; empty: none is required. A configured list without one
             usable key is empty too, and in the log: a mistyped key must not make a fleet unstoppable.
+
+    Attributes:
+        required: the operator chose that unsigned stops do not count on any network.
     """
 
     def __init__(
@@ -199,10 +206,28 @@ class StopRules:
         keys: Sequence[bytes] | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._allow = tuple(settings.items("DEVICE_CONNECT_ESTOP_ALLOW") if allow is None else allow)
+        self._allow = tuple(settings.items(ALLOW) if allow is None else allow)
         self._keys = tuple(estop_keys() if keys is None else keys)
         self._clock = clock
         self._clocks = ObservedClocks()
+        self.required = settings.boolean(REQUIRE_SIGNED)
+
+    def require_keys(self) -> None:
+        """Refuse to start where only signed stops count and no key could have signed one.
+
+        Raises:
+            ValidationError: naming both settings.
+        """
+        if self.required and not self._keys:
+            raise ValidationError(
+                f"{REQUIRE_SIGNED} is true and DEVICE_CONNECT_ESTOP_PUBLIC_KEYS holds no usable key: no emergency stop "
+                "would count. Make a key with: strands-robots keys estop FILE"
+            )
+
+    @property
+    def open(self) -> bool:
+        """True when the name of a source is not checked, only a signature."""
+        return not self._allow
 
     @property
     def signed(self) -> bool:
