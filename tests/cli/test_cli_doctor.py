@@ -14,7 +14,7 @@ from tests.cli.conftest import Run
 
 from strands_robots import __version__
 from strands_robots.cli import doctor
-from strands_robots.cli.doctor import certificate_error, other_owners
+from strands_robots.cli.doctor import Finding, certificate_error, other_owners
 
 
 @pytest.fixture(autouse=True)
@@ -158,3 +158,25 @@ def test_doctor_names_the_distribution_also_where_it_is_not_installed(
     found = checked(run("doctor", "--json"))["distribution"]
     assert found["mark"] == "ok"
     assert found["said"] == f"strands-robots-edge {__version__}, run from its source tree"
+
+
+def _stops(monkeypatch: pytest.MonkeyPatch, **stated: str) -> Finding:
+    for name, value in stated.items():
+        monkeypatch.setenv(name, value)
+    [finding] = doctor._stop_senders()
+    return finding
+
+
+def test_who_may_stop_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    anyone = _stops(monkeypatch)
+    assert (anyone.mark, "any name may lock the robots" in anyone.said) == ("note", True)
+    assert "STRANDS_ESTOP_REQUIRE_SIGNED=true" in anyone.remedy
+    listed = _stops(monkeypatch, DEVICE_CONNECT_ESTOP_ALLOW="safety-*")
+    assert listed.said == "names count as stated"
+
+
+def test_signed_stops_alone_without_a_key_are_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _stops(monkeypatch, STRANDS_ESTOP_REQUIRE_SIGNED="true").mark == "broken"
+    key = "A" * 43 + "="
+    signed = _stops(monkeypatch, STRANDS_ESTOP_REQUIRE_SIGNED="true", DEVICE_CONNECT_ESTOP_PUBLIC_KEYS=key)
+    assert signed.mark == "ok"

@@ -10,7 +10,7 @@ from fixtures.waiting import eventually
 from rich.console import Console
 
 from strands_robots.cli import safety_controller
-from strands_robots.cli.resume import LockoutReport
+from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.safety_controller import FleetScreen, StopButton
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.safety.controller import Answer, Progress, StopReport

@@ -109,7 +109,7 @@ def test_estop_is_published_at_once_and_again_with_the_counts(peers: Fleet, monk
     assert seen[0]["source_zid"] == peers.transports["console"].session_id
     assert set(seen[1]) == {
         "peer_id", "t", "estop_id", "responses_received", "peers_not_stopped", "peers_silent", "lockout_engaged",
-        "source_zid",
+        "source_zid", "pressed_at",
     }  # fmt: skip
 
 

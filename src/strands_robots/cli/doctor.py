@@ -22,6 +22,7 @@ from strands_robots.cli.command import command
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
 from strands_robots.utils import DISTRIBUTION, MissingExtraError, ValidationError, install_line
 
 FRAMEWORK = "0.2.5"
@@ -118,6 +119,7 @@ def examine(network: Network) -> list[Finding]:
         _multicast,
         _certificates,
         _credentials,
+        _stop_senders,
         _rendering,
         _state,
     )
@@ -281,6 +283,23 @@ def _credentials() -> Iterator[Finding]:
         yield Finding("credentials", Mark.WARN, f"{name} is open to other users", f"chmod 600 {name}")
     else:
         yield Finding("credentials", Mark.OK, name)
+
+
+def _stop_senders() -> Iterator[Finding]:
+    """Name who may stop and lock the robots of this machine."""
+    name, rules = "emergency stops", StopRules()
+    try:
+        rules.require_keys()
+    except ValidationError as exc:
+        yield Finding(name, Mark.BROKEN, "signed stops alone count, and no key can sign one", str(exc))
+        return
+    if rules.required:
+        yield Finding(name, Mark.OK, "only signed ones count, on Device Connect and on the mesh")
+        return
+    remedy = f"to accept signed stops alone on both networks: strands-robots keys estop FILE, and {REQUIRE_SIGNED}=true"
+    who = f"any name may lock the robots, because {ALLOW} is not set" if rules.open else "names count as stated"
+    where = "on the mesh, " if rules.signed else ""
+    yield Finding(name, Mark.NOTE, f"{where}{who}", remedy)
 
 
 def _rendering() -> Iterator[Finding]:

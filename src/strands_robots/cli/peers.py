@@ -9,10 +9,11 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe, mesh_peer, temporary_mesh_id
-from strands_robots.cli.output import CliError, Exit, Screen, first_line, plain, table
+from strands_robots.cli.output import CliError, Exit, Screen, first_line, label, plain, table
 from strands_robots.envelope import is_error, text_of
 from strands_robots.utils import number
 
@@ -88,8 +89,15 @@ def _mesh_peers(screen: Screen, timeout: float) -> None:
     if not rows:
         raise CliError("No peer is on the mesh of this machine.", Exit.SILENT, peers=[])
     screen.data({"status": "success", "peers": rows})
-    cells = ((r["peer_id"], r["type"], r["hostname"], r.get("task_status", ""), f"{r['age']:.1f} s") for r in rows)
+    cells = ((r["peer_id"], r["type"], r["hostname"], _mesh_status(r), f"{r['age']:.1f} s") for r in rows)
     screen.show(table("", ("peer", "type", "host", "status", "last heard"), cells))
+
+
+def _mesh_status(row: Mapping[str, Any]) -> str | Text:
+    """Return the task's state, or the lockout, or that emergency stops do not arrive."""
+    if row.get("estop_unheard"):
+        return label("CANNOT RECEIVE STOPS", "bold red")
+    return label("LOCKED", "bold red") if row.get("locked") is True else str(row.get("task_status", ""))
 
 
 def _facts(peer: Peer) -> dict[str, Any]:

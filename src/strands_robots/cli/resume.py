@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +14,7 @@ import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
+from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.network import Network, call_device, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.cli.resume_mesh import ask_peers, lockable_peers, resume_peers
@@ -145,21 +145,6 @@ def grant(
     screen.say(f"Granted: {verb} on {peer}, once, within {seconds:g} s.", "green")
 
 
-@dataclass(frozen=True, slots=True)
-class LockoutReport:
-    """Lockouts and status of one robot; ``problem`` is empty if it reports them.
-
-    ``at`` is the time of the report in monotonic seconds.
-    """
-
-    name: str
-    lockouts: tuple[Lockout, ...] = ()
-    problem: str = ""
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    round_trip_ms: float = 0.0
-    at: float = field(default_factory=time.monotonic)
-
-
 def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
     """Return the devices on the network that can be locked and resumed."""
     return [peer.id for peer in fleet.peers(seconds) if any(each.get("name") == "resume" for each in peer.functions)]
@@ -176,8 +161,7 @@ def _ask_mesh(network: Network, seconds: float) -> list[LockoutReport]:
     network.use_mesh()
     with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
         discover(mesh)
-        answers = ask_peers(mesh, lockable_peers(mesh), seconds)
-    return [LockoutReport(name, lockouts, problem) for name, (lockouts, problem) in answers.items()]
+        return ask_peers(mesh, lockable_peers(mesh), seconds)
 
 
 def _resume_on_mesh(wanted: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
@@ -186,8 +170,8 @@ def _resume_on_mesh(wanted: list[str], signer: Any, seconds: float) -> dict[str,
         answers = ask_peers(mesh, wanted or lockable_peers(mesh), seconds)
         if not answers:
             raise CliError("No robot answered on the mesh of this machine.", Exit.SILENT, devices={})
-        silent = {name: (False, problem) for name, (_, problem) in answers.items() if problem}
-        found = {name: lockouts for name, (lockouts, problem) in answers.items() if not problem}
+        silent = {each.name: (False, each.problem) for each in answers if each.problem}
+        found = {each.name: each.lockouts for each in answers if not each.problem}
         return resume_peers(mesh, found, signer, seconds) | silent
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.safety.lockout import OVERFLOW, Lockout
 from strands_robots.safety.resume import sign
 from strands_robots.utils import shown
@@ -29,11 +30,11 @@ def lockable_peers(mesh: Mesh) -> list[str]:
     ]
 
 
-def ask_peers(mesh: Mesh, names: Iterable[str], seconds: float) -> dict[str, tuple[tuple[Lockout, ...], str]]:
-    """Return each peer's lockouts by name, and the reason where it reports none."""
+def ask_peers(mesh: Mesh, names: Iterable[str], seconds: float) -> list[LockoutReport]:
+    """Ask each peer for its status, in parallel."""
     wanted = list(dict.fromkeys(names))
     with ThreadPoolExecutor(PARALLEL_REQUESTS) as pool:
-        return dict(zip(wanted, pool.map(lambda name: _ask(mesh, name, seconds), wanted), strict=True))
+        return list(pool.map(lambda name: _ask(mesh, name, seconds), wanted))
 
 
 def resume_peers(
@@ -72,7 +73,7 @@ def _still_locked(
     deadline = time.monotonic() + within
     while left:
         answers = ask_peers(mesh, left, within)
-        left = {name: lockouts or left[name] for name, (lockouts, problem) in answers.items() if lockouts or problem}
+        left = {each.name: each.lockouts or left[each.name] for each in answers if each.lockouts or each.problem}
         if time.monotonic() >= deadline:
             break
         time.sleep(0.05)
@@ -87,15 +88,18 @@ def _outcome(before: tuple[Lockout, ...], left: tuple[Lockout, ...] | None, said
     return f"{said or 'it did not confirm'}: its own audit says why"
 
 
-def _ask(mesh: Mesh, name: str, seconds: float) -> tuple[tuple[Lockout, ...], str]:
+def _ask(mesh: Mesh, name: str, seconds: float) -> LockoutReport:
+    began = time.monotonic()
     reply = mesh.send(name, {"action": "status"}, seconds)
+    took_ms = (time.monotonic() - began) * 1000
     result = reply.get("result")
     if reply.get("type") != "response" or not isinstance(result, Mapping):
-        return (), shown(reply.get("error")) if reply.get("error") else "no answer"
+        return LockoutReport(name, problem=shown(reply["error"]) if reply.get("error") else "no answer")
     rows = result.get("lockout")
     if not isinstance(rows, list):
-        return (), "it does not report lockouts"
-    return tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping)), ""
+        return LockoutReport(name, problem="it does not report lockouts", facts=result, round_trip_ms=took_ms)
+    lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping))
+    return LockoutReport(name, lockouts, str(result.get("estop_unheard", "")), result, took_ms)
 
 
 def _send(mesh: Mesh, name: str, assertion: Mapping[str, Any], seconds: float) -> str:

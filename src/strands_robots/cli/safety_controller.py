@@ -18,11 +18,13 @@ import typer
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from strands_robots.cli.command import command
+from strands_robots.cli.command import OnMesh, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network
+from strands_robots.cli.lockout_report import LockoutReport
+from strands_robots.cli.mesh_controller import MeshController
+from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
-from strands_robots.cli.resume import LockoutReport, ask_robots, lockable_robots
+from strands_robots.cli.resume import ask_robots, lockable_robots
 from strands_robots.cli.stop import LATE_MS, SLOW_MS, exit_code, summary
 from strands_robots.safety.controller import Answer, Progress, SafetyController, StopReport
 from strands_robots.safety.lockout import utc
@@ -37,6 +39,9 @@ LOOK_S = 1.0
 ASK_S = 1.0
 GONE_S = 5.0
 """A robot that was silent for this long is shown as gone; it must still answer a stop."""
+
+Reports = Callable[[Collection[str], float], list[LockoutReport]]
+"""Asks the robots in reach and those of these names, for at most so many seconds each."""
 
 KEY_REPEAT_S = 1.0
 """Presses closer than this are one stop: a key held down repeats, and a robot distinguishes at most 64 stops."""
@@ -60,6 +65,7 @@ def safety_controller(
     ] = "space bar",
     key: Annotated[Path | None, typer.Option("--key", help="Sign stops and check-ins with it.")] = None,
     passphrase_file: PassphraseFile = None,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Stop every robot at once with the SPACE bar; show each robot, its lockout, answers and check-in."""
     if not (screen.live and sys.stdin.isatty()):
@@ -69,6 +75,16 @@ def safety_controller(
         )
     source = device_id("--id", source)
     every = None if check_in is None else number("--check-in", check_in, low=0.02, high=60)
+    if on_mesh:
+        network.use_mesh()
+        signer = None if key is None else signing_key(key, passphrase_file)
+        with mesh_peer(None, source, "controller") as mesh:
+            controls = MeshController(mesh, signer)
+            if every is not None:
+                controls.check_in_every(every)
+            _run(screen, controls, FleetScreen(controls, controls.reports, every), reason)
+        screen.say(f"{source} is off. The robots it stopped stay locked.")
+        return
     link = network.link()
     signer = None if key is None else signing_key(key, passphrase_file)
     from strands_robots.device_connect import safety_controller as network_side  # noqa: PLC0415 - loaded when it is used
@@ -81,7 +97,7 @@ def safety_controller(
     screen.say(f"{source} is off. The robots it stopped stay locked.")
 
 
-def _run(screen: Screen, controller: SafetyController, fleet: FleetScreen, reason: str) -> None:
+def _run(screen: Screen, controller: SafetyController | MeshController, fleet: FleetScreen, reason: str) -> None:
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     done = threading.Event()
@@ -143,7 +159,9 @@ class StopButton:
         reason: sent to the robots.
     """
 
-    def __init__(self, controller: SafetyController, expected: Callable[[], Collection[str]], reason: str) -> None:
+    def __init__(
+        self, controller: SafetyController | MeshController, expected: Callable[[], Collection[str]], reason: str
+    ) -> None:
         self.progress: Progress | None = None
         self.report: StopReport | None = None
         self._controller, self._expected, self._reason = controller, expected, reason
@@ -196,11 +214,13 @@ class FleetScreen:
 
     Args:
         controller: whose link and id are shown.
-        link: the network that is polled.
+        link: the network that is polled, or a function that polls it.
         check_in_s: seconds between the controller's check-ins, or None.
     """
 
-    def __init__(self, controller: SafetyController, link: LinkConfig, check_in_s: float | None) -> None:
+    def __init__(
+        self, controller: SafetyController | MeshController, link: LinkConfig | Reports, check_in_s: float | None
+    ) -> None:
         self._controller, self._link, self._check_in_s = controller, link, check_in_s
         self._robots: dict[str, LockoutReport] = {}
         self._problem = "Looking for robots..."
@@ -227,6 +247,10 @@ class FleetScreen:
             thread.join(2 * ASK_S + 1.0)
 
     def _poll(self) -> None:
+        if callable(self._link):
+            while not self._closed.wait(LOOK_S):
+                self.update(self._link(self._robots, ASK_S))
+            return
         from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - the network is loaded when it is used
 
         from strands_robots.device_connect import FleetClient  # noqa: PLC0415

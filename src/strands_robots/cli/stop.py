@@ -102,10 +102,11 @@ def estop(
     if devices and everything:
         raise CliError("estop takes DEVICE... or --all.", Exit.USAGE)
     if on_mesh:
-        if devices or key is not None:
-            raise CliError("estop --mesh stops every robot, and takes neither DEVICE nor --key.", Exit.USAGE)
+        if devices:
+            raise CliError("estop --mesh stops every robot, and takes no DEVICE.", Exit.USAGE)
         network.use_mesh()
-        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason), f" {LOCKED_MESH}")
+        on_key = None if key is None else signing_key(key, passphrase_file)
+        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason, on_key), f" {LOCKED_MESH}")
         return
     expected = [device_id("DEVICE", each) for each in devices or []]
     seconds = number("--deadline", deadline, above=0, high=600)

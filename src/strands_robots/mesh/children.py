@@ -18,7 +18,7 @@ from strands_robots.mesh import topics
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
-from strands_robots.mesh.safety import SafetyAdapter, status_of
+from strands_robots.mesh.safety import status_of
 from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Declaration, TransportError, undeclare
@@ -127,7 +127,7 @@ class Children:
         context: the parent's.
         pipeline: the parent's, whose threads and pending commands the children share.
         kind: the parent's type.
-        adapter: has the parent's lockouts, which hold its children as well.
+        safety: returns the parent's lockout, which holds its children as well; ``report`` returns all of it.
         own: the verbs that the parent answers for its children.
         teleop: the parent's input streams, which may drive any of the robots.
         audit: makes the audit of a child.
@@ -140,7 +140,8 @@ class Children:
         pipeline: Pipeline,
         *,
         kind: str,
-        adapter: SafetyAdapter,
+        safety: Callable[[], Mapping[str, Any]],
+        report: Callable[[], Mapping[str, Any]],
         own: Mapping[str, Own],
         teleop: TeleopReceivers,
         audit: Callable[[str], AuditThrottle],
@@ -149,7 +150,7 @@ class Children:
         self._world = world
         self._pipeline = pipeline
         self._kind = kind
-        self._adapter = adapter
+        self._safety, self._report = safety, report
         self._own = own
         self._teleop = teleop
         self._audit = audit
@@ -218,7 +219,7 @@ class Children:
             own={
                 **self._own,
                 **parents,
-                "status": status_of(robot, self._adapter),
+                "status": status_of(robot, self._report),
                 "execute": execute_on(robot, parent),
             },
             pending=self._pipeline.pending.of(name),
@@ -231,7 +232,7 @@ class Children:
             before_stop=self._teleop.void,
             after_stop=self._teleop.reap,
         )
-        presence = PresencePublisher(context, self._kind, robot.facts, self._adapter.facts)
+        presence = PresencePublisher(context, self._kind, robot.facts, self._safety)
         handles: list[Declaration] = []
         child = _Child(context, presence, pipeline, handles, context.monotonic())
         handles.append(transport.declare_subscriber(topics.command(peer), server.on_command))

@@ -20,11 +20,12 @@ from strands_robots.mesh.children import Children
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
+from strands_robots.mesh.hearing import Hearing
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Requester
-from strands_robots.mesh.safety import FleetSafety, SafetyAdapter, status_of
+from strands_robots.mesh.safety import FleetSafety, OnAnswers, SafetyAdapter, status_of
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
@@ -50,6 +51,7 @@ LOOP_JOIN_TIMEOUT_S = 2.0
 
 PRUNE_HZ = 1.0
 LATE_HZ = 2.0
+HEARING_HZ = 2.0
 TOKENS_HZ = 5.0
 DELIVERIES_MAX = 1024
 """Messages of the user's subscriptions that wait for their callbacks."""
@@ -125,7 +127,8 @@ class Mesh(SensorLoopsMixin):
         self._requester = Requester(context)
         self._teleop = TeleopReceivers(lambda source, device: InputReceiver(self, body_of(robot), source, device))
         self._description = Description(peer, robot)
-        self._presence = PresencePublisher(context, self.peer_type, self._describe, self._adapter.facts)
+        self._hearing = Hearing(context, self._adapter.halt)
+        self._presence = PresencePublisher(context, self.peer_type, self._describe, self._safety_facts)
         self._state = StateReader(peer, robot, parts.clock)
         self._steps = StepPublisher(context, robot, settings.number("STRANDS_MESH_STREAM_HZ"))
         self._delivery = BoundedExecutor(f"{peer}-delivery", 1, DELIVERIES_MAX, drop_oldest=True)
@@ -138,7 +141,7 @@ class Mesh(SensorLoopsMixin):
             "resume": lambda arguments: self._safety.on_resume_command(arguments.get("assertion")),
         }
         if robot is not None:
-            own["status"] = status_of(robot, self._adapter)
+            own["status"] = status_of(robot, lambda: {**self._adapter.report(), **self._hearing.facts()})
             own["execute"] = execute_on(robot, context, lambda: self._pipeline.closed)
         self._pipeline = Pipeline.of(
             robot, lambda: peer, hardware=hardware, authorize=SenderCheck(context, hardware=hardware), own=own
@@ -157,11 +160,15 @@ class Mesh(SensorLoopsMixin):
                 robot,
                 self._pipeline,
                 kind=self.peer_type,
-                adapter=self._adapter,
+                safety=self._safety_facts,
+                report=self._adapter.report,
                 own=answered_here,
                 teleop=self._teleop,
                 audit=parts.recorder,
             )
+
+    def _safety_facts(self) -> dict[str, Any]:
+        return {**self._adapter.facts(), **self._hearing.facts()}
 
     def _describe(self) -> dict[str, Any]:
         """Return the fields of presence: the robot's own, and the streams of this peer."""
@@ -227,6 +234,12 @@ class Mesh(SensorLoopsMixin):
             (topics.responses(peer), self._requester.on_response),
         ):
             self._handles.append(transport.declare_subscriber(key, receive))
+        if self.robot is not None:
+            if self._adapter.needs_check_in:
+                controllers = topics.check_in("*")
+                self._handles.append(transport.declare_subscriber(controllers, self._safety.on_check_in))
+            self.robot.gate.attach(self._hearing)
+            self._hearing.look()
         self._presence.start()
         every, rates = self._scheduler.every, topics.BY_NAME
         if self.robot is not None:
@@ -238,6 +251,7 @@ class Mesh(SensorLoopsMixin):
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
         every("tokens", TOKENS_HZ, self._presence.judge_tokens, quick=True)
         every("prune", PRUNE_HZ, self._prune, quick=True)
+        every("hearing", HEARING_HZ, self._hearing.look, quick=True)
         every("late peers", LATE_HZ, self._safety.late.look, quick=True)
         frames = frames_of(self.robot)
         if frames is not None:
@@ -247,6 +261,8 @@ class Mesh(SensorLoopsMixin):
         # A robot whose bus is wedged is announced all the same, by its name alone.
         self._presence.described.wait(DESCRIBE_S)
         every("presence", rates["presence"].rate_hz, self._presence.announce, quick=True)
+        if self.robot is not None and self._adapter.open_to_all:
+            logger.info("%s: any name on the mesh may stop and lock it; DEVICE_CONNECT_ESTOP_ALLOW is not set.", peer)
         if not settings.is_set("STRANDS_MESH_RESUME_PUBLIC_KEY"):
             logger.info("%s: no resume key is configured; an emergency stop is cleared at this machine only.", peer)
 
@@ -271,6 +287,8 @@ class Mesh(SensorLoopsMixin):
         self._handles = []
         alive += self._pipeline.close(left()) + self._delivery.stop(left()) + join(streams, left())
         self._context.transport = None
+        if self.robot is not None:
+            self.robot.gate.detach(self._hearing)
         self._context.audit.close()
         if alive:
             logger.warning("%s left the mesh with loops still running: %s.", self.peer_id, ", ".join(alive))
@@ -278,7 +296,7 @@ class Mesh(SensorLoopsMixin):
     def _publish_state(self) -> None:
         body = self._state.read()
         if body is not None:
-            self._context.put(topics.state(self.peer_id), body | self._adapter.facts())
+            self._context.put(topics.state(self.peer_id), body | self._safety_facts())
 
     def _prune(self) -> None:
         self._context.registry.prune()
@@ -444,10 +462,17 @@ class Mesh(SensorLoopsMixin):
         """Return the oldest epoch that locks this peer, or None."""
         return next(iter(self._adapter.epochs()), None)
 
-    def emergency_stop(self) -> list[dict[str, Any]]:
+    def emergency_stop(
+        self, signing_key: Any = None, *, estop_id: str = "", on_answers: OnAnswers = lambda replies: None
+    ) -> list[dict[str, Any]]:
         """Stop and lock this robot and every peer; return the answers.
 
         A peer that did not stop or did not answer is named at CRITICAL.
+
+        Args:
+            signing_key: for fleets that act on signed stops only.
+            estop_id: 32 hex digits, the same for one press; a fresh one by default.
+            on_answers: called with the replies so far.
 
         Raises:
             RuntimeError: this peer is not on the mesh.
@@ -455,7 +480,16 @@ class Mesh(SensorLoopsMixin):
         # A link that is down must not keep this robot from stopping; the fleet gets the stop later.
         if self._context.transport is None:
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
-        return self._safety.emergency_stop()
+        return self._safety.emergency_stop(signing_key, estop_id=estop_id, on_answers=on_answers)
+
+    def check_in_every(self, interval_s: float, signing_key: Any = None) -> None:
+        """Check in with robots that need a live controller, while this peer is joined.
+
+        Raises:
+            ValidationError: ``interval_s`` is not from 0.02 to 60.
+        """
+        hz = 1.0 / number("interval_s", interval_s, low=0.02, high=60)
+        self._scheduler.every("check-in", hz, lambda: self._safety.check_in(signing_key), quick=True)
 
     def resume(self, signing_key: Any, *, targets: list[str] | None = None) -> dict[str, Any]:
         """Clear this peer's lockout and the fleet's with the operator's key.

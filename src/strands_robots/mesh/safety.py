@@ -7,12 +7,15 @@ peers that missed it.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import secrets
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any
 
 from strands_robots.contract import Robot
@@ -23,10 +26,12 @@ from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
+from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch
+from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch, signed_bytes
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
+from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain
 from strands_robots.serving.pipeline import Own
 from strands_robots.serving.robot_verbs import PEER_VERBS, peer_stop_answer
@@ -56,6 +61,8 @@ ASK_S = 1.0
 """Seconds in which peers report the epochs that a resume is signed for."""
 
 Verdict = Callable[[], StopVerdict | None]
+OnAnswers = Callable[[list[dict[str, Any]]], None]
+"""Gets the replies to an emergency stop so far, on the thread that collects them."""
 
 
 class NoRobot:
@@ -88,6 +95,9 @@ class SafetyAdapter:
         self._key = key
         self._entry: Registered | None = None
         self._decision = StopRules()
+        self._check_ins = CheckInRules(self._decision if self._decision.required else StopRules(keys=()))
+        if robot is not None:
+            self._decision.require_keys()
         self.open()
 
     def open(self) -> None:
@@ -114,9 +124,44 @@ class SafetyAdapter:
         """Return each lockout with its source, reason and time."""
         return [each.fields() for each in self._entry.latch.state.all] if self._entry is not None else []
 
-    def source_refusal(self, source: str) -> str | None:
+    def report(self) -> dict[str, Any]:
+        """Return the fields of ``status``: the lockouts and the check-in."""
+        check_in = self._plane.checkin.fields(time.monotonic())
+        return {**self.facts(), "lockout": self.lockouts(), "check_in": check_in}
+
+    def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
         """The reason why an e-stop of ``source`` does not count, or None."""
-        return self._decision.source_refusal(source)
+        why = self._decision.source_refusal(source)
+        if why is None and self._decision.required:
+            why = self._decision.signature_refusal(source, body, Purpose.EMERGENCY_STOP)
+        return why
+
+    @property
+    def open_to_all(self) -> bool:
+        """True when an e-stop of any name counts."""
+        return self._decision.open and not self._decision.required
+
+    @property
+    def needs_check_in(self) -> bool:
+        """True when this process's robots need a live controller."""
+        return self._plane.checkin.on
+
+    def check_in(self, source: str, body: Mapping[str, Any]) -> str | None:
+        """Record a controller's check-in, or return the reason why it does not count."""
+        why = self._check_ins.refusal(source, body)
+        if why is None:
+            self._plane.checkin.record(source, time.monotonic())
+        return why
+
+    def halt(self, reason: str) -> None:
+        """Void every motion of this robot and halt it; return at once."""
+        self._robot.gate.revoke()
+
+        def halted(verdict: Future[StopVerdict]) -> None:
+            if verdict.result().stopped is not True:
+                logger.critical("%s DID NOT STOP: %s", self._peer_id, verdict.result().envelope().get("reason"))
+
+        self._plane.executor.submit(self._robot, self._peer_id, reason).add_done_callback(halted)
 
     def begin(self, order: StopOrder) -> Verdict | None:
         """Lock under the order's epoch and start the halt; None for a known epoch.
@@ -147,13 +192,13 @@ class SafetyAdapter:
             entry.close()
 
 
-def status_of(robot: Robot, adapter: SafetyAdapter) -> Own:
-    """Make the ``status`` of a peer: what the robot answers, with its lockouts."""
+def status_of(robot: Robot, facts: Callable[[], Mapping[str, Any]]) -> Own:
+    """Make the ``status`` of a peer: what the robot answers, with the safety facts."""
 
     def status(arguments: Arguments) -> object:
         run = PEER_VERBS["status"].run
         answer = run(robot, arguments) if run is not None else None
-        return {**answer, **adapter.facts(), "lockout": adapter.lockouts()} if isinstance(answer, Mapping) else answer
+        return {**answer, **facts()} if isinstance(answer, Mapping) else answer
 
     return status
 
@@ -241,30 +286,39 @@ class FleetSafety:
         self._recent: deque[str] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
+        self._latest = ""
+        self._press = ("", 0.0)
 
     def locked(self) -> bool:
         return bool(self._adapter.epochs())
 
     # Issuing.
 
-    def emergency_stop(self) -> list[dict[str, Any]]:
+    def emergency_stop(
+        self, signing_key: Any = None, *, estop_id: str = "", on_answers: OnAnswers = lambda replies: None
+    ) -> list[dict[str, Any]]:
         """Stop this robot and every peer; return their replies, the local one first."""
         context = self._context
-        order = StopOrder(new_epoch(), context.peer_id, "emergency stop", "mesh", issued=context.clock())
+        if not estop_id or estop_id != self._press[0]:
+            self._press = (estop_id or new_epoch(), context.clock())
+        epoch, pressed = self._press
+        order = StopOrder(epoch, context.peer_id, "emergency stop", "mesh", issued=context.clock(), pressed=pressed)
+        self._latest = order.epoch
         # The fleet receives the stop while the local robot halts.
         local = self._adapter.begin(order)
         none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
-        self._publish_estop(order, none)
+        self._publish_estop(order, none, signing_key)
         roster = {row["peer_id"] for row in context.registry.all() if row["reachable"]} - {context.peer_id}
         published = time.monotonic()
 
         def missing(replies: list[dict[str, Any]]) -> set[str]:
             nonlocal published
+            on_answers(replies)
             absent = roster - {str(reply["responder_id"]) for reply in replies}
             if absent and time.monotonic() - published >= SPACING_S:
                 # A link that was down when the stop was published may be back: the same stop again.
                 published = time.monotonic()
-                self._publish_estop(order, none)
+                self._publish_estop(order, none, signing_key)
             return absent
 
         replies = self._requester.broadcast({"action": "stop"}, COLLECT_S, missing)
@@ -282,14 +336,14 @@ class FleetSafety:
             "peers_not_stopped": len(not_stopped),
             "peers_silent": len(silent),
         }
-        self._publish_estop(order, counts)
+        self._publish_estop(order, counts, signing_key)
         self._publish_event("emergency_stop", order.epoch)
         unreached = (roster | context.registry.seen_within(KNOWN_S)) - stopped - {context.peer_id}
         self._retry.begin(
             order.epoch,
             unreached,
             lambda: order.epoch in self._adapter.epochs(),
-            lambda: self._publish_estop(order, counts),
+            lambda: self._publish_estop(order, counts, signing_key),
         )
         context.audit.always(
             "emergency_stop",
@@ -309,12 +363,13 @@ class FleetSafety:
         result = peer_stop_answer(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
         return [wire.Reply("response", context.peer_id, order.epoch, result, timestamp=context.clock()).to_wire()]
 
-    def _publish_estop(self, order: StopOrder, counts: dict[str, Any]) -> None:
+    def _publish_estop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> None:
+        # The time is that of the sending, because peers in the field refuse what is older than a minute.
         context = self._context
-        issued = order.issued if order.issued is not None else context.clock()
         counts = {**counts, "lockout_engaged": True}
-        notice = wire.EstopNotice(context.peer_id, issued, order.epoch, context.session_id(), counts)
-        self._publish(topics.estop(), notice.to_wire(), f"Emergency stop {order.epoch}", logging.CRITICAL)
+        notice = wire.EstopNotice(context.peer_id, context.clock(), order.epoch, context.session_id(), counts)
+        body = self._signed({**notice.to_wire(), "pressed_at": order.pressed}, Purpose.EMERGENCY_STOP, signing_key)
+        self._publish(topics.estop(), body, f"Emergency stop {order.epoch}", logging.CRITICAL)
 
     # Receiving.
 
@@ -322,6 +377,8 @@ class FleetSafety:
         """Receive a fleet e-stop; on return all robots are locked and halting."""
         received = time.monotonic()
         context = self._context
+        if not sample.payload:
+            return  # a broker's stored stop was cleared
         try:
             body = wire.decode(sample.payload, topics.BY_NAME["estop"].max_bytes)
             _require_same_session(body, sample)
@@ -331,11 +388,12 @@ class FleetSafety:
             return
         if notice.peer_id == context.peer_id and sample.session == context.session_id():
             return
-        why = self._adapter.source_refusal(notice.peer_id)
+        why = self._adapter.stop_refusal(notice.peer_id, body)
         if why is not None:
             context.audit("estop_rejected", notice.peer_id, reason=why)
             return
         epoch = notice.estop_id or derived_epoch(notice.peer_id, json.dumps(body["t"]).encode())
+        self._latest = epoch
         if epoch in self._recent:
             self.late.heard(epoch)
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
@@ -343,7 +401,8 @@ class FleetSafety:
         if sample.retained and epoch in self._resumed:
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch, reason="resumed since")
             return
-        order = StopOrder(epoch, notice.peer_id, "fleet e-stop", "mesh", True, notice.t, received)
+        pressed = wire.finite(body.get("pressed_at"))
+        order = StopOrder(epoch, notice.peer_id, "fleet e-stop", "mesh", True, notice.t, received, pressed)
         self._recent.append(epoch)
         # The plane locks and starts the halts at once; nothing on this path waits.
         if self._adapter.begin(order) is None:
@@ -358,7 +417,9 @@ class FleetSafety:
         """Publish a stop of another issuer again, from our session."""
         session = self._context.session_id()
         bare = {key: value for key, value in body.items() if key != "source_zid"}
-        again = {**bare, "t": self._context.clock()} | ({} if session is None else {"source_zid": session})
+        # A signature covers the time, so a signed stop keeps it.
+        sent = {} if "sig" in bare else {"t": self._context.clock()}
+        again = {**bare, **sent} | ({} if session is None else {"source_zid": session})
         self._publish(topics.estop(), again, f"Emergency stop {body['estop_id']}", logging.CRITICAL)
 
     def _publish_event(self, event: str, epoch: str) -> None:
@@ -470,7 +531,7 @@ class FleetSafety:
 
     def _note_retained(self, assertion: Any) -> None:
         """Note the epoch of a retained resume, which ends its retained e-stop."""
-        if not isinstance(assertion, dict) or self._context.peer_id not in (assertion.get("targets") or ()):
+        if not isinstance(assertion, dict):
             return
         signature = ed25519.decode(assertion.get("sig"), 64)
         try:
@@ -502,6 +563,45 @@ class FleetSafety:
         context = self._context
         relay = wire.ResumeRelay(context.peer_id, context.clock(), assertion, context.session_id())
         self._publish(topics.resume(), relay.to_wire(), "A resume", logging.ERROR)
+        transport = context.transport
+        if transport is not None and isinstance(assertion, dict) and assertion.get("epoch") == self._latest:
+            # A newcomer must not be locked by a stop that is over.
+            with contextlib.suppress(TransportError):
+                transport.clear_retained(topics.estop())
+
+    # Check-in.
+
+    def check_in(self, signing_key: Any = None) -> None:
+        """Check in with the robots that need a live controller."""
+        peer = self._context.peer_id
+        body = self._signed({"peer_id": peer, "estop_id": new_epoch()}, Purpose.CHECK_IN, signing_key)
+        self._publish(topics.check_in(peer), body, "A check-in", logging.ERROR)
+
+    def on_check_in(self, sample: Sample) -> None:
+        """Record the check-in of a controller; a refused one is audited."""
+        context = self._context
+        try:
+            body = wire.decode(sample.payload, topics.BY_NAME["checkin"].max_bytes)
+            source = identifier("peer_id", body.get("peer_id"))
+        except (wire.WireError, ValidationError) as exc:
+            context.audit("checkin_rejected", reason=str(exc))
+            return
+        bound = context.registry.session_of(source)
+        if sample.key != topics.check_in(source) or (bound is not None and bound != sample.session):
+            context.audit("checkin_rejected", source, reason="the topic or the session is another peer's")
+            return
+        why = self._adapter.check_in(source, body)
+        if why is not None:
+            context.audit("checkin_rejected", source, reason=why)
+
+    def _signed(self, fields: dict[str, Any], purpose: Purpose, signing_key: Any) -> dict[str, Any]:
+        """Return the fields with the time; with a key also signed."""
+        stated = {**fields, "t": self._context.clock()}
+        if signing_key is None:
+            return stated
+        stated["nonce"] = secrets.token_hex(16)
+        covered = signed_bytes(purpose, self._context.peer_id, stated)
+        return {**stated, "sig": ed25519.encode(signing_key.sign(covered))}
 
     def _denied(self, why: str) -> dict[str, Any]:
         self._context.audit("resume_denied", reason=why)

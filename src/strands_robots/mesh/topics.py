@@ -44,6 +44,7 @@ class Topic:
 TABLE: tuple[Topic, ...] = (
     Topic("estop", "strands/safety/estop", 0, None, 4 * KIB, True, True, 1, True, True),
     Topic("resume", "strands/safety/resume", 0, None, 4 * KIB, True, True, 1, True, True),
+    Topic("checkin", "strands/*/checkin", 0, None, 4 * KIB, True, True, 1, False, True),
     Topic("broadcast", "strands/broadcast", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("cmd", "strands/*/cmd", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("response", "strands/*/response/**", 0, None, 1024 * KIB, True, True, 1, False, True),
@@ -83,6 +84,10 @@ def command(peer: str) -> str:
 
 def broadcast() -> str:
     return f"{ROOT}/broadcast"
+
+
+def check_in(controller: str) -> str:
+    return f"{ROOT}/{controller}/checkin"
 
 
 def response(requester: str, responder: str, turn: str) -> str:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import MissingExtraError, ValidationError
 
@@ -142,15 +143,16 @@ class NativeMesh:
 
         return _on_mesh(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str) -> Envelope:
+    def emergency_stop(self, reason: str, signing_key: Any = None) -> Envelope:
         """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
-        A peer that was seen and did not answer is named. Each repetition is an epoch of its own; one signed resume
-        clears all of them. ``estop_id`` names the first.
+        A peer that was seen and did not answer is named. Every repetition is the same stop, ``estop_id``.
         """
+        estop_id = new_epoch()
 
         def stopped(mesh: Mesh) -> Envelope:
-            return {**_stop_all(mesh, mesh.emergency_stop), "estop_id": mesh.lockout_epoch}
+            answer = _stop_all(mesh, lambda: mesh.emergency_stop(signing_key, estop_id=estop_id))
+            return {**answer, "estop_id": estop_id}
 
         return _on_mesh(stopped, stopped=None)
 

@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from fixtures.command_line import Machine
+from fixtures.command_line import COMMAND, Machine, on_a_terminal
 from fixtures.waiting import eventually
 from typer.testing import CliRunner
 
@@ -104,3 +104,17 @@ def test_resume_of_a_silent_peer_of_the_mesh_is_no_success(tmp_path: Path, machi
     assert machine.json(*signed)[0] == 3
     code, answer = machine.json(*signed, "--targets", "arm-9", "--timeout", "0.5")
     assert (code, answer["devices"]["arm-9"]["free"]) == (1, False)
+
+
+def test_space_bar_stops_the_mesh_and_its_check_in_keeps_a_robot_free(machine: Machine) -> None:
+    line = [*COMMAND, "safety-controller", "--mesh", "--id", "desk-1", "--check-in", "0.2"]
+    with on_a_terminal(line, machine.environment) as terminal:
+        eventually(lambda: "the stop link is up; checks in every 0.2 s" in terminal.drawn, within=60)
+        with machine.serving("arm-1", "--mesh", STRANDS_CHECKIN_TIMEOUT_S="30"):
+            eventually(lambda: "s left" in terminal.drawn, within=60)
+            assert "LOCKED" not in terminal.drawn
+            terminal.press(" ")
+            eventually(lambda: "1 stopped, in" in terminal.drawn and "LOCKED" in terminal.drawn, within=60)
+            terminal.press("q")
+            assert terminal.process.wait(60) == 0
+    assert "Traceback" not in terminal.drawn

@@ -1,0 +1,25 @@
+"""Report of one robot's lockouts, on either network."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from strands_robots.safety.lockout import Lockout
+
+
+@dataclass(frozen=True, slots=True)
+class LockoutReport:
+    """Lockouts and status of one robot; ``problem`` is empty if it reports them.
+
+    ``at`` is the time of the report in monotonic seconds.
+    """
+
+    name: str
+    lockouts: tuple[Lockout, ...] = ()
+    problem: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    round_trip_ms: float = 0.0
+    at: float = field(default_factory=time.monotonic)

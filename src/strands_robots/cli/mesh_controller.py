@@ -1,0 +1,96 @@
+"""The native mesh's side of ``safety-controller --mesh``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.cli.lockout_report import LockoutReport
+from strands_robots.cli.resume_mesh import ask_peers, lockable_peers
+from strands_robots.safety.controller import Answer, OnProgress, Press, Progress, StopReport
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.stopping import explain
+from strands_robots.tools.networks import stop_outcome
+
+if TYPE_CHECKING:
+    from strands_robots.mesh import Mesh
+
+
+class MeshController:
+    """A safety controller whose stops and check-ins travel on the mesh.
+
+    Args:
+        mesh: the peer that sends them, under its own id.
+        signing_key: Ed25519 private key, for fleets that act on signed stops only.
+    """
+
+    def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
+        self._mesh = mesh
+        self._key = signing_key
+        self._press = ("", Press(0.0, 0.0))
+        self.controller_id = mesh.peer_id
+
+    @property
+    def link_up(self) -> bool:
+        """True while this peer is on the mesh."""
+        return self._mesh.alive
+
+    def press(self, estop_id: str) -> None:
+        """Note the moment of a press, from which its answers are counted."""
+        self._press = (estop_id, Press(time.monotonic(), time.time()))
+
+    def check_in_every(self, interval_s: float) -> None:
+        """Check in with the robots that need a live controller."""
+        self._mesh.check_in_every(interval_s, self._key)
+
+    def stop(
+        self,
+        expected: Collection[str] = (),
+        reason: str = "",
+        *,
+        estop_id: str = "",
+        on_progress: OnProgress = lambda progress: None,
+    ) -> StopReport:
+        """Stop every peer of the mesh and wait for their answers, at most three seconds."""
+        epoch = estop_id or new_epoch()
+        if self._press[0] != epoch:
+            self.press(epoch)
+        pressed = self._press[1]
+        answers: dict[str, Answer] = {}
+
+        def note(replies: list[dict[str, Any]]) -> None:
+            for reply in replies:
+                name = str(reply["responder_id"])
+                if name not in answers or answers[name].stopped is not True:
+                    answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000)
+            silent = tuple(sorted(set(expected) - answers.keys()))
+            elapsed = (time.monotonic() - pressed.at) * 1000
+            on_progress(Progress(epoch, dict(answers), silent, self.link_up, elapsed))
+
+        note([])
+        up = self.link_up
+        note(self._mesh.emergency_stop(self._key, estop_id=epoch, on_answers=note))
+        robots = {*expected, *lockable_peers(self._mesh)}
+        told = {name: each for name, each in answers.items() if name in robots}
+        return StopReport(
+            epoch,
+            {name: each for name, each in told.items() if each.stopped is True},
+            {name: each for name, each in told.items() if each.stopped is not True},
+            {},
+            tuple(sorted(set(expected) - told.keys())),
+            up,
+            (time.monotonic() - pressed.at) * 1000,
+        )
+
+    def reports(self, known: Collection[str], seconds: float) -> list[LockoutReport]:
+        """Ask the robots in reach and those known for their lockouts."""
+        return ask_peers(self._mesh, sorted({*lockable_peers(self._mesh), *known}), seconds)
+
+
+def _answer(name: str, reply: dict[str, Any], latency_ms: float) -> Answer:
+    result = reply.get("result")
+    if reply.get("type") != "response" or not isinstance(result, dict):
+        return Answer(name, None, latency_ms, str(reply.get("error", "no answer")))
+    stopped, _ = stop_outcome(result)
+    return Answer(name, stopped, latency_ms, "" if stopped else explain(result), result)
