@@ -125,3 +125,47 @@ def test_invalid_publication_is_refused_before_a_thread_starts() -> None:
             Bridge(Arm()).start(**options)
     with pytest.raises(ValidationError, match="robot must be given"):
         Bridge(None).start()
+
+
+def streaming(arm: Arm, speed: float) -> RosTelemetryBase:
+    return RosTelemetryBase(
+        arm,
+        domain_id=0,
+        enable_commands=True,
+        command_robot_name=None,
+        period=0.02,
+        period_name="period",
+        max_joint_speed=speed,
+    )
+
+
+def test_far_command_is_cut_to_what_the_joint_may_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    arm = Arm()
+    made = streaming(arm, 1.0)
+    assert made.apply({"name": ["a.pos"], "position": [9.0]})
+    now[0] += 0.05
+    assert made.apply({"name": ["a.pos"], "position": [9.0]})
+    now[0] += 0.05
+    assert made.apply({"name": ["a.pos"], "position": [0.6]})
+    # It starts where the arm is, 0.5; the first command has a tenth of a second.
+    assert [each["a.pos"] for each in arm.taken] == pytest.approx([0.6, 0.65, 0.6])
+
+
+def test_stream_that_paused_starts_where_the_arm_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    arm = Arm()
+    made = streaming(arm, 1.0)
+    made.apply({"name": ["a.pos"], "position": [0.6]})
+    arm.state = {"joints": {"a.pos": -0.5}}
+    now[0] += 60.0
+    made.apply({"name": ["a.pos"], "position": [0.6]})
+    assert arm.taken[-1]["a.pos"] == pytest.approx(-0.4)
+
+
+@pytest.mark.parametrize("speed", [0, -1.0, math.nan, True, "fast"])
+def test_unusable_joint_speed_is_refused_by_name(speed: Any) -> None:
+    with pytest.raises(ValidationError, match="max_joint_speed"):
+        streaming(Arm(), speed)

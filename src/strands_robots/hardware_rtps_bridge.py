@@ -7,7 +7,7 @@ from typing import Any
 
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.dds_security import DdsCredentials, checked_credentials, governance_gap
-from strands_robots.ros_telemetry import RosTelemetryBase, refuse_unsecured
+from strands_robots.ros_telemetry import JOINT_SPEED, RosTelemetryBase, refuse_unsecured
 from strands_robots.utils import missing_extra
 
 
@@ -18,7 +18,7 @@ class HardwareRtpsBridge(RosTelemetryBase):
 
     Args:
         robot: see :class:`~strands_robots.ros_telemetry.RosTelemetryBase`, as for ``enable_commands``,
-            ``command_robot_name`` and ``joint_limits``.
+            ``command_robot_name``, ``joint_limits`` and ``max_joint_speed``.
         domain_id: DDS domain, 0 to 232.
         poll_period: seconds between two looks for a command, above 0.
         dds_security_config: paths, ``file:`` or ``data:,`` URIs of ``identity_ca``, ``certificate``, ``private_key``,
@@ -41,6 +41,7 @@ class HardwareRtpsBridge(RosTelemetryBase):
         command_robot_name: str | None = None,
         poll_period: float = 0.02,
         joint_limits: dict[str, tuple[float, float]] | None = None,
+        max_joint_speed: float = JOINT_SPEED,
         dds_security_config: dict[str, str] | None = None,
     ) -> None:
         super().__init__(
@@ -51,6 +52,7 @@ class HardwareRtpsBridge(RosTelemetryBase):
             period=poll_period,
             period_name="poll_period",
             joint_limits=joint_limits,
+            max_joint_speed=max_joint_speed,
         )
         if find_spec("cyclonedds") is None:
             raise missing_extra("HardwareRtpsBridge", "ros2")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import threading
 import time
@@ -13,6 +14,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.envelope import is_error, text_of
+from strands_robots.policies.base import SpeedLimit, numbers
 from strands_robots.ros.link import BroadcastLink, Message
 from strands_robots.ros.names import DOMAIN_MAX
 from strands_robots.ros.names import node_name as checked_node_name
@@ -28,6 +30,12 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 IMAGE = "sensor_msgs/msg/Image"
 
 RATE_MAX_HZ = 200.0
+
+JOINT_SPEED = 360.0
+"""Default bound of a commanded joint in the robot's unit a second: a turn, in degrees."""
+
+STREAM_S = 0.1
+"""Longest pause between two commands of a stream; after a longer one the arm's own joints are where it begins."""
 
 Limits = dict[str, tuple[float, float]]
 
@@ -85,6 +93,8 @@ class RosTelemetryBase:
         command_robot_name: name in the command topic; the robot's own by default.
         period: seconds between two looks for a command, above 0; refusals call it ``period_name``.
         joint_limits: ``{"<motor>.pos": (min, max)}`` in the robot's unit; others are not limited here.
+        max_joint_speed: bound of a joint in the robot's unit a second. A command that goes beyond is cut to it, so a
+            far target is reached by a stream of commands and not by one.
 
     Raises:
         ValidationError: an argument outside its domain, before anything else has happened.
@@ -100,6 +110,7 @@ class RosTelemetryBase:
         period: float,
         period_name: str,
         joint_limits: dict[str, tuple[float, float]] | None = None,
+        max_joint_speed: float = JOINT_SPEED,
     ) -> None:
         self._takes_commands = flag("enable_commands", enable_commands) and robot is not None
         self.domain_id = whole("domain_id", domain_id, low=0, high=DOMAIN_MAX)
@@ -110,6 +121,9 @@ class RosTelemetryBase:
         own = str(getattr(robot, "tool_name_str", "") or "robot")
         self.command_topic = f"/{segment(own if command_robot_name is None else command_robot_name)}/joint_command"
         self._limits = checked_limits(joint_limits)
+        self._max_speed = number("max_joint_speed", max_joint_speed, above=0)
+        self._sent: dict[str, float] = {}
+        self._sent_at = -math.inf
         # One place: a newer command replaces an older one.
         self._latest: deque[Message] = deque(maxlen=1)
         self._done = threading.Event()
@@ -222,15 +236,31 @@ class RosTelemetryBase:
             logger.warning("A command on %s is dropped whole: %s.", self.command_topic, problem)
             return False
         try:
+            action = self._within_speed({str(n): float(p) for n, p in zip(names, positions, strict=True)})
             # The robot's own verb asks its own gate: a locked robot refuses here as on every other path.
-            answer = self._robot.send_action({str(n): float(p) for n, p in zip(names, positions, strict=True)})
+            answer = self._robot.send_action(action)
         except Exception:
             logger.exception("%s did not take a command.", self.command_topic)
             return False
         if is_error(answer):
             logger.warning("%s was refused: %s", self.command_topic, text_of(answer))
             return False
+        self._sent, self._sent_at = {**self._sent, **action}, time.monotonic()
         return True
+
+    def _within_speed(self, action: dict[str, float]) -> dict[str, float]:
+        """Cut each target to what the joint may go since the last command."""
+        since = time.monotonic() - self._sent_at
+        start = self._sent
+        if since > STREAM_S:
+            # Whatever was commanded then, the arm may be elsewhere now.
+            state: dict[str, Any] = getattr(self._robot, "get_state", dict)()
+            start = {**start, **numbers(state.get("joints") or {})}
+        limit = SpeedLimit(dict.fromkeys(action, (-math.inf, math.inf)), 1.0, self._max_speed)
+        cut = limit.limit(action, start, min(max(since, self._period_s), STREAM_S))
+        if cut != action:
+            logger.info("A command on %s is cut to %g a second: %s.", self.command_topic, self._max_speed, cut)
+        return cut
 
     def _begin(self, link: BroadcastLink, name: str, *, open_now: bool = False) -> None:
         """Use this link from now on, and take commands from it where enabled.
@@ -278,7 +308,8 @@ class RosTelemetryBridge(RosTelemetryBase):
     """Bridge through rclpy, for real robots and for simulations.
 
     Args:
-        robot: see :class:`RosTelemetryBase`, as for ``enable_commands``, ``command_robot_name`` and ``joint_limits``.
+        robot: see :class:`RosTelemetryBase`, as for ``enable_commands``, ``command_robot_name``, ``joint_limits`` and
+            ``max_joint_speed``.
         domain_id: ROS 2 domain, 0 to 232. The node has a context of its own, so no environment variable is written.
         node_name: name of the node; each subclass has its own default.
         qos_depth: KEEP_LAST history of each endpoint, 1 to :data:`MAX_QOS_HISTORY_DEPTH`.
@@ -302,6 +333,7 @@ class RosTelemetryBridge(RosTelemetryBase):
         command_robot_name: str | None = None,
         spin_period: float = 0.02,
         joint_limits: dict[str, tuple[float, float]] | None = None,
+        max_joint_speed: float = JOINT_SPEED,
     ) -> None:
         super().__init__(
             robot,
@@ -311,6 +343,7 @@ class RosTelemetryBridge(RosTelemetryBase):
             period=spin_period,
             period_name="spin_period",
             joint_limits=joint_limits,
+            max_joint_speed=max_joint_speed,
         )
         depth = whole("qos_depth", qos_depth, low=1, high=MAX_QOS_HISTORY_DEPTH)
         name = checked_node_name("node_name", self.default_node_name if node_name is None else node_name)

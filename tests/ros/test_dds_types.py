@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from cyclonedds.idl._machinery import BytesMachine
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from strands_robots.ros.dds import filled, plain
 from strands_robots.ros.dds_types import KINDS, Image, JointState, Odometry, Twist
 from strands_robots.ros.link import RosError
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+# turtlesim is not among the packages of rosbags; the fields are those of its Pose.msg.
+TURTLE = "float32 x\nfloat32 y\nfloat32 theta\nfloat32 linear_velocity\nfloat32 angular_velocity\n"
+STORE.register(get_types_from_msg(TURTLE, "turtlesim/msg/Pose"))
 OLD = importlib.metadata.version("cyclonedds").startswith("0.10.")
 
 
@@ -40,6 +43,8 @@ def some(hint: Any, zero: Any, rng: random.Random) -> Any:
         return rng.choice(["", "base", "odométrie"])
     inner = typing.get_args(typing.get_args(hint)[0])[0]
     kind = (typing.get_args(inner) or (inner,))[0]
+    if "int8" in typing.get_args(inner):
+        return [rng.randrange(-128, 128) for _ in range(rng.randrange(4))]
     return [some(kind, kind(), rng) for _ in range(len(zero) or rng.randrange(4))]
 
 

@@ -15,7 +15,7 @@ from typing import Any, get_args, get_type_hints
 from strands_robots import settings
 from strands_robots.ros.dds_security import checked_credentials, presenting
 from strands_robots.ros.link import Message, OnMessage, RosError, Unwatch, next_message
-from strands_robots.ros.names import absolute, bare_kind, domain
+from strands_robots.ros.names import absolute, bare_kind, domain, is_latched
 from strands_robots.utils import missing_extra, number, shown
 
 logger = logging.getLogger(__name__)
@@ -108,8 +108,12 @@ class DdsLink:
     def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
         sub, qos, core = _dds("sub"), _dds("qos"), _dds("core")
         struct = _struct(kind or self._kind_of(topic))
-        # Best effort takes what a sensor sends so as well as what is sent reliably.
-        quality = qos.Qos(qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepLast(DEPTH))
+        # Best effort takes what a sensor sends so as well as what is sent reliably; what is latched is sent so.
+        policies = [qos.Policy.Reliability.BestEffort, qos.Policy.History.KeepLast(DEPTH)]
+        if is_latched(topic):
+            reliable = qos.Policy.Reliability.Reliable(max_blocking_time=_SLICE_MS * 1_000_000)
+            policies = [reliable, qos.Policy.Durability.TransientLocal, *policies[1:]]
+        quality = qos.Qos(*policies)
         with self._lock:
             participant = self.open()
             try:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint32
+from cyclonedds.idl.types import array, float32, float64, int8, int32, sequence, uint32
 
 from strands_robots.ros._compat import pack_as_bytes
 
@@ -39,6 +39,7 @@ def _thirty_six() -> list[float]:
 if TYPE_CHECKING:
     Strings = list[str]
     Float32s = list[float]
+    Int8s = list[int]
     Float64s = list[float]
     Nine = list[float]
     ThirtySix = list[float]
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 else:
     Strings = sequence[str]
     Float32s = sequence[float32]
+    Int8s = sequence[int8]
     Float64s = sequence[float64]
     Bytes = sequence[byte]
     Nine = array[float64, 9]
@@ -157,6 +159,31 @@ class Odometry(IdlStruct, **_typed("nav_msgs/Odometry")):
     child_frame_id: str = ""
     pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
     twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+
+
+@dataclass
+class MapMetaData(IdlStruct, **_typed("nav_msgs/MapMetaData")):
+    map_load_time: Time = field(default_factory=Time)
+    resolution: float32 = 0.0
+    width: uint32 = 0
+    height: uint32 = 0
+    origin: Pose = field(default_factory=Pose)
+
+
+@dataclass
+class OccupancyGrid(IdlStruct, **_typed("nav_msgs/OccupancyGrid")):
+    header: Header = field(default_factory=Header)
+    info: MapMetaData = field(default_factory=MapMetaData)
+    data: Int8s = field(default_factory=list)
+
+
+@dataclass
+class TurtlePose(IdlStruct, **_typed("turtlesim/Pose")):
+    x: float32 = 0.0
+    y: float32 = 0.0
+    theta: float32 = 0.0
+    linear_velocity: float32 = 0.0
+    angular_velocity: float32 = 0.0
 
 
 @dataclass

@@ -84,6 +84,18 @@ class UrgentLink(Protocol):
         """Drop everything that the first connection has not sent yet."""
 
 
+class NoReceiptError(RosError):
+    """A message was sent, and the server has not confirmed that it received it."""
+
+
+@runtime_checkable
+class ConfirmingLink(Protocol):
+    """A link that can ask whether what it sent has arrived."""
+
+    def confirm(self, within_s: float) -> None:
+        """Wait until everything sent has arrived, else :class:`NoReceiptError`."""
+
+
 @runtime_checkable
 class GoalLink(Protocol):
     """A link that carries actions."""

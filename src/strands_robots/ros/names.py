@@ -14,6 +14,9 @@ NAME_MAX = 255
 DOMAIN_MAX = 232
 """Highest DDS domain: RTPS derives its UDP ports from it, and those of 233 are past 65535."""
 
+LATCHED = ("/robot_description", "/map", "/tf_static")
+"""Topics whose publishers keep their last message for a late subscription, by the conventions of ROS 2."""
+
 _NAME = re.compile(r"[/~]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _KIND = re.compile(r"([a-z][a-z0-9_]*)/(?:(?:msg|srv|action)/)?([A-Z][A-Za-z0-9]*)\Z")
@@ -35,6 +38,11 @@ def interface(name: str, value: object) -> str:
             f"{name} must be a ROS type such as geometry_msgs/msg/Twist or geometry_msgs/Twist, not {shown(value)}."
         )
     return value
+
+
+def is_latched(topic: str) -> bool:
+    """Return True for a latched topic, by its name in any namespace."""
+    return any(absolute(topic).endswith(name) for name in LATCHED)
 
 
 @lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ from typing import Any
 from weakref import WeakSet
 
 from strands_robots.ros.link import CancelCheck, Goal, Message, OnMessage, RosError, Unwatch, never, next_message
-from strands_robots.ros.names import absolute, bare_kind, class_place, domain, node_name
+from strands_robots.ros.names import absolute, bare_kind, class_place, domain, is_latched, node_name
 from strands_robots.ros.rclpy_session import RclpySession, ros2
 from strands_robots.utils import number, shown, whole
 
@@ -90,9 +90,13 @@ class RclpyLink:
     def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
         session = self.open()
         qos = ros2("rclpy.qos")
-        # Best effort takes what a sensor sends so as well as what is sent reliably.
+        latched = is_latched(topic)
+        # Best effort takes what a sensor sends so as well as what is sent reliably; what is latched is sent so.
         profile = qos.QoSProfile(
-            history=qos.HistoryPolicy.KEEP_LAST, depth=self._depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT
+            history=qos.HistoryPolicy.KEEP_LAST,
+            depth=self._depth,
+            reliability=qos.ReliabilityPolicy.RELIABLE if latched else qos.ReliabilityPolicy.BEST_EFFORT,
+            durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if latched else qos.DurabilityPolicy.VOLATILE,
         )
         struct = interface_class(kind or self._kind_of(topic), "msg")
         deliver = _deliver_to(on_message, topic)

@@ -20,8 +20,10 @@ from strands_robots.ros.link import (
     Unwatch,
     never,
 )
+from strands_robots.ros.names import bare_kind
 from strands_robots.ros.rosbridge_session import (
     Fragments,
+    RosbridgeAccess,
     RosbridgeSession,
     UrgentConnection,
     decoded,
@@ -34,6 +36,13 @@ logger = logging.getLogger(__name__)
 
 ROSAPI_S = 5.0
 """Seconds within which the server's own services answer."""
+
+LOOKS = 3
+"""Times that the server is asked for our publisher; a graph may need a second or two to show a new one."""
+
+
+_INQUIRIES = {"/rosapi/topic_type": "rosapi/TopicType", "/rosapi/publishers": "rosapi/Publishers"}
+"""Services that show whether a server publishes for us, with their types."""
 
 
 @dataclass(slots=True)
@@ -62,6 +71,17 @@ class _Subscription:
     kind: str | None
     watchers: list[OnMessage]
     failed: list[Callable[[str], None]]
+    silent: bool = True
+
+
+@dataclass(slots=True)
+class _Inquiry:
+    """Question whether the graph has our publisher of a topic."""
+
+    kind: str
+    looks: int = 0
+    typed: bool = False
+    listed: bool = False
 
 
 class RosbridgeLink:
@@ -71,18 +91,28 @@ class RosbridgeLink:
 
     A lost connection is reopened, its subscriptions restored and its topics advertised anew; what is sent meanwhile
     is refused, not queued: a velocity that arrives late is worse than one that does not. A ``status`` error of the
-    server fails the request that it names, or the next publish on the topic that it names, and is logged.
+    server fails the request that it names, or the next publish on the topic that it names, and is logged. A server
+    that sends none, as rosbridge_suite for ROS 2, is asked by rosapi for the type and the publishers of each topic
+    that we advertise, and for a topic without a type again until it appears.
 
     Args:
         host: bare hostname or IP literal of the server.
         port: its TCP port, 1 to 65535.
         connect_s: how long one attempt to connect may take, above 0 and at most 60 s.
+        access: TLS, headers and a rosauth secret for a server that is not open to everyone.
 
     Raises:
         ValidationError: an argument outside its domain.
     """
 
-    def __init__(self, host: str = "localhost", port: int = 9090, *, connect_s: float = 5.0) -> None:
+    def __init__(
+        self,
+        host: str = "localhost",
+        port: int = 9090,
+        *,
+        connect_s: float = 5.0,
+        access: RosbridgeAccess | None = None,
+    ) -> None:
         seconds = number("connect_s", connect_s, above=0, high=60)
         self._session = RosbridgeSession(
             host,
@@ -91,8 +121,10 @@ class RosbridgeLink:
             opened=self._restore,
             received=self._received,
             lost=self._lost,
+            tick=self._ask_again,
+            access=access,
         )
-        self._urgent = UrgentConnection(host, port, seconds)
+        self._urgent = UrgentConnection(host, port, seconds, access)
         self._numbers = count(1)
         self._lock = threading.RLock()
         self._advertised: dict[str, str] = {}
@@ -100,6 +132,7 @@ class RosbridgeLink:
         self._requests: dict[str, _Request] = {}
         self._goals: dict[str, tuple[Goal, OnMessage | None]] = {}
         self._refusals: dict[str, str] = {}
+        self._inquiries: dict[str, _Inquiry] = {}
         self._fragments = Fragments()
 
     @property
@@ -116,6 +149,7 @@ class RosbridgeLink:
         if self._advertised.get(topic) != kind or not self._session.up:
             self._session.send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))
             self._advertised[topic] = kind
+            self._inquiries[topic] = _Inquiry(kind)
         self._session.send(frame)
 
     def prepare_urgent(self, topic: str, kind: str) -> None:
@@ -126,6 +160,9 @@ class RosbridgeLink:
 
     def cut(self) -> None:
         self._session.cut()
+
+    def confirm(self, within_s: float) -> None:
+        self._session.confirm(within_s)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
         request = _Request()
@@ -155,7 +192,10 @@ class RosbridgeLink:
         feedback: OnMessage | None = None,
         cancelled: CancelCheck = never,
     ) -> Goal:
-        """Send an action goal and return at once: acceptance is not reported."""
+        """Send an action goal and return at once: acceptance is not reported.
+
+        A server that does not take a goal answers ``result: false``; the goal is then rejected and nothing began.
+        """
         if cancelled():
             raise RosError(f"{action} was given up before its goal was sent.")
         del within_s
@@ -271,8 +311,53 @@ class RosbridgeLink:
             # A subscriber discovers a new publisher some milliseconds late, so advertise ahead of the first message.
             for topic, kind in list(self._advertised.items()):
                 send(encoded("advertise", id=self._id("advertise", topic), topic=topic, type=kind))
+                self._inquiries[topic] = _Inquiry(kind)
             for topic, subscription in self._subscriptions.items():
                 send(self._subscription(topic, subscription))
+
+    def _ask_again(self) -> None:
+        """Ask for our publishers, and subscribe again to what was not there yet."""
+        for topic, inquiry in list(self._inquiries.items()):
+            if inquiry.looks > LOOKS:
+                self._inquiries.pop(topic, None)
+                continue
+            inquiry.looks += 1
+            for service, kind in _INQUIRIES.items():
+                key = f"{service}:{topic}:{next(self._numbers)}"
+                frame = encoded("call_service", id=key, service=service, type=kind, args={"topic": topic})
+                self._session.send_if_free(frame)
+        with self._lock:
+            waiting = [(t, s) for t, s in self._subscriptions.items() if s.silent and s.kind is None]
+        for topic, subscription in waiting:
+            # Without a type rosbridge_suite drops a subscription to a topic that nothing publishes yet.
+            self._session.send_if_free(self._subscription(topic, subscription))
+
+    def _inquired(self, key: str, message: Message) -> bool:
+        """Take the answer of rosapi to a question of ours; return whether it was one."""
+        service, _, rest = key.partition(":")
+        topic, values = rest.rpartition(":")[0], message.get("values")
+        inquiry = self._inquiries.get(topic)
+        if service not in _INQUIRIES:
+            return False
+        if inquiry is None:
+            return True
+        known = values if isinstance(values, dict) and message.get("result") is not False else {}
+        other = known.get("type")
+        inquiry.typed |= bool(other)
+        inquiry.listed |= bool(known.get("publishers"))
+        if isinstance(other, str) and other and bare_kind(other) != bare_kind(inquiry.kind):
+            self._refuse(topic, f"rosbridge does not publish {inquiry.kind} on {topic}, which carries {other}")
+        elif known.get("publishers") == [] and inquiry.looks >= LOOKS:
+            self._refuse(topic, f"rosbridge has no publisher on {topic}: it refused ours")
+        elif not known or (inquiry.typed and inquiry.listed):
+            # Without rosapi the refusal of a command cannot be found.
+            self._inquiries.pop(topic, None)
+        return True
+
+    def _refuse(self, topic: str, why: str) -> None:
+        logger.warning("%s", why)
+        self._inquiries.pop(topic, None)
+        self._refusals[topic] = why
 
     def _lost(self, why: str) -> None:
         for request in list(self._requests.values()):
@@ -299,6 +384,8 @@ class RosbridgeLink:
             self._goal_event(op, key, message)
         elif op == "service_response":
             request = self._requests.get(key) if isinstance(key, str) else None
+            if isinstance(key, str) and self._inquired(key, message):
+                return
             if request is not None:
                 request.end(message)
         elif op == "status":
@@ -314,7 +401,10 @@ class RosbridgeLink:
                 feedback(values)
             return
         del self._goals[str(key)]
-        if isinstance(status, int):
+        if message.get("result") is False:
+            # Only what happens before the server has taken a goal, or after it has ended, is answered so.
+            goal.reject(f"{message.get('action')} did not take the goal: {shown(values)}")
+        elif isinstance(status, int):
             goal.end(status, values)
         else:
             goal.fail(f"the server reported no status: {shown(values)}")
@@ -326,6 +416,7 @@ class RosbridgeLink:
             watchers = list(subscription.watchers) if subscription is not None else []
         if subscription is None or not isinstance(body, dict):
             return
+        subscription.silent = False
         whole = with_bytes(subscription.kind, body)
         for each in watchers:
             try:
@@ -335,6 +426,8 @@ class RosbridgeLink:
 
     def _status(self, message: dict[str, Any]) -> None:
         said = f"rosbridge says: {shown(message.get('msg'))}"
+        if self._inquired(str(message.get("id") or ""), message):
+            return
         if message.get("level") != "error":
             logger.info("%s", said)
             return

@@ -11,22 +11,33 @@ import binascii
 import contextlib
 import json
 import logging
+import ssl
 import struct
 import threading
+import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
+from hashlib import sha512
 from itertools import count
+from secrets import token_hex
 from socket import SHUT_RDWR, SO_LINGER, SOL_SOCKET
 from typing import Any
 
-from strands_robots.ros.link import Message, RosError
+from strands_robots.ros.link import Message, NoReceiptError, RosError
 from strands_robots.ros.names import bare_kind
-from strands_robots.utils import ValidationError, dial_host_error, missing_extra, port, shown
+from strands_robots.utils import ValidationError, dial_host_error, mapping, missing_extra, port, shown, text
 
 logger = logging.getLogger(__name__)
 
 BACKOFF_S = (0.1, 2.0)
 """First and longest pause between two attempts to reopen a lost connection."""
+
+TICK_S = 1.0
+"""Seconds between two looks at what has to be asked again."""
+
+CONFIRM_S = 0.5
+"""Seconds within which a living server confirms that a zero has arrived."""
 
 _PING_S = 2.0
 _CLOSE_S = 0.5
@@ -125,6 +136,60 @@ def _plain(value: Any) -> Any:
 _encoder = json.JSONEncoder(allow_nan=False, default=_plain)
 
 
+@dataclass(frozen=True)
+class RosbridgeAccess:
+    """TLS, headers and secret of a server that is not open to everyone.
+
+    Args:
+        tls: true for ``wss`` with the system's authorities; a path: with those of this PEM file alone.
+        headers: of the WebSocket's request, such as ``Authorization`` for a proxy.
+        secret: of ``rosauth``, whose ``auth`` operation is then the first of each connection.
+
+    Raises:
+        ValidationError: an unusable file or header, or a secret without TLS, which anyone could overhear.
+    """
+
+    tls: bool | str = False
+    headers: Mapping[str, str] = field(default_factory=dict)
+    secret: str = field(default="", repr=False)
+
+    def __post_init__(self) -> None:
+        for name, value in mapping("headers", self.headers).items():
+            text(f"headers[{name!r}]", value)
+        if not isinstance(self.tls, bool | str):
+            raise ValidationError(f"tls must be true, false or the path of a PEM file, not {shown(self.tls)}.")
+        if not self.tls and (self.secret or self.headers):
+            raise ValidationError("tls must be given with headers or a secret; on an open connection they can be read.")
+        self.context()
+
+    def context(self) -> ssl.SSLContext | None:
+        """Return the TLS context, None without TLS."""
+        if not self.tls:
+            return None
+        try:
+            return ssl.create_default_context(cafile=self.tls if isinstance(self.tls, str) else None)
+        except (OSError, ssl.SSLError) as exc:
+            raise ValidationError(
+                f"tls must be a readable PEM file of authorities, not {shown(self.tls)}: {exc}"
+            ) from exc
+
+    def login(self, host: str) -> str | None:
+        """Return the ``auth`` operation of rosauth, None without a secret."""
+        if not self.secret:
+            return None
+        now = int(time.time())
+        said = {
+            "client": "strands-robots",
+            "dest": host,
+            "rand": token_hex(8),
+            "t": now,
+            "level": "user",
+            "end": now + 60,
+        }
+        mac = sha512("".join([self.secret, *map(str, said.values())]).encode()).hexdigest()
+        return encoded("auth", mac=mac, **said)
+
+
 class RosbridgeSession:
     """One WebSocket, reopened when it is lost; its frames arrive on one thread.
 
@@ -134,6 +199,8 @@ class RosbridgeSession:
         opened: called on the session's thread with each new connection's sender, before any other frame is sent.
         received: called there with every frame.
         lost: called there with the reason whenever a connection ends.
+        tick: called there about once in :data:`TICK_S` while there is a connection.
+        access: how to reach a server that is not open.
 
     Raises:
         ValidationError: ``host`` is no bare hostname or address, or ``tcp_port`` none from 1 to 65535.
@@ -148,14 +215,18 @@ class RosbridgeSession:
         opened: Callable[[Callable[[str], None]], None],
         received: Callable[[str | bytes], None],
         lost: Callable[[str], None],
+        tick: Callable[[], None] = lambda: None,
+        access: RosbridgeAccess | None = None,
     ) -> None:
+        self._access = access or RosbridgeAccess()
         reason = dial_host_error(host)
         if reason is not None:
             raise ValidationError(reason)
         bare = f"[{host}]" if ":" in host and not host.startswith("[") else host
-        self.url = f"ws://{bare}:{port('port', tcp_port)}"
+        self.url = f"{'wss' if self._access.tls else 'ws'}://{bare}:{port('port', tcp_port)}"
+        self._host = host
         self._connect_s = connect_s
-        self._opened, self._received, self._lost = opened, received, lost
+        self._opened, self._received, self._lost, self._tick = opened, received, lost, tick
         self._lock = threading.Lock()
         self._writing = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -205,6 +276,29 @@ class RosbridgeSession:
         """
         self._send(self._current(), frame)
 
+    def send_if_free(self, frame: str) -> None:
+        """Send one frame unless another is being sent: a question can wait, and must not."""
+        socket = self._socket
+        if socket is not None and self._writing.acquire(blocking=False):
+            try:
+                socket.send(frame)
+            finally:
+                self._writing.release()
+
+    def confirm(self, within_s: float) -> None:
+        """Wait until the server has received all that was sent, by a WebSocket ping.
+
+        Raises:
+            NoReceiptError: it did not confirm in time, or the connection broke.
+        """
+        socket = self._socket
+        arrived = False
+        if socket is not None:
+            with contextlib.suppress(Exception):  # whatever breaks a connection, there is no receipt
+                arrived = socket.ping().wait(within_s)
+        if not arrived or self._socket is not socket:
+            raise NoReceiptError(f"rosbridge at {self.url} did not confirm within {within_s:g} s; is the server gone?")
+
     def close(self) -> None:
         """Close the connection and end the thread. A later :meth:`send` opens anew."""
         with self._lock:
@@ -243,7 +337,12 @@ class RosbridgeSession:
                     compression=None,
                     proxy=None,
                     max_size=FRAME_MAX,
+                    ssl=self._access.context(),
+                    additional_headers=dict(self._access.headers) or None,
                 ) as socket:
+                    login = self._access.login(self._host)
+                    if login is not None:
+                        self._send(socket, login)
                     self._opened(partial(self._send, socket))
                     self._socket = socket
                     settled.set()
@@ -251,9 +350,7 @@ class RosbridgeSession:
                     # A close during the steps above must not leave a connection open.
                     if closing.is_set():
                         return
-                    for frame in socket:
-                        self._received(frame)
-                    self._why = "the server closed it"
+                    self._receive(socket)
             except Exception as exc:  # noqa: BLE001 - whatever ends a connection is reported, and the next attempt follows
                 self._why = str(exc) or type(exc).__name__
             finally:
@@ -265,6 +362,16 @@ class RosbridgeSession:
                 return
             pause = min(2 * pause, BACKOFF_S[1])
             logger.info("Reconnecting to %s: %s", self.url, self._why)
+
+    def _receive(self, socket: Any) -> None:
+        """Hand on the frames of a connection until it ends, which raises."""
+        due = time.monotonic() + TICK_S
+        while True:
+            with contextlib.suppress(TimeoutError):
+                self._received(socket.recv(timeout=max(0.0, due - time.monotonic())))
+            if time.monotonic() >= due:
+                self._tick()
+                due = time.monotonic() + TICK_S
 
     def _send(self, socket: Any, frame: str) -> None:
         try:
@@ -280,11 +387,18 @@ class UrgentConnection:
     Args:
         host: of the server, with its ``port``.
         connect_s: how long one attempt to connect may take, in seconds.
+        access: how to reach a server that is not open.
     """
 
-    def __init__(self, host: str, port: int, connect_s: float) -> None:
+    def __init__(self, host: str, port: int, connect_s: float, access: RosbridgeAccess | None = None) -> None:
         self._session = RosbridgeSession(
-            host, port, connect_s=connect_s, opened=self._opened, received=self._received, lost=self._lost
+            host,
+            port,
+            connect_s=connect_s,
+            opened=self._opened,
+            received=self._received,
+            lost=self._lost,
+            access=access,
         )
         self._numbers = count(1)
         self._kinds: dict[str, str] = {}
@@ -301,7 +415,12 @@ class UrgentConnection:
             self._session.start()
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
-        """Send one message now, or raise :class:`RosError` instead of waiting."""
+        """Send one message now, and return once the server has received it.
+
+        Raises:
+            NoReceiptError: it did not confirm within :data:`CONFIRM_S`: it may be gone.
+            RosError: there is no connection yet; nothing is waited for.
+        """
         complaint, self._complaint = self._complaint, ""
         if complaint:
             raise RosError(complaint)
@@ -309,6 +428,7 @@ class UrgentConnection:
         if not self._session.up:
             raise RosError(f"The second connection to {self._session.url} is not there.")
         self._session.send(encoded("publish", id=f"publish:{next(self._numbers)}", topic=topic, type=kind, msg=fields))
+        self._session.confirm(CONFIRM_S)
 
     def close(self) -> None:
         """Close the connection."""

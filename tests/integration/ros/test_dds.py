@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cyclonedds import domain as dds_domain
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.topic import Topic
 from fixtures.base_process import BaseProcess, base_process
 from fixtures.ros_bases import OPEN
 from fixtures.waiting import eventually
 from tests.integration.ros.conftest import obeyed, x_of
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
-from strands_robots.ros.dds import DdsLink
+from strands_robots.ros.dds import DdsLink, filled, plain
+from strands_robots.ros.dds_types import KINDS
 from strands_robots.ros.link import RosError
+from strands_robots.ros.names import bare_kind
 from strands_robots.utils import ValidationError
 
 DOMAIN = 91
@@ -151,3 +157,38 @@ def test_service_and_unknown_type_over_bare_dds_are_errors() -> None:
 def test_invalid_domain_is_refused_at_construction(domain: Any) -> None:
     with pytest.raises(ValidationError, match="domain_id must be an integer from 0 to 232"):
         RtpsRobot("rover", "/cmd_vel", domain_id=domain)
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "message"),
+    [
+        ("/robot_description", "std_msgs/msg/String", {"data": "<robot/>"}),
+        ("/map", "nav_msgs/msg/OccupancyGrid", {"info": {"width": 2, "height": 1}, "data": [-1, 100]}),
+        ("/robot/tf_static", "tf2_msgs/msg/TFMessage", {"transforms": [{"child_frame_id": "camera"}]}),
+    ],
+)
+def test_latched_topic_is_read_after_its_only_message(topic: str, kind: str, message: dict[str, Any]) -> None:
+    participant = dds_domain.DomainParticipant(DOMAIN)
+    struct = KINDS[bare_kind(kind)]
+    latching = Qos(Policy.Durability.TransientLocal, Policy.Reliability.Reliable(10**8), Policy.History.KeepLast(1))
+    writer = DataWriter(participant, Topic(participant, f"rt{topic}", struct), qos=latching)
+    writer.write(filled(struct, message))
+    link = DdsLink(DOMAIN, match_s=20.0)
+    try:
+        read = link.read(topic, kind, 20.0)
+        assert message.keys() <= read.keys()
+        assert read == plain(filled(struct, message))
+    finally:
+        link.close()
+
+
+def test_pose_of_the_turtle_is_carried() -> None:
+    ours, theirs = DdsLink(DOMAIN, match_s=20.0), DdsLink(DOMAIN, match_s=20.0)
+    received: list[Mapping[str, Any]] = []
+    try:
+        ours.watch("/turtle1/pose", "turtlesim/msg/Pose", received.append)
+        theirs.publish("/turtle1/pose", "turtlesim/msg/Pose", {"x": 5.5, "theta": 0.25})
+        assert eventually(lambda: received)[0]["theta"] == 0.25
+    finally:
+        ours.close()
+        theirs.close()

@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from cyclonedds import domain
 from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from fixtures import rclpy_stand_in
@@ -26,6 +28,7 @@ from strands_robots.envelope import Envelope
 from strands_robots.ros import ros_action
 from strands_robots.ros.actions import close_links
 from strands_robots.ros.dds import confine
+from strands_robots.ros.dds_types import KINDS
 from strands_robots.ros.gate import CommandGate
 
 DOMAIN = 86
@@ -212,3 +215,15 @@ def test_a_car_is_armed_once_by_its_services_and_steered(
         assert car[5:] == [(1.0, 0.5), (1.0, 0.5), (0.0, 0.0)]
     finally:
         racer.disconnect()
+
+
+def test_latched_topic_is_read_after_its_only_message(sourced: None) -> None:
+    participant = DomainParticipant(DOMAIN)
+    struct = KINDS["std_msgs/String"]
+    latching = Qos(Policy.Durability.TransientLocal, Policy.Reliability.Reliable(10**8), Policy.History.KeepLast(1))
+    writer = DataWriter(participant, Topic(participant, "rt/robot_description", struct), qos=latching)
+    writer.write(struct(data="<robot/>"))
+    answer = ros_action(
+        "echo", name="/robot_description", type="std_msgs/msg/String", backend="rclpy", domain_id=DOMAIN, timeout=20.0
+    )
+    assert answer["messages"] == [{"data": "<robot/>"}]

@@ -9,6 +9,7 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name
 from strands_robots.ros.rosbridge import RosbridgeLink
+from strands_robots.ros.rosbridge_session import RosbridgeAccess
 from strands_robots.utils import number
 
 ROS1_TWIST = "geometry_msgs/Twist"
@@ -18,7 +19,7 @@ CURIOSITY = "/curiosity_mars_rover"
 class RosbridgeRobot(PosedBaseRobot):
     """A ROS 1 or ROS 2 base behind a rosbridge server, with limits by default.
 
-    The first verb connects. The connection is neither authenticated nor encrypted: reach a remote server by a tunnel.
+    The first verb connects. Without ``access`` the connection is neither authenticated nor encrypted.
 
     Args:
         node_name: name of the robot and of its tools.
@@ -28,6 +29,7 @@ class RosbridgeRobot(PosedBaseRobot):
         host: bare hostname or IP address of the server. ``port``: 1 to 65535.
         max_linear: clamp in m/s. ``max_angular``: clamp in rad/s. ``max_duration``: longest drive in seconds. All three
             are above 0 and required: this class has no unlimited drive.
+        access: TLS, headers and a rosauth secret of the server.
         link: a link to use in place of the connection to ``host`` and ``port``.
 
     The other arguments are those of :class:`~strands_robots.drivers.ros.mobile_base.MobileBaseRobot`.
@@ -49,10 +51,11 @@ class RosbridgeRobot(PosedBaseRobot):
         max_angular: float = 1.0,
         max_duration: float = 30.0,
         publish_rate: float = 10.0,
+        access: RosbridgeAccess | None = None,
         link: RosLink | None = None,
         command_gate: CommandGate | None = None,
     ) -> None:
-        default = RosbridgeLink(host, port)
+        default = RosbridgeLink(host, port, access=access)
         super().__init__(
             node_name,
             link or default,

@@ -9,13 +9,23 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from strands_robots.ros.link import EarlierRefusedError, RosError, RosLink, UrgentLink
+from strands_robots.ros.link import (
+    ConfirmingLink,
+    EarlierRefusedError,
+    NoReceiptError,
+    RosError,
+    RosLink,
+    UrgentLink,
+)
 from strands_robots.safety.gate import Permit, PermitVoidError
 
 logger = logging.getLogger(__name__)
 
 BLIND_HOLD_S = 5.0
 """Seconds of zeros, accepted without a failure, for a base whose odometry is silent."""
+
+RECEIPT_S = 0.5
+"""Seconds within which a server confirms a zero that went behind the commands; without, the base did not stop."""
 
 CLOGGED_S = 0.1
 """Seconds after which a connection that does not accept a zero is cut, with the commands that it still holds."""
@@ -73,9 +83,13 @@ class VelocityPublisher:
         self._clogged = clogged
         try:
             self._urgent.publish_urgent(self.topic, self.kind, self._zero)
+        except NoReceiptError:
+            raise
         except RuntimeError:
             # A RosError; or there is no second connection, and no thread to make it.
             self._queued_zero.wait(CLOGGED_S)
+            if isinstance(self.link, ConfirmingLink):
+                self.link.confirm(RECEIPT_S)
 
 
 class _BackgroundZero:
