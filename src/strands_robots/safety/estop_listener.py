@@ -329,7 +329,7 @@ class EstopListener:
         key, now = (report.robot_id, report.epoch), time.monotonic()
         if report.repeated and now - self._answered.get(key, 0.0) < ANSWER_AGAIN_S:
             return
-        if report.repeated and key not in self._redundant:
+        if report.repeated and report.names_its_epoch and key not in self._redundant:
             # Once for each stop: a controller repeats until every robot has answered.
             self._redundant[key] = None
             log_safety_event("remote_estop_redundant", report.robot_id, {"epoch": report.epoch})

@@ -17,6 +17,7 @@ from strands_robots import settings
 from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import estop_refusal
 from strands_robots.safety.clocks import ObservedClocks
+from strands_robots.safety.lockout import OVERFLOW
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, covered
 from strands_robots.safety.stopping import StopVerdict
@@ -123,6 +124,11 @@ class RobotReport:
     def stopped(self) -> bool | None:
         """True, False, or None where it is unknown."""
         return self.verdict.stopped
+
+    @property
+    def names_its_epoch(self) -> bool:
+        """False for a stop of a robot that is locked by more than it tells apart."""
+        return self.epoch in self.epochs or OVERFLOW not in self.epochs
 
     def fields(self) -> dict[str, Any]:
         """The ``emergencyStopVerdict`` of this report, as it goes on the wire."""

@@ -7,7 +7,7 @@ import functools
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any, Protocol
@@ -24,6 +24,7 @@ from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.reporting import OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, note_motion, stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, identifier, shown
@@ -31,6 +32,12 @@ from strands_robots.utils import ValidationError, identifier, shown
 logger = logging.getLogger(__name__)
 
 REPORTS_KEPT = 64
+HALT_AGAIN_S = 0.25
+"""Seconds in which one halt answers for all stops of a robot that is locked by more than it tells apart."""
+
+TOLD_EVERY_S = 10.0
+"""Seconds between two records of the stops that were counted instead of carried out one by one."""
+
 KEEP_AGAIN_S = 1.0
 """Seconds between two attempts to write a lockout, or its clearing, that could not be written."""
 
@@ -63,6 +70,8 @@ class Registered:
         self.latch = LockoutLatch(wire_id, kept.state, kept.seen)
         self.on_disk = kept.state
         self.keep_again = False
+        self.verdict = StopVerdict(unknown={robot_id: "its halt has not answered yet"})
+        self._halted_at = float("-inf")
         self.verifier = ResumeVerifier([wire_id])
         self.reports: dict[str, RobotReport] = {}
         self._plane = plane
@@ -119,6 +128,43 @@ class Registered:
         if ready:
             self._plane.executor.detach(self.robot, wait=1.0)
 
+    def engage(self, order: StopOrder) -> bool:
+        """Lock under the order; True when it has to be carried out.
+
+        A stop is known, or one of a flood that locks nothing more: the latest halt answers for it.
+        """
+        if not self.crowded:
+            return self.latch.engage(order.epoch, order.source, order.reason)
+        if order.received - self._halted_at < HALT_AGAIN_S or not self.latch.engage(
+            order.epoch, order.source, order.reason
+        ):
+            return False
+        self._halted_at = order.received
+        return True
+
+    @property
+    def crowded(self) -> bool:
+        """True while more stops lock it than it tells apart."""
+        return self.latch.state.overflow is not None
+
+    def report_again(self, order: StopOrder) -> RobotReport | None:
+        """Return the report on a stop that is not carried out, None while it is due."""
+        state = self.latch.state
+        known, held = self.reports.get(order.epoch), order.epoch in state.resumable
+        if known is not None and (held or self.crowded):
+            return replace(known, epochs=state.epochs, repeated=True, late=False)
+        if held:
+            return None
+        if self.crowded:
+            persisted = state is self.on_disk if self.key else None
+            return RobotReport(
+                self.robot_id, order.epoch, self.verdict, state.epochs, 0.0, persisted=persisted, repeated=True
+            )
+        if order.epoch in self.latch.seen:
+            why = {self.robot_id: "this stop was resumed before it came again"}
+            return RobotReport(self.robot_id, order.epoch, StopVerdict(unknown=why), state.epochs, 0.0)
+        return None
+
     def _stand_by(self) -> None:
         with self._readying:
             if not self._ready:
@@ -126,12 +172,15 @@ class Registered:
                 self._ready = True
 
     def _came_up(self, halted: Future[StopVerdict]) -> None:
-        verdict = halted.result()
+        verdict = self.verdict = halted.result()
         if verdict.stopped is not True:
             logger.critical("%s comes up locked and DID NOT STOP: %s", self.robot_id, verdict.envelope().get("reason"))
 
     def remember(self, report: RobotReport) -> None:
         """Keep the report for when this stop arrives again."""
+        self.verdict = report.verdict
+        if not report.names_its_epoch:
+            return  # the latest verdict answers for it
         self.reports[report.epoch] = report
         while len(self.reports) > REPORTS_KEPT:
             del self.reports[next(iter(self.reports))]
@@ -161,6 +210,7 @@ class SafetyPlane:
         self._robots: dict[str, Registered] = {}
         self._reporter: Reporter | None = None
         self._issued: dict[str, int] = {}
+        self._counted = StopCount(TOLD_EVERY_S)
         self._clearance = ClearanceInbox(self.robot_ids, self._clear_one)
         self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
 
@@ -266,7 +316,7 @@ class SafetyPlane:
         robots = [each for each in self._robots.values() if not (order.remote and each.wire_id == order.source)]
         fresh: list[Registered] = []
         for entry in robots:
-            if entry.latch.engage(order.epoch, order.source, order.reason):
+            if entry.engage(order):
                 note_motion(entry.robot)
                 for gate in entry.gates:
                     gate.revoke()
@@ -378,14 +428,13 @@ class SafetyPlane:
             return NOT_LOCKED if robot_id in self._robots else LEFT
         return NOT_KEPT if entry.key and entry.latch.state is not entry.on_disk else CLEARED
 
-    def _repeat(self, order: StopOrder, robots: Iterable[Registered], on_report: OnReport) -> None:
+    def _repeat(self, order: StopOrder, robots: Collection[Registered], on_report: OnReport) -> None:
         for entry in robots:
-            known, held = entry.reports.get(order.epoch), order.epoch in entry.epochs
-            if known is not None and (held or entry.latch.state.overflow is not None):
-                on_report(replace(known, epochs=entry.epochs, repeated=True, late=False))
-            elif not held and order.epoch in entry.latch.seen:
-                why = {entry.robot_id: "this stop was resumed before it came again"}
-                on_report(RobotReport(entry.robot_id, order.epoch, StopVerdict(unknown=why), entry.epochs, 0.0))
+            report = entry.report_again(order)
+            if report is not None:
+                on_report(report)
+        if any(entry.crowded and order.epoch not in entry.epochs for entry in robots):
+            self._counted.add(order.source)
 
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.
@@ -426,6 +475,9 @@ class SafetyPlane:
         order = run.order
         event = "remote_estop_engaged" if order.remote else "emergency_stop"
         for report in run.reports.values():
+            if report.stopped and not report.names_its_epoch:
+                self._counted.add(order.source)
+                continue
             facts: dict[str, Any] = {
                 **report.fields(),
                 "source": order.source,
@@ -447,6 +499,9 @@ class SafetyPlane:
             self.checkin.rearm(time.monotonic())
 
     def _tick(self) -> None:
+        counted = self._counted.take(time.monotonic())
+        if counted is not None:
+            log_safety_event("estops_counted", "stop-lane", counted)
         silent = self.checkin.lapsed(time.monotonic())
         if silent is not None:
             names = ", ".join(silent) or "no safety controller was ever heard"
