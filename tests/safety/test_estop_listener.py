@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import threading
 
-from strands_robots.safety.estop_listener import BUCKET_CAPACITY, SOURCES_MAX, FailureBudget, FairQueue, StopEvent
+from strands_robots.safety.estop_listener import (
+    BUCKET_CAPACITY,
+    BUCKETS,
+    SOURCES_MAX,
+    VOUCHED_MAX,
+    FailureBudget,
+    FairQueue,
+    LatchAnswers,
+    StopEvent,
+)
 
 
 def drained(events: FairQueue) -> list[StopEvent]:
@@ -64,6 +73,45 @@ def test_get_waits_for_an_event_and_ends_with_the_queue() -> None:
     events.close()
     thread.join(20)
     assert sorted(map(int, found)) == list(range(100))
+
+
+def test_source_that_signed_is_served_within_two_turns_of_any_crowd() -> None:
+    events = FairQueue()
+    events.vouch("safety-1")
+    for number in range(20 * BUCKETS * BUCKET_CAPACITY):
+        events.put("emergencyStop", f"forger-{number}", b"forged")
+    events.put("emergencyStop", "safety-1", b"true")
+    for number in range(20 * BUCKETS * BUCKET_CAPACITY):
+        events.put("emergencyStop", f"forger-{number}", b"forged")
+    assert b"true" in [received.payload for received in (events.get(), events.get()) if received]
+
+
+def test_flood_in_the_name_of_a_source_that_signed_leaves_every_second_turn_to_all_others() -> None:
+    events = FairQueue()
+    events.vouch("safety-1")
+    for _ in range(100):
+        events.put("emergencyStop", "safety-1", b"forged")
+    events.put("emergencyStop", "safety-2", b"true")
+    assert b"true" in [received.payload for received in (events.get(), events.get()) if received]
+    assert len(drained(events)) == BUCKET_CAPACITY - 1
+
+
+def test_sources_that_signed_are_bounded_and_the_first_keep_their_share() -> None:
+    events = FairQueue()
+    for number in range(10 * VOUCHED_MAX):
+        events.vouch(f"safety-{number}")
+    events.put("emergencyStop", f"safety-{10 * VOUCHED_MAX - 1}", b"last")
+    events.put("emergencyStop", "safety-0", b"first")
+    assert {received.payload for received in drained(events)} == {b"first", b"last"}
+
+
+def test_stop_of_a_flood_is_answered_within_a_budget_and_one_that_comes_again_always() -> None:
+    answers = LatchAnswers(per_s=3)
+    assert sum(answers.allows("arm-1", f"flood-{number}", 10.0) for number in range(1000)) == 3
+    assert not answers.allows("arm-1", "true", 10.1)
+    assert answers.allows("arm-1", "true", 10.2)
+    assert not answers.allows("arm-2", "true", 10.2), "each robot answers for itself"
+    assert answers.allows("arm-1", "another", 11.0)
 
 
 def test_failure_budget_of_a_source_lasts_until_the_next_second() -> None:

@@ -42,6 +42,11 @@ runs; Python's own default is ten times that, and a stop wakes three threads."""
 
 BUCKETS = 64
 BUCKET_CAPACITY = 16
+VOUCHED_MAX = 16
+"""Sources with a share of their own in the queue: the first that signed validly."""
+
+LATCH_ANSWERS_PER_S = 200
+LATCH_ANSWERS_REMEMBERED = 4096
 
 OnEvent = Callable[[str, str, bytes], None]
 """Called with event, source and bytes on a thread of the link; it must return at once and may not raise."""
@@ -99,20 +104,33 @@ class FairQueue:
 
     A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
     are served in turn, one event each, the newest first. What overflows a bucket is its oldest event; a controller
-    repeats its stop, so a true one arrives again. No method but :meth:`get` blocks.
+    repeats its stop, so a true one arrives again. A source that was vouched for has a bucket of its own, and every
+    second turn is of such a one: names that are made up share the other turns. No method but :meth:`get` blocks.
     """
 
     def __init__(self) -> None:
         self._salt = secrets.randbits(62)
         self._buckets: list[deque[StopEvent]] = [deque(maxlen=BUCKET_CAPACITY) for _ in range(BUCKETS)]
+        self._vouched: dict[str, deque[StopEvent]] = {}
+        self._turns: tuple[deque[StopEvent], ...] = ()
         self._waiting = threading.Event()
-        self._turn = 0
+        self._turn = self._vouched_turn = 0
+        self._crowd_next = False
         self._closed = False
+
+    def vouch(self, source: str) -> None:
+        """Give a source that signed validly a bucket of its own."""
+        if source not in self._vouched and len(self._vouched) < VOUCHED_MAX:
+            bucket: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY)
+            self._turns = (*self._turns, bucket)
+            self._vouched[source] = bucket
 
     def put(self, event: str, source: str, payload: bytes, *, urgent: bool = True) -> None:
         """Add an event; one that is not urgent is served last or dropped."""
         received = StopEvent(event, source, payload, time.monotonic())
-        bucket = self._buckets[hash((self._salt, source)) % BUCKETS]
+        bucket = self._vouched.get(source)
+        if bucket is None:
+            bucket = self._buckets[hash((self._salt, source)) % BUCKETS]
         # Appending to a deque and setting an event are atomic; no lock is shared with the listener's thread.
         if urgent:
             bucket.append(received)
@@ -123,16 +141,33 @@ class FairQueue:
     def get(self) -> StopEvent | None:
         """Return the next event, waiting for one; None once closed and empty."""
         while True:
-            for _ in range(BUCKETS):
-                self._turn = (self._turn + 1) % BUCKETS
-                bucket = self._buckets[self._turn]
-                if bucket:
-                    return bucket.pop()
+            self._crowd_next = not self._crowd_next
+            for take in (self._of_crowd, self._of_vouched) if self._crowd_next else (self._of_vouched, self._of_crowd):
+                event = take()
+                if event is not None:
+                    return event
             if self._closed:
                 return None
             self._waiting.wait()
             self._waiting.clear()
             # What was put between the look and the clearing is found by the next look; what comes later sets it.
+
+    def _of_crowd(self) -> StopEvent | None:
+        for _ in range(BUCKETS):
+            self._turn = (self._turn + 1) % BUCKETS
+            bucket = self._buckets[self._turn]
+            if bucket:
+                return bucket.pop()
+        return None
+
+    def _of_vouched(self) -> StopEvent | None:
+        turns = self._turns
+        for _ in turns:
+            self._vouched_turn = (self._vouched_turn + 1) % len(turns)
+            bucket = turns[self._vouched_turn]
+            if bucket:
+                return bucket.pop()
+        return None
 
     def close(self) -> None:
         """Let :meth:`get` return None when nothing is left."""
@@ -157,6 +192,34 @@ class FailureBudget:
         since, count = self._failures.pop(source, (now, 0))
         self._failures[source] = (since, count + 1) if now - since < 1.0 else (now, 1)
         _bound(self._failures)
+
+
+class LatchAnswers:
+    """Budget of answers to stops beyond those that a robot tells apart.
+
+    Any such stop is answered while fewer than ``per_s`` were in this second. Beyond that, one that comes again is: a
+    controller repeats its stop until it is answered, and a flood of fresh ids does not.
+    """
+
+    def __init__(self, per_s: int = LATCH_ANSWERS_PER_S) -> None:
+        self._per_s = per_s
+        self._since, self._count = float("-inf"), 0
+        self._unanswered: dict[tuple[str, str], None] = {}
+
+    def allows(self, robot_id: str, epoch: str, now: float) -> bool:
+        """Return True when this stop is answered now, else remember it."""
+        if now - self._since >= 1.0:
+            self._since, self._count = now, 0
+        if self._count < self._per_s:
+            self._count += 1
+            return True
+        key = (robot_id, epoch)
+        if key in self._unanswered:
+            return True
+        self._unanswered[key] = None
+        if len(self._unanswered) > LATCH_ANSWERS_REMEMBERED:
+            del self._unanswered[next(iter(self._unanswered))]
+        return False
 
 
 class RefusalLog:
@@ -217,6 +280,7 @@ class EstopListener:
         self._registrations: tuple[ListenerRegistration, ...] = ()
         self._refusals = RefusalLog()
         self._budget = FailureBudget()
+        self._latch_answers = LatchAnswers()
         self._rules = StopRules(allow=(), keys=())
         self._check_ins = CheckInRules(self._rules)
         self._answered: dict[tuple[str, str], float] = {}
@@ -306,27 +370,34 @@ class EstopListener:
         while (received := events.get()) is not None:
             try:
                 if received.event == CHECK_IN:
-                    self._check_in(received)
+                    if self._check_in(received) and self._rules.signed:
+                        events.vouch(received.source)
                     continue
                 order = self._rules.order_of(received.source, received.payload, received.at)
                 if isinstance(order, StopRefused):
                     self._refusals.record(order, received.event)
                 else:
                     self._plane.begin(order, self._answer)
+                    if self._rules.signed:
+                        events.vouch(received.source)
             except Exception:
                 logger.critical("The e-stop listener failed on an event of %s.", shown(received.source), exc_info=True)
 
-    def _check_in(self, received: StopEvent) -> None:
+    def _check_in(self, received: StopEvent) -> bool:
+        """Record a check-in; False when it does not count."""
         source, params = received.source, params_of(received.payload)
         why = self._check_ins.refusal(source, params)
         if why is not None:
             self._refusals.record(StopRefused(source, why), received.event)
-        else:
-            self._plane.checkin.record(source, received.at)
-            self._rules.compare_clock(source, params, received.at)
+            return False
+        self._plane.checkin.record(source, received.at)
+        self._rules.compare_clock(source, params, received.at)
+        return True
 
     def _answer(self, report: RobotReport) -> None:
         key, now = (report.robot_id, report.epoch), time.monotonic()
+        if not report.names_its_epoch and not self._latch_answers.allows(report.robot_id, report.epoch, now):
+            return
         if report.repeated and now - self._answered.get(key, 0.0) < ANSWER_AGAIN_S:
             return
         if report.repeated and report.names_its_epoch and key not in self._redundant:
