@@ -116,6 +116,24 @@ async def test_a_halt_without_an_answer_is_reported_as_not_stopped(
         let_go.set()
 
 
+async def test_a_device_that_raises_an_emergency_stop_is_halted_before_the_network_is_told(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.call("execute", instruction="wave", duration=300)
+        permit = robot.gate.permit("execute")
+        valid_when_told: list[bool] = []
+
+        async def told(name: str, payload: dict[str, object]) -> None:
+            if name == "emergencyStop":
+                valid_when_told.append(permit.valid)
+
+        halted = threading.Event()
+        robot.before["halt"] = halted.set
+        bench.driver.set_event_callback(told)
+        await bench.driver.emergencyStop(reason="smoke")
+        await bench.until(lambda: halted.is_set() and not robot.rollouts["toy"].running)
+        assert len(valid_when_told) == 1
+
+
 async def test_an_emergency_stop_of_an_allowed_source_halts(robot: ToyRobot) -> None:
     async with DriverBench(drive(robot, DEVICE_CONNECT_ESTOP_ALLOW=("safety-*",))) as bench:
         await bench.call("execute", instruction="wave", duration=300)

@@ -159,11 +159,10 @@ def test_arrivals_at_the_same_moment_halt_once(plane: SafetyPlane, add: Add) -> 
     assert len(robot.halts) == 1
 
 
-def test_a_robot_is_not_stopped_by_its_own_event_but_its_neighbours_are(plane: SafetyPlane, add: Add) -> None:
-    own, other = add("arm-1"), add("arm-2")
+def test_a_robot_is_stopped_by_its_own_event_like_its_neighbours(plane: SafetyPlane, add: Add) -> None:
+    robots = [add("arm-1"), add("arm-2")]
     plane.emergency_stop(order(source="arm-1", remote=True))
-    assert not own.refuses()
-    assert other.refuses()
+    assert all(robot.refuses() and len(robot.halts) == 1 for robot in robots)
 
 
 def test_its_own_local_stop_stops_everything(plane: SafetyPlane, add: Add) -> None:

@@ -29,6 +29,7 @@ from strands_robots.device_connect.telemetry import RolloutPump, paced
 from strands_robots.envelope import Envelope, error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
@@ -239,7 +240,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     @emit(labels={"safety": "critical"})
     async def emergencyStop(self, reason: str = "") -> None:
-        """This device calls for an emergency stop.
+        """This device locks and halts, and calls for an emergency stop of all others.
 
         Args:
             reason: Why
@@ -252,12 +253,22 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     async def on_estop(self, device_id: object, payload: object) -> None:
         """Act on an emergency stop of the runtime, in the safety plane if registered."""
-        if device_id != self.peer_id and self.registration is not None:
+        if self.registration is not None:
             self.registration.runtime_estop(device_id, payload)
             return
         halting = self._begin_estop(device_id, payload)
         if halting is not None:
             halting.add_done_callback(lambda halted: self._log_estop(device_id, halted.result()))
+
+    def _raise_estop(self, payload: Mapping[str, Any]) -> None:
+        """Lock and halt before the network is told, which must be told whatever happens."""
+        try:
+            if self.registration is not None:
+                self.registration.raise_estop(payload)
+            else:
+                stop_executor().submit(self.robot, self.peer_id, "its own emergency stop")
+        except Exception:
+            logger.critical("%s: its own emergency stop failed.", self.peer_id, exc_info=True)
 
     def _begin_estop(self, device_id: object, payload: object) -> Future[StopVerdict] | None:
         if device_id == self.peer_id:
@@ -332,6 +343,8 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
         async def emit_at_home(name: str, payload: dict[str, Any]) -> None:
             clean = jsonable(payload)
+            if name == ESTOP:
+                self._raise_estop(clean)
             if asyncio.get_running_loop() is home:
                 await callback(name, clean)
             else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Mapping
@@ -15,6 +16,7 @@ from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 
@@ -75,6 +77,15 @@ class SafetyRegistration:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
             estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime")
+
+    def raise_estop(self, params: Mapping[str, Any]) -> None:
+        """Lock and halt on this device's own emergency stop; return at once.
+
+        Its event, which other devices and this one's listener get, is the same stop.
+        """
+        reason = str(params.get("reason") or "")[:REASON_MAX]
+        epoch = epoch_of(self.device_id, params, json.dumps(params, default=repr).encode())
+        estop_listener().stop_here(StopOrder(epoch, self.device_id, reason))
 
     def resume(self, assertion: object) -> Envelope:
         """Check a signed resume; its signature is its authorization."""

@@ -21,7 +21,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.audit import log_safety_event
 from strands_robots.safety.checkin import CheckInRules
-from strands_robots.safety.orders import RobotReport, StopRefused, StopRules, params_of
+from strands_robots.safety.orders import RobotReport, StopOrder, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.utils import shown
 
@@ -339,6 +339,10 @@ class EstopListener:
             self._refusals.record(order, ESTOP)
         else:
             self._plane.begin(order, self._answer)
+
+    def stop_here(self, order: StopOrder) -> None:
+        """Act on a stop that a device of this process raises; return at once."""
+        self._plane.begin(order, self._answer)
 
     def receive(self, event: str, source: str, payload: bytes) -> None:
         """Take an event from a link's thread; returns at once."""

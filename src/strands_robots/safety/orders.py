@@ -58,7 +58,7 @@ class StopOrder:
         epoch: 32 hex digits; the same on every path by which this stop arrives.
         source: who stops, as declared.
         path: lane (the e-stop listener), runtime, mesh, local or check-in.
-        remote: it came over a network, so the robot named as its source is left alone.
+        remote: it came over a network, not from a program or a device of this process.
         issued: the issuer's wall-clock seconds at this sending, or None; decides only what the audit says.
         received: this process's monotonic seconds at receipt; latencies count from here.
         pressed: the issuer's wall-clock seconds at the press, the same in every repetition, or None.

@@ -313,7 +313,7 @@ class SafetyPlane:
         A robot that has seen this stop is not halted again; ``on_report`` gets at once its report of then while this
         stop still holds it, and ``stopped`` None once it was resumed. None when no robot had anything to do.
         """
-        robots = [each for each in self._robots.values() if not (order.remote and each.wire_id == order.source)]
+        robots = list(self._robots.values())
         fresh: list[Registered] = []
         for entry in robots:
             if entry.engage(order):

@@ -29,6 +29,7 @@ from strands_robots.device_connect.client import DeviceTimeoutError, NoSuchDevic
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import SafetyController
@@ -201,6 +202,26 @@ def test_stop_by_the_runtime_and_by_the_listener_halts_once(floor: Floor) -> Non
     records = recorded("remote_estop_engaged")
     assert sorted(each["peer_id"] for each in records) == ["arm-1", "sim-1"]
     assert json.dumps(records[0]["payload"]["reason"]) == '"button"'
+
+
+def test_a_device_that_raises_an_emergency_stop_is_locked_first_and_all_others_by_the_same_stop(floor: Floor) -> None:
+    floor.move()
+    told: list[str] = []
+    neighbour = stop_link(floor.link)
+    neighbour.open((ESTOP,), lambda event, source, payload: told.append(source), lambda up: None)
+    eventually(lambda: neighbour.up)
+    asyncio.run(floor.drivers[1].emergencyStop(reason="smoke"))
+    lockouts = plane().lockouts()
+    assert set(lockouts) == {"sim-1", "arm-1"}
+    assert {each.source for robot in lockouts.values() for each in robot} == {"arm-1"}
+    assert [each.reason for each in lockouts["arm-1"]] == ["smoke"]
+    written = eventually(lambda: len(recorded("emergency_stop")) == 2 and recorded("emergency_stop"))
+    assert all(each["payload"]["stopped"] for each in written)
+    # The event goes to everyone, and comes back to its own process as the same stop.
+    eventually(lambda: told == ["arm-1"])
+    neighbour.close()
+    assert [len(each.epochs) for each in plane().robots.values()] == [1, 1]
+    assert floor.asked("arm-1", "execute", **MOVE)["locked"] is True
 
 
 def test_a_lockout_outlives_the_device_and_its_process_memory(floor: Floor) -> None:
