@@ -14,6 +14,7 @@ from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.mesh.security import validate_command
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.robot_verbs import ARM_VERBS, PEER_VERBS
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
 from strands_robots.tools import robot_mesh
@@ -65,6 +66,7 @@ def test_the_mesh_knows_the_documented_actions() -> None:
         *("status", "stop", "features", "state", "execute", "start", "step", "reset"),
         *("teleop_status", "teleop_receive", "teleop_stop", "releaseTorque", "resume", "ping"),
         *ARM_MOTION_VERBS,
+        *PICTURE_VERBS,
     }
     moving = {name for name, verb in PEER_VERBS.items() if verb.kind is Kind.MOTION}
     arm = {"moveJoints", "moveTo", "moveBy", "setGripper", "goTo", "savePlace", "pick", "place"}

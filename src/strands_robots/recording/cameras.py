@@ -15,6 +15,12 @@ QUALITY = 80
 OVERVIEW = "overview"
 """Camera that every simulated world has."""
 
+FIRST = "front"
+"""Camera of a simulated world that shows a picture where none is named."""
+
+PICTURE_MAX_BYTES = 700_000
+"""Largest JPEG of one answer: as base64 it fits into a message of 1 MiB."""
+
 Frames = Callable[[], Mapping[str, Any]]
 """Returns height x width x 3 arrays of uint8 by camera name."""
 
@@ -86,6 +92,53 @@ def _selected(frames: Mapping[str, Any], names: Sequence[str]) -> LazyFrames:
     return LazyFrames({name: partial(frames.__getitem__, name) for name in frames if name in names})
 
 
+def camera_list(robot: Any) -> list[str]:
+    """Return the names of a robot's cameras, the one that is meant by none first."""
+    if _draws(robot):
+        names = [str(name) for name in robot.get_features().get("cameras", ())]
+        return sorted(names, key=lambda name: name != FIRST)
+    frames = frames_of(robot)
+    return [] if frames is None else [str(name) for name in frames()]
+
+
+def take_picture(robot: Any, camera: str, width: int, height: int) -> tuple[str, Any]:
+    """Take one RGB picture of at most this size; return its camera and it.
+
+    A simulation draws it in this size; a real camera's is scaled down where it is larger.
+
+    Raises:
+        ValidationError: the robot has no such camera, or none.
+        MissingExtraError: Pillow is not installed.
+        Exception: what the camera raises.
+    """
+    names = camera_list(robot)
+    if not names:
+        raise ValidationError("this robot has no camera.")
+    name = camera or names[0]
+    if name not in names:
+        raise ValidationError(f"camera must be one of {', '.join(names)}, not {shown(camera)}.")
+    if _draws(robot):
+        return name, robot.camera_picture(name, width, height)
+    frames = frames_of(robot)
+    assert frames is not None
+    return name, _scaled(name, frames()[name], width, height)
+
+
+def _draws(robot: Any) -> bool:
+    return isinstance(robot, WorldRobot) and callable(getattr(robot, "camera_picture", None))
+
+
+def _scaled(name: str, pixels: Any, width: int, height: int) -> Any:
+    high, wide = pixels.shape[:2]
+    if wide <= width and high <= height:
+        return pixels
+    image = _image(name, pixels)
+    image.thumbnail((width, height))
+    import numpy as np  # noqa: PLC0415 - optional, there where pictures are
+
+    return np.asarray(image)
+
+
 def jpeg(name: str, pixels: Any) -> bytes:
     """Encode one picture of the camera ``name`` as JPEG.
 
@@ -93,6 +146,12 @@ def jpeg(name: str, pixels: Any) -> bytes:
         ValidationError: ``pixels`` is no height x width x 3 array of uint8.
         MissingExtraError: Pillow is not installed.
     """
+    buffer = io.BytesIO()
+    _image(name, pixels).save(buffer, format="JPEG", quality=QUALITY)
+    return buffer.getvalue()
+
+
+def _image(name: str, pixels: Any) -> Any:
     shape = tuple(getattr(pixels, "shape", ()))
     if len(shape) != 3 or shape[2] != 3 or str(getattr(pixels, "dtype", "")) != "uint8":
         raise ValidationError(f"a frame of {name} must be height x width x 3 of uint8, not {shape}.")
@@ -100,6 +159,4 @@ def jpeg(name: str, pixels: Any) -> bytes:
         from PIL import Image  # noqa: PLC0415 - optional, loaded when a picture is taken
     except ImportError:
         raise missing_extra("Encoding camera frames", "record") from None
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="JPEG", quality=QUALITY)
-    return buffer.getvalue()
+    return Image.fromarray(pixels)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from strands_robots import settings
@@ -18,6 +18,7 @@ from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS, for_robot
+from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.verbs import (
     ASSERTION,
@@ -326,6 +327,7 @@ ARM_VERBS = table(
         GET_FEATURES,
         GET_STATE,
         *ARM_MOTION_VERBS.values(),
+        *PICTURE_VERBS.values(),
     ]
 )
 WORLD_VERBS = table(
@@ -370,6 +372,7 @@ WORLD_VERBS = table(
             critical=False,
         ),
         *WORLD_MOTION_VERBS.values(),
+        *PICTURE_VERBS.values(),
     ]
 )
 
@@ -438,6 +441,7 @@ PEER_VERBS = table(
         _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
         *(for_robot(verb, _PEER_ROBOT, drops_unknown=True) for verb in ARM_MOTION_VERBS.values()),
+        *(replace(verb, drops_unknown=True) for verb in PICTURE_VERBS.values()),
     ]
 )
 """The actions of the mesh; ``execute``, ``stop``, ``resume``, ``ping`` and teleoperation are the peer's own."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -157,3 +158,10 @@ def test_goal_that_cannot_be_is_refused_by_name(fleet: FleetClient, goal: dict[s
     answer = fleet.call("sim-1", "moveTo", {**goal, "robot_name": "left"})
     assert answer["status"] == "error"
     assert reason in answer["reason"]
+
+
+def test_picture_comes_over_the_network(fleet: FleetClient) -> None:
+    assert "front" in fleet.call("sim-1", "listCameras")["cameras"]
+    answer = fleet.call("sim-1", "getPicture", {"camera": "table"})
+    assert (answer["camera"], answer["width"], answer["height"]) == ("table", 640, 480)
+    assert base64.b64decode(answer["jpeg"]).startswith(b"\xff\xd8")
