@@ -29,7 +29,7 @@ def test_flag_outranks_the_network_of_the_environment(monkeypatch: pytest.Monkey
     [
         Network(connect=["tcp/192.0.2.1:7447"]),
         Network(listen=["tcp/0.0.0.0:7447"]),
-        Network(nats="nats://192.0.2.1:4222"),
+        Network(nats=["nats://192.0.2.1:4222"]),
         Network(multicast=True),
     ],
 )
@@ -42,7 +42,7 @@ def test_unauthenticated_remote_network_is_refused_with_every_remedy(network: Ne
 
 
 def test_insecure_flag_or_certificates_allow_a_remote_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Network(nats="nats://192.0.2.1:4222", insecure=True).link().transport == "nats"
+    assert Network(nats=["nats://192.0.2.1:4222"], insecure=True).link().transport == "nats"
     for name in ("ca", "cert", "key"):
         (tmp_path / name).write_text("pem")
     files = {"tls_ca": tmp_path / "ca", "tls_cert": tmp_path / "cert", "tls_key": tmp_path / "key"}
@@ -58,11 +58,16 @@ def test_missing_extra_is_named_in_one_sentence(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_broker_on_this_machine_needs_no_authentication() -> None:
-    assert Network(nats="nats://127.0.0.1:4222").link().loopback_only
+    assert Network(nats=["nats://127.0.0.1:4222"]).link().loopback_only
 
 
 def test_contradicting_flags_and_missing_files_are_wrong_usage(tmp_path: Path) -> None:
     with pytest.raises(CliError, match="--nats names a broker"):
-        Network(nats="nats://127.0.0.1:4222", connect=["tcp/127.0.0.1:1"]).link()
+        Network(nats=["nats://127.0.0.1:4222"], connect=["tcp/127.0.0.1:1"]).link()
     with pytest.raises(CliError, match=r"--tls-ca .* is no file"):
         Network(tls_ca=tmp_path / "absent").link()
+
+
+def test_nats_takes_several_servers() -> None:
+    link = Network(nats=["nats://127.0.0.1:4222,nats://127.0.0.1:4223", "nats://127.0.0.1:4224"]).link()
+    assert [url.rpartition(":")[2] for url in link.connect] == ["4222", "4223", "4224"]

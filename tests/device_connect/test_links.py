@@ -111,3 +111,28 @@ def test_certificates_need_no_opt_in(tmp_path: Path, caplog: pytest.LogCaptureFi
     link = LinkConfig(ca=str(robot.ca), cert=str(robot.cert), key=str(robot.key))
     assert not insecure_opt_in(None, link, stated=False)
     assert caplog.text == ""
+
+
+def test_several_urls_with_commas_are_servers_of_one_link() -> None:
+    link = link_for("nats://a:4222, nats://b:4222", None, "default", None)
+    assert link.connect == ("nats://a:4222", "nats://b:4222")
+    assert link_for("tcp/a:7447,tcp/b:7447", None, "default", None).connect == ("tcp/a:7447", "tcp/b:7447")
+
+
+def test_zenoh_ignores_the_url_of_a_nats_server_and_the_other_way_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NATS_URL", "nats://127.0.0.1:4222")
+    assert link_for(None, "zenoh", "default", None).uses_multicast
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
+    assert link_for(None, "zenoh", "default", None).connect == ("tcp/127.0.0.1:7447",)
+    assert link_for(None, "nats", "default", None).connect == ("nats://127.0.0.1:4222",)
+    monkeypatch.delenv("NATS_URL")
+    with pytest.raises(ValidationError, match="nats needs a server"):
+        link_for(None, "nats", "default", None)
+
+
+def test_nats_url_is_no_zenoh_endpoint() -> None:
+    with pytest.raises(ValidationError, match=r"connect must be like tcp/host:port"):
+        link_for("nats://user:secret@127.0.0.1:4222", "zenoh", "default", None)
+    with pytest.raises(ValidationError) as refused:
+        LinkConfig(connect=("nats://user:secret@127.0.0.1:4222",))
+    assert "secret" not in str(refused.value)

@@ -34,9 +34,10 @@ def test_similar_name_is_suggested() -> None:
         create_policy("mok")
 
 
-def test_port_zero_is_the_default_and_a_provider_without_port_ignores_it() -> None:
+def test_port_zero_is_the_default_and_a_provider_without_port_refuses_another() -> None:
     assert create_policy("mock", policy_port=0)
-    assert create_policy("mock", policy_port=9000)
+    with pytest.raises(ValidationError, match="policy_port must be 0 for policy_provider mock"):
+        create_policy("mock", policy_port=9000)
     assert create_policy("remote", policy_port=0).url == "ws://127.0.0.1:8765"  # type: ignore[attr-defined]
     assert create_policy("remote", policy_port=9000).url == "ws://127.0.0.1:9000"  # type: ignore[attr-defined]
 

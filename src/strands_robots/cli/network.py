@@ -39,7 +39,9 @@ def _option(flag: str, text: str, **more: Any) -> Any:
 class Network:
     """Network flags as the user gave them."""
 
-    nats: Annotated[str | None, _option("--nats", "NATS server, such as nats://host:4222.", metavar="URL")] = None
+    nats: Annotated[
+        list[str] | None, _option("--nats", "NATS server, such as nats://host:4222 (repeat).", metavar="URL")
+    ] = None
     connect: Annotated[
         list[str] | None, _option("--connect", "Zenoh endpoint to connect to (repeat).", metavar="EP")
     ] = None
@@ -117,7 +119,7 @@ class Network:
             return replace(
                 link,
                 mode="peer" if self.listen or self.multicast else "auto",
-                connect=(self.nats,) if self.nats else _endpoints(self.connect),
+                connect=_urls(self.nats) if self.nats else _endpoints(self.connect),
                 listen=_endpoints(self.listen),
                 multicast=True if self.multicast else None,
                 verify_hostname=True,
@@ -207,7 +209,13 @@ def _pem(flag: str, path: Path | None, otherwise: str) -> str:
     return str(path) if path is not None else otherwise
 
 
+def _urls(values: list[str] | None) -> tuple[str, ...]:
+    from strands_robots.device_connect.backends.config import split_urls  # noqa: PLC0415 - as above
+
+    return split_urls(values or [])
+
+
 def _endpoints(values: list[str] | None) -> tuple[str, ...]:
     from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
 
-    return endpoints([part for each in values or [] for part in each.split(",")])
+    return endpoints(_urls(values))

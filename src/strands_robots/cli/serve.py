@@ -212,8 +212,8 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
 def _network_flags(link: LinkConfig, network: Network) -> str:
     """Return the flags for another terminal of the same network, without secrets."""
     flags = []
-    if network.nats:
-        flags += ["--nats", network.nats]
+    for url in network.nats or []:
+        flags += ["--nats", url]
     for endpoint in network.connect or network.listen or []:
         flags += ["--connect", endpoint.replace("0.0.0.0", "HOST").replace("[::]", "HOST")]
     flags += ["--multicast"] if network.multicast else []

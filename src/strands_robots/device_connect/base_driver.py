@@ -36,7 +36,7 @@ from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Re
 from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
-from strands_robots.utils import shown
+from strands_robots.utils import shown, text
 
 logger = logging.getLogger(__name__)
 
@@ -85,6 +85,16 @@ def rpc_method(verb: Verb) -> Callable[..., Any]:
     itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     vars(method)["__signature__"] = inspect.Signature([itself, *parameters], return_annotation=dict[str, Any])
     return rpc(labels=_labels(verb))(method)
+
+
+def stated_type(robot: object, usual: str) -> str:
+    """Return the ``device_type`` that a robot states for itself, else the usual one.
+
+    Raises:
+        ValidationError: it states something else than a short text.
+    """
+    stated = getattr(robot, "device_type", None)
+    return usual if stated is None else text("device_type", stated, longest=100)
 
 
 def enveloped(verb: str, answer: object) -> Envelope:

@@ -99,8 +99,8 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         robot: a simulation, a robot, any object that ``contract.adapt`` accepts, or a ready ``DeviceDriver``.
         peer_id: its id on the network, without dots; ``<tool_name>-<8 hex>`` by default.
         peer_type: ``robot`` or ``sim``; settles what an object is that could be either.
-        messaging_url: ``nats://host:port`` or ``tcp/host:port``; the environment's by default. Zenoh without one
-            finds other devices by multicast on the local network.
+        messaging_url: ``nats://host:port`` or ``tcp/host:port``, or several with commas; the environment's by default.
+            Zenoh without one finds other devices by multicast on the local network.
         messaging_backend: ``zenoh`` or ``nats``; by default what the URL or ``MESSAGING_BACKEND`` says.
         tenant: devices and agents of other tenants neither see nor reach this one.
         allow_insecure: True accepts a transport without authentication; None asks
@@ -266,9 +266,23 @@ def stop_device_connect(runtime: Any, within: float = 10.0) -> None:
 
 
 def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
-    """Return the driver of ``robot``, by its class, else by ``peer_type``."""
+    """Return the driver of ``robot``, by its class, else by ``peer_type``.
+
+    Raises:
+        ValidationError: ``sim`` for a robot that is none, or a robot that lacks what its driver needs.
+    """
     if isinstance(robot, DeviceDriver):
         return robot
+    driver = _driver_by_class(robot)
+    if driver is None:
+        return SimulationDeviceDriver(robot) if peer_type == "sim" else RobotDeviceDriver(robot)
+    if peer_type == "sim" and not isinstance(driver, SimulationDeviceDriver):
+        raise ValidationError(f"peer_type must be robot for {type(robot).__name__}, which is no simulation, not sim.")
+    return driver
+
+
+def _driver_by_class(robot: Any) -> DeviceDriver | None:
+    """Return the driver of a robot that can only be one kind of device, else None."""
     if getattr(robot, "device_type", "") == "reachy_mini":
         from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver  # noqa: PLC0415 - for it alone
 
@@ -288,7 +302,7 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
         return SimulationDeviceDriver(robot)
     if isinstance(robot, WorldRobot) and not callable(getattr(robot, "start_task", None)):
         return SimulationDeviceDriver(robot)
-    return SimulationDeviceDriver(robot) if peer_type == "sim" else RobotDeviceDriver(robot)
+    return None
 
 
 def default_id(robot: Any) -> str:

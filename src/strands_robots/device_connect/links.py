@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from strands_robots import settings
 from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
-from strands_robots.device_connect.backends.config import endpoints
+from strands_robots.device_connect.backends.config import endpoints, split_urls
 from strands_robots.utils import ValidationError, choice, device_id, shown, text
 
 logger = logging.getLogger(__name__)
@@ -57,10 +57,10 @@ def link_for(
         if found.transport == "nats" and not found.connect:
             raise ValidationError("nats needs a server: give messaging_url or set NATS_URL.")
         return found
-    url = text("messaging_url", messaging_url, longest=500)
-    transport = messaging_backend or transport_of(url)
+    urls = split_urls([text("messaging_url", messaging_url, longest=500)])
+    transport = messaging_backend or transport_of(urls[0] if urls else "")
     base = link_from_environment(tenant, transport)
-    return replace(base, connect=endpoints([url]) if transport == "zenoh" else (url,), listen=(), multicast=None)
+    return replace(base, connect=endpoints(urls) if transport == "zenoh" else urls, listen=(), multicast=None)
 
 
 def transport_of(url: str) -> str:

@@ -10,7 +10,7 @@ from device_connect_edge.types import DeviceIdentity
 from strands_robots import settings
 from strands_robots.contract import Haltable, RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
-from strands_robots.device_connect.base_driver import Activity, RobotDriver
+from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
 from strands_robots.device_connect.telemetry import numbers, paced
 from strands_robots.envelope import Envelope, fields_of
 from strands_robots.safety.approval import Approval
@@ -43,6 +43,7 @@ class SimulationDeviceDriver(RobotDriver):
         super().__init__(world, hardware=hardware, authorization=authorization, approval=approval)
         self.world = world
         self._model = world.tool_name_str
+        self.device_type = stated_type(sim, self.device_type)
         self._observed: dict[str, dict[str, float]] = {}
 
     @property

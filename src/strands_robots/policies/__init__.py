@@ -49,16 +49,19 @@ def resolve_provider(provider: object) -> str:
 def create_policy(provider: str, **options: Any) -> Policy:
     """Make a policy; cheap, because its ``reset`` loads and connects.
 
-    ``policy_port=0`` is the provider's own default, and a port is passed only to a provider that takes one.
+    ``policy_port=0`` is the provider's own default.
 
     Raises:
-        ValidationError: no such provider, or an option outside its domain.
+        ValidationError: no such provider, a port for a provider that takes none, or an option outside its domain.
         MissingExtraError: the provider needs an extra that is not installed.
     """
     name = resolve_provider(provider)
     factory = policy_factory(name)
-    if not options.get("policy_port") or not _takes(factory, "policy_port"):
+    if not options.get("policy_port"):
         options.pop("policy_port", None)
+    elif not _takes(factory, "policy_port"):
+        wanted = shown(options["policy_port"])
+        raise ValidationError(f"policy_port must be 0 for policy_provider {name}, which asks no server, not {wanted}.")
     try:
         policy = factory(**options)
     except TypeError as exc:

@@ -38,6 +38,8 @@ from strands_robots.device_connect import (
 )
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
+from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
 
 
@@ -125,6 +127,23 @@ def test_driver_follows_from_the_object() -> None:
 
     assert isinstance(bringup.driver_for(Both(), "sim"), SimulationDeviceDriver)
     assert isinstance(bringup.driver_for(Both(), "robot"), RobotDeviceDriver)
+
+
+def test_robot_that_is_no_simulation_refuses_to_be_served_as_one() -> None:
+    base = MobileBaseRobot("base", MemoryLink(), "/cmd_vel")
+    with pytest.raises(ValidationError, match="peer_type must be robot for MobileBaseRobot"):
+        bringup.driver_for(base, "sim")
+
+
+def test_device_type_that_a_robot_states_is_announced() -> None:
+    class Gripper(ToyRobot):
+        device_type = "gripper"
+
+    assert bringup.driver_for(Gripper(), "robot").identity.device_type == "gripper"
+    assert bringup.driver_for(ToyRobot(), "robot").identity.device_type == "strands_robot"
+    Gripper.device_type = 5
+    with pytest.raises(ValidationError, match="device_type"):
+        bringup.driver_for(Gripper(), "robot")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,9 @@ INTERNET = ("tcp", "udp", "tls", "quic", "ws")
 ZENOH_PORT = 7447
 
 _DOTTED = re.compile(r"[0-9.]+")
+
+# Variables with the URLs of a backend, the first that is set counts.
+_URLS_OF = {"nats": ("NATS_URLS", "NATS_URL"), "zenoh": ("ZENOH_CONNECT",)}
 
 # Batches of 64 KiB per priority and link: the memory that a peer costs which is stopped in a debugger.
 QUEUED_BATCHES = 16
@@ -279,9 +282,7 @@ def link_from_environment(tenant: str = "default", transport: str | None = None)
     """
     credentials = _credentials_file()
     backend = transport or (settings.raw("MESSAGING_BACKEND") if settings.is_set("MESSAGING_BACKEND") else "")
-    urls = _first_set("MESSAGING_URLS", "NATS_URLS" if backend == "nats" else "", "NATS_URL", "ZENOH_CONNECT")
-    if backend == "zenoh" and settings.is_set("ZENOH_CONNECT") and not settings.is_set("MESSAGING_URLS"):
-        urls = settings.items("ZENOH_CONNECT")
+    urls = _first_set("MESSAGING_URLS", *_URLS_OF.get(backend, ("NATS_URL", "ZENOH_CONNECT")))
     if not backend:
         backend = _backend_of(urls, credentials)
     section = credentials.get(backend) or {}
@@ -302,6 +303,11 @@ def link_from_environment(tenant: str = "default", transport: str | None = None)
         cert=tls["cert"],
         key=tls["key"],
     )
+
+
+def split_urls(stated: Iterable[str]) -> tuple[str, ...]:
+    """Return the URLs of values that may each hold several, with commas."""
+    return tuple(url for value in stated for each in value.split(",") if (url := each.strip()))
 
 
 def endpoints(servers: Sequence[str]) -> tuple[str, ...]:
@@ -332,12 +338,12 @@ def _check_zenoh(name: str, endpoint: str) -> None:
         ValidationError: naming ``name``, the value and the domain.
     """
     scheme, slash, rest = endpoint.partition("/")
-    if slash and scheme not in INTERNET:
+    if slash and scheme not in INTERNET and not scheme.endswith(":"):
         return
     address = re.split(r"[?#]", rest, maxsplit=1)[0]
     host, colon, number = address.rpartition(":")
     if not (slash and colon and _is_host(host) and number.isascii() and number.isdigit() and int(number) <= 65535):
-        raise ValidationError(f"{name} must be like tcp/host:port or tls/host:port, not {shown(endpoint)}.")
+        raise ValidationError(f"{name} must be like tcp/host:port or tls/host:port, not {shown(_safe(endpoint))}.")
 
 
 def _check_nats(name: str, url: str) -> None:
