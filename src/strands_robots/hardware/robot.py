@@ -6,7 +6,8 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, cast
@@ -327,15 +328,13 @@ class HardwareRobot(TeleopMixin):
         if self._settling is not None and self._settling.running and ordered == self._frozen_at:
             # Ordered before the halt that began to settle had frozen the robot: the two are one stop.
             return StopVerdict(settling=True)
-
-        def freeze() -> None:
+        with self._halted(deadline) as verdicts:
             # A halt that waited for the bus when this one was ordered has frozen the robot for both.
             if ordered != self._frozen_at or self._body.driven:
                 seen = self.gate.generation
                 self._body.stop()
                 self._frozen_at = seen
-
-        verdict = self._settled_after(self._halted_by(freeze, deadline))
+        verdict = self._settled_after(*verdicts)
         logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
         return verdict
 
@@ -343,21 +342,28 @@ class HardwareRobot(TeleopMixin):
         """Halt and switch torque off on the stop executor's thread."""
         if self._settling is not None:
             self._settling.take()
-        return self._halted_by(lambda: self._body.release(motors), deadline)
+        with self._halted(deadline) as verdicts:
+            self._body.release(motors)
+        return verdicts[0]
 
-    def _halted_by(self, freeze: Callable[[], None], deadline: float) -> StopVerdict:
-        """Void every permit, ask every loop to end, and freeze the body."""
+    @contextmanager
+    def _halted(self, deadline: float) -> Iterator[list[StopVerdict]]:
+        """Void every permit and ask every loop to end; inside, the body is frozen.
+
+        Yields a list that has the verdict afterwards.
+        """
+        verdicts: list[StopVerdict] = []
         moved = self._halting = dict.fromkeys([*self._moved, *self._moving()])
         self._moved = {}
         self.gate.revoke()
         ends = self._ends(deadline)
         try:
             with self._body.stopping():
-                freeze()
+                yield verdicts
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
-            return _unfrozen(_failure(self.tool_name_str, exc), moved)
+            verdicts.append(_unfrozen(_failure(self.tool_name_str, exc), moved))
         else:
-            return halt_each({**dict.fromkeys(moved, _stopped), **ends})
+            verdicts.append(halt_each({**dict.fromkeys(moved, _stopped), **ends}))
         finally:
             self._halting = {}
 
