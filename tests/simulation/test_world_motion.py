@@ -10,11 +10,13 @@ from typing import Any
 import pytest
 from fixtures.bodies import ScriptedPolicy
 from fixtures.leaders import ScriptedLeader
+from fixtures.planes import own_plane
 from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.envelope import Envelope, error
 from strands_robots.safety.gate import Permit
+from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.stopping import Outcome, StopVerdict, grade, halt_each
 from strands_robots.simulation import Simulation
 from strands_robots.simulation import world as world_module
@@ -184,6 +186,24 @@ def test_halt_names_a_policy_that_does_not_return_and_its_action_is_not_written(
     stuck.let_go.set()
     eventually(lambda: not busy(world))
     assert held == world.body("left").targets
+
+
+def test_emergency_stop_names_a_policy_whose_loop_ended_before_the_halt_ran(world: Simulation) -> None:
+    world.start_policy("left", "wave", duration=300)
+    eventually(lambda: world.list_policies_running()[0]["step"] > 2)
+    halt = world.halt
+
+    def late(reason: str = "") -> StopVerdict:
+        eventually(lambda: not busy(world))
+        return halt(reason)
+
+    world.halt = late  # type: ignore[method-assign]
+    with own_plane(20.0) as plane:
+        plane.register("world", world)
+        report = plane.emergency_stop(StopOrder(new_epoch(), "safety-1"))["world"]
+        assert (report.stopped, report.verdict.halted) == (True, ("left",))
+        plane.clear_local("ann")
+        assert plane.emergency_stop(StopOrder(new_epoch(), "safety-1"))["world"].verdict.halted == ()
 
 
 @pytest.mark.parametrize("stop", ["halt", "stop_policy"])

@@ -97,6 +97,7 @@ class Simulation(ArmMixin, TeleopMixin):
         self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime))
         self._bodies: dict[str, RobotBody] = {}
         self._rollouts: dict[str, Rollout] = {}
+        self._moved: dict[str, None] = {}
         self._waiting = Waiting()
         self._renderer = Renderer()
         self._closed = False
@@ -436,8 +437,14 @@ class Simulation(ArmMixin, TeleopMixin):
         The gate is revoked first and the setpoints are frozen second; both take microseconds, and after them no
         action is written, whatever a policy is doing. Last it waits for the loops to end, to report whether they did.
         """
+        self.halt_ordered()
         self.gate.revoke()
         return self._freeze(reason)
+
+    def halt_ordered(self) -> None:
+        """Note what moves; a loop whose permit is void counts as halted."""
+        leaders = (f"teleoperation {name}" for name in self.teleoperating())
+        self._moved.update(dict.fromkeys([*self._running(), *leaders]))
 
     def cleanup(self) -> Envelope:
         """Halt, stop the clock and free the pictures. A second call does nothing."""
@@ -613,10 +620,12 @@ class Simulation(ArmMixin, TeleopMixin):
     def _freeze(self, reason: str) -> StopVerdict:
         deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
         self.physics.hold()
+        moved, self._moved = self._moved, {}
         running = self._running()
         for rollout in running.values():
             rollout.request_stop()
         sources: dict[str, Callable[[], object]] = {
+            **dict.fromkeys(moved, partial(success, "Stopped.", stopped=True)),
             **{name: partial(rollout.ended_by, deadline) for name, rollout in running.items()},
             **self.teleop_stops(deadline),
         }

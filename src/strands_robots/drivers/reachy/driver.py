@@ -375,6 +375,10 @@ class ReachyDriver:
         """Call ``observer`` at every motion's end."""
         return self.motions.observers.subscribe(observer)
 
+    def halt_ordered(self) -> None:
+        """Note what moves before the permits are void."""
+        self.motions.halt_ordered()
+
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop gestures, ramps, streams, and every move that the daemon runs.
 

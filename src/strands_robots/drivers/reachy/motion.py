@@ -171,6 +171,7 @@ class MotionController:
         self._write = threading.Lock()
         self._next_frame_at = 0.0
         self._current: ReachyMotion | None = None
+        self._moved: ReachyMotion | None = None
         self._sent = Target()
         self._sent_on = 0
         self._body_yaw_sent_on = 0
@@ -283,11 +284,17 @@ class MotionController:
             self.forget_sent()
             self._end(motion, "completed")
 
+    def halt_ordered(self) -> None:
+        """Note what moves; a motion whose permit is void counts as halted."""
+        if self._current is not None and self._current.running:
+            self._moved = self._current
+
     def halt(self, reason: str) -> StopVerdict:
         """Stop every motion, from any thread, without waiting for a motion's start."""
+        self.halt_ordered()
         self._gate.revoke()
         deadline = time.monotonic() + 0.85 * settings.number("STRANDS_HALT_DEADLINE_S")
-        motion = self._current if self._current is not None and self._current.running else None
+        motion, self._moved = self._moved, None
         if motion is not None:
             motion.detail = motion.detail or reason
             motion.cancelled.set()
