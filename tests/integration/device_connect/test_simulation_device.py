@@ -34,6 +34,8 @@ def sim(link: LinkConfig) -> Iterator[Simulation]:
     world.create_world()
     world.add_robot("left", "so100")
     world.add_robot("right", "so100")
+    # The thread of the pictures belongs to the world, not to the test that asks for one.
+    world.camera_picture("front", 64, 48)
     runtime = init_device_connect_sync(world, peer_id="sim-1", link=link)
     yield world
     stop_device_connect(runtime)
