@@ -165,7 +165,7 @@ _declare(
     # Robots.
     Setting("STRANDS_CONTROL_HZ", "number", "50", "Control loop rate of a rollout.", 1, 2000),
     Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Network of the robot_mesh tool: off means the native mesh."),
-    Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants and lockouts. Unset: ~/.strands_robots."),
+    Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants, lockouts and keys. Unset: ~/.strands_robots."),
     # Rendering, by names that are not ours.
     Setting("MUJOCO_GL", "text", "", "OpenGL of MuJoCo: egl, osmesa or glfw. Unset: one that works without a display."),
     Setting("DISPLAY", "text", "", "X display; with one, MuJoCo's own choice of OpenGL is kept."),

@@ -15,7 +15,8 @@ from strands_robots.cli.demo.output import DemoScreen, draw_path, sample_poses
 from strands_robots.cli.demo.processes import AgentEvent
 from strands_robots.cli.demo.steps import DemoReport, DriveSteps, SafetySteps
 from strands_robots.cli.output import CliError, Screen
-from strands_robots.safety.controller import Answer, StopReport
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import StopReport
 
 EPOCH = "0123456789abcdef0123456789abcdef"
 

@@ -13,7 +13,8 @@ from strands_robots.cli import safety_controller
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.safety_controller import FleetScreen, StopButton
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.safety.controller import Answer, Progress, StopReport
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.lockout import Lockout
 
 

@@ -12,7 +12,8 @@ from strands_robots.cli.output import Exit
 from strands_robots.cli.stop import exit_code, progress_rows, report_rows, summary
 from strands_robots.device_connect import safety_controller
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.controller import Answer, Progress, StopReport
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.tools.networks import stop_outcome
 
 

@@ -11,6 +11,7 @@ from strands_robots.cli import (
     audit,
     demo,
     doctor,
+    enroll,
     keys,
     peers,
     record,
@@ -70,6 +71,7 @@ def build() -> typer.Typer:
         record,
         audit,
         keys,
+        enroll,
         doctor,
         demo,
     ):

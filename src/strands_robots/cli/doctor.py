@@ -22,6 +22,7 @@ from strands_robots.cli.command import command
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.identity import robots_here
 from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
 from strands_robots.utils import DISTRIBUTION, MissingExtraError, ValidationError, install_line
 
@@ -122,6 +123,7 @@ def examine(network: Network) -> list[Finding]:
         _stop_senders,
         _rendering,
         _state,
+        _robot_keys,
     )
     return [finding for check in checks for finding in check()]
 
@@ -333,6 +335,14 @@ def _state() -> Iterator[Finding]:
     except OSError as exc:
         remedy = "set STRANDS_STATE_DIR to a directory that this user can write"
         yield Finding("state", Mark.BROKEN, f"{probe} cannot be written: {exc.strerror}", remedy)
+
+
+def _robot_keys() -> Iterator[Finding]:
+    for name, identity in robots_here().items():
+        if isinstance(identity, str):
+            yield Finding(f"key of {name}", Mark.WARN, identity, "its answers are not signed until this is mended")
+        else:
+            yield Finding(f"key of {name}", Mark.OK, f"fingerprint {identity.fingerprint}")
 
 
 def _version(name: str) -> str | None:

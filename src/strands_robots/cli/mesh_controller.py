@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.resume_mesh import ask_peers, lockable_peers
-from strands_robots.safety.controller import Answer, OnProgress, Press, Progress, StopReport
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.stopping import explain
 from strands_robots.tools.networks import stop_outcome

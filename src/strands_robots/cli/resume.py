@@ -21,9 +21,11 @@ from strands_robots.cli.resume_mesh import ask_peers, lockable_peers, resume_pee
 from strands_robots.envelope import text_of
 from strands_robots.safety.approval import GRANT_S, Grants, state_dir
 from strands_robots.safety.clearance import clear_here
+from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.lockout import OVERFLOW, Lockout, utc
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
+from strands_robots.safety.statements import Purpose, distrust
 from strands_robots.tools.networks import discover
 from strands_robots.utils import device_id, number
 
@@ -151,10 +153,13 @@ def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
 
 
 def ask_robots(fleet: FleetClient, names: Iterable[str], seconds: float) -> list[LockoutReport]:
-    """Ask each robot for its status, in parallel."""
-    wanted = list(dict.fromkeys(names))
+    """Ask each robot for its status, in parallel.
+
+    An enrolled robot whose answer is not its own has a ``problem``.
+    """
+    wanted, keys = list(dict.fromkeys(names)), _enrolled(fleet)
     with ThreadPoolExecutor(PARALLEL_CALLS) as pool:
-        return list(pool.map(lambda name: _ask(fleet, name, seconds), wanted))
+        return list(pool.map(lambda name: _ask(fleet, name, seconds, keys.get(name)), wanted))
 
 
 def _ask_mesh(network: Network, seconds: float) -> list[LockoutReport]:
@@ -196,7 +201,21 @@ def _stored_lockouts() -> dict[str, tuple[Lockout, ...]]:
     return {each.name or key: each.state.all for key, each in stored.items() if each.state.locked}
 
 
-def _ask(fleet: FleetClient, name: str, seconds: float) -> LockoutReport:
+def _enrolled(fleet: FleetClient) -> dict[str, bytes]:
+    """Return the enrolled keys of the robots on this network.
+
+    Raises:
+        CliError: the keys cannot be used.
+    """
+    from strands_robots.device_connect.enrollment import enrolled_robots  # noqa: PLC0415 - the network is loaded when it is used
+
+    try:
+        return enrolled_robots(fleet.link)
+    except (KeyFileError, OSError) as exc:
+        raise CliError(f"The enrolled keys cannot be used: {exc}") from exc
+
+
+def _ask(fleet: FleetClient, name: str, seconds: float, key: bytes | None) -> LockoutReport:
     began = time.monotonic()
     try:
         answer = call_device(fleet, name, "getStatus", {}, seconds)
@@ -207,7 +226,9 @@ def _ask(fleet: FleetClient, name: str, seconds: float) -> LockoutReport:
         return LockoutReport(name, problem="it does not report lockouts", facts=answer, round_trip_ms=took_ms)
     rows = answer.get("lockout")
     lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping)) if isinstance(rows, list) else ()
-    return LockoutReport(name, lockouts, facts=answer, round_trip_ms=took_ms)
+    stated = {"locked": answer["locked"], "epochs": [each.epoch for each in lockouts]}
+    problem = distrust(Purpose.LOCKOUT_STATE, name, answer.get("statement"), key, stated)
+    return LockoutReport(name, () if problem else lockouts, problem, answer, took_ms)
 
 
 def _lockout_rows(name: str, lockouts: Iterable[Lockout]) -> list[tuple[str, str]]:
@@ -235,6 +256,7 @@ def _resume_all(
     fleet: FleetClient, found: list[LockoutReport], signer: Any, seconds: float
 ) -> dict[str, tuple[bool, str]]:
     """Sign and send a resume of every lockout; return each robot's answer."""
+    keys = _enrolled(fleet)
     by_epoch: dict[str, list[str]] = {}
     for robot in found:
         for lockout in robot.lockouts:
@@ -246,12 +268,14 @@ def _resume_all(
             for name in assertion["targets"]:
                 assertions.setdefault(name, []).append(assertion)
     with ThreadPoolExecutor(PARALLEL_CALLS) as pool:
-        outcomes = pool.map(lambda robot: _resume(fleet, robot, assertions.get(robot.name, []), seconds), found)
+        outcomes = pool.map(
+            lambda robot: _resume(fleet, robot, assertions.get(robot.name, []), seconds, keys.get(robot.name)), found
+        )
         return {robot.name: outcome for robot, outcome in zip(found, outcomes, strict=True)}
 
 
 def _resume(
-    fleet: FleetClient, robot: LockoutReport, assertions: list[dict[str, Any]], seconds: float
+    fleet: FleetClient, robot: LockoutReport, assertions: list[dict[str, Any]], seconds: float, key: bytes | None
 ) -> tuple[bool, str]:
     if robot.problem:
         return False, robot.problem
@@ -263,6 +287,11 @@ def _resume(
             answer = call_device(fleet, robot.name, "resume", {"assertion": assertion}, seconds)
         except CliError as failure:
             return False, failure.reason
+        stated = {"status": answer.get("status"), "nonce": assertion["nonce"]}
+        stated |= {"locked": answer["locked"]} if "locked" in answer else {}
+        problem = distrust(Purpose.RESUME_ANSWER, robot.name, answer.get("statement"), key, stated)
+        if problem:
+            return False, problem
         if answer.get("status") != "success":
             return False, f"{text_of(answer)}: its own audit says why"
         locked, said = answer.get("locked") is not False, text_of(answer)

@@ -25,8 +25,9 @@ from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
 from strands_robots.cli.resume import ask_robots, lockable_robots
-from strands_robots.cli.stop import LATE_MS, SLOW_MS, exit_code, summary
-from strands_robots.safety.controller import Answer, Progress, SafetyController, StopReport
+from strands_robots.cli.stop import LATE_MS, SLOW_MS, style_of, summary
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import Progress, SafetyController, StopReport
 from strands_robots.safety.lockout import utc
 from strands_robots.safety.orders import new_epoch
 from strands_robots.utils import device_id, number
@@ -89,7 +90,7 @@ def safety_controller(
     signer = None if key is None else signing_key(key, passphrase_file)
     from strands_robots.device_connect import safety_controller as network_side  # noqa: PLC0415 - loaded when it is used
 
-    controller = network_side.safety_controller(source, link, signing_key=signer)
+    controller = network_side.safety_controller(source, link, signing_key=signer, require_signed=signer is not None)
     with contextlib.closing(controller):
         if every is not None:
             controller.check_in_every(every)
@@ -198,7 +199,7 @@ class StopButton:
 
         while True:
             report = self._controller.stop(self._expected(), self._reason, estop_id=estop_id, on_progress=note)
-            unfinished = not report.link or bool(report.silent)
+            unfinished = not report.link or bool(report.unanswered)
             with self._guard:
                 if estop_id != self._id:
                     return
@@ -271,7 +272,8 @@ class FleetScreen:
         robots |= {each.name: each for each in reports if not each.problem}
         # The screen and the space bar may be reading the old dictionary, so it is replaced and not changed.
         self._robots = robots
-        self._problem = "" if robots else "No robot is on this network yet."
+        alarms = [f"{each.name}: {each.problem}." for each in reports if "ALARM" in each.problem]
+        self._problem = " ".join(alarms) if robots or alarms else "No robot is on this network yet."
 
     def draw(self, button: StopButton, log: Collection[str]) -> RenderableType:
         """Return the whole screen."""
@@ -309,6 +311,8 @@ def _row(name: str, last: LockoutReport, answer: Answer | None) -> tuple[Any, ..
 def _stop_cell(answer: Answer | None) -> Text | str:
     if answer is None:
         return ""
+    if answer.stopped and answer.claimed:
+        return label("claimed to have stopped; not signed", "yellow")
     if answer.stopped:
         if answer.latency_ms > LATE_MS:
             return label(f"stopped {answer.latency_ms / 1000:.1f} s after the press", "bold red")
@@ -337,4 +341,5 @@ def _outcome(button: StopButton) -> Text:
         return label("")
     report = button.report
     silent_names = f" No answer: {', '.join(report.silent)}." if report.silent else ""
-    return label(f"{summary(report)}{silent_names}", "green" if exit_code(report) is Exit.OK else "bold red")
+    alarms = " ".join(f" ALARM: {name}: {why}." for name, why in report.alarms.items())
+    return label(f"{summary(report)}{silent_names}{alarms}", "bold red" if alarms else style_of(report))

@@ -181,6 +181,8 @@ def _on_device_connect(
 
 def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriver, network: Network) -> None:
     functions = {each.name: str(each.description).strip() for each in driver.capabilities.functions}
+    identity = getattr(getattr(driver, "registration", None), "identity", None)
+    key = identity.fingerprint if identity is not None else ""
     screen.data(
         {
             "event": "serving",
@@ -189,6 +191,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
             "network": describe(link),
             "pid": os.getpid(),
             "functions": functions,
+            "fingerprint": key,
         }
     )
     if screen.machine:
@@ -203,6 +206,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
         label(f"  strands-robots call {peer_id} {_example(functions)}{flags}"),
         label(f"  strands-robots stop {peer_id}{flags}"),
         label(f"  strands-robots estop{flags}"),
+        *([label(f"Its key, for strands-robots enroll: {key}")] if key else []),
         label(""),
         label("Ctrl-C stops the robot, then takes it off the network."),
     ]

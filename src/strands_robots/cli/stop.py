@@ -16,7 +16,8 @@ from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import SOURCE, Network, describe
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.envelope import Envelope, text_of
-from strands_robots.safety.controller import DEADLINE_S, Answer, Progress, SafetyController, StopReport
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import DEADLINE_S, Progress, SafetyController, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.tools.networks import NativeMesh, stop_outcome
 from strands_robots.utils import device_id, number
@@ -34,6 +35,7 @@ LOCKED = "They are locked until they are resumed: strands-robots resume."
 LOCKED_MESH = (
     "They are locked until they are resumed: strands-robots resume --mesh --key FILE, or resume --local where they run."
 )
+CLAIMED = "Claimed is not proven: no enrolled robot signed it. Enroll robots with strands-robots enroll."
 LINK_WAIT_S = 2.0
 
 
@@ -94,7 +96,9 @@ def estop(
     deadline: Annotated[
         float, typer.Option("--deadline", help="Seconds until a robot without an answer counts as silent.")
     ] = DEADLINE_S,
-    key: Annotated[Path | None, typer.Option("--key", help="Sign it, where robots ask for signed stops.")] = None,
+    key: Annotated[
+        Path | None, typer.Option("--key", help="Sign it; then only enrolled robots can confirm it.")
+    ] = None,
     passphrase_file: PassphraseFile = None,
     on_mesh: OnMesh = False,
 ) -> None:
@@ -118,7 +122,7 @@ def estop(
         safety_controller,
     )
 
-    controller = safety_controller(source, link, signing_key=signer)
+    controller = safety_controller(source, link, signing_key=signer, require_signed=signer is not None)
     try:
         running = RunningStop(controller, expected, reason, seconds, link)
         if screen.live:
@@ -130,7 +134,14 @@ def estop(
         controller.close()
     answer = envelope(report)
     facts = _facts(answer)
-    screen.say(summary(report), "green" if report.ok else "bold red")
+    screen.say(summary(report), style_of(report))
+    for name, why in report.alarms.items():
+        screen.say(
+            f"ALARM: {name}: {why}. Its own answer {'is missing' if name in report.alarmed else 'came, too'}.",
+            "bold red",
+        )
+    if report.claimed:
+        screen.say(CLAIMED, "yellow")
     code = exit_code(report)
     if code is not Exit.OK:
         where = "" if report.link else f" {describe(link)}"
@@ -196,10 +207,18 @@ class RunningStop:
 
 
 def exit_code(report: StopReport) -> Exit:
-    """Return 0 when all stopped, 1 when one did not, 3 when one is silent."""
-    if report.not_stopped or report.refused:
+    """Return 0 when all stopped, 1 when one did not, 3 when one has not answered."""
+    if report.not_stopped or report.refused or report.alarmed:
         return Exit.REFUSED
     return Exit.OK if report.ok else Exit.SILENT
+
+
+def style_of(report: StopReport) -> str:
+    """Return green when every robot is still, yellow when some only by a claim."""
+    if report.ok:
+        return "green"
+    only_claimed = not (report.not_stopped or report.refused or report.alarmed or report.silent)
+    return "yellow" if report.claimed and only_claimed else "bold red"
 
 
 def summary(report: StopReport) -> str:
@@ -208,6 +227,8 @@ def summary(report: StopReport) -> str:
     for robots, outcome in (
         (report.not_stopped, "DID NOT STOP"),
         (report.refused, "did not act on it"),
+        (report.alarmed, "answered with a WRONG KEY"),
+        (report.claimed, "claimed"),
         (report.silent, "silent"),
     ):
         parts += [f"{len(robots)} {outcome}"] if robots else []
@@ -219,7 +240,9 @@ def report_rows(report: StopReport) -> list[tuple[Any, ...]]:
     """Return one row for each robot of a finished stop, the worst first."""
     left_ms = report.left_ms
     worst = [_row(name, each, left_ms) for name, each in sorted({**report.not_stopped, **report.refused}.items())]
+    worst += [(*_silent_row(name, "WRONG KEY")[:3], report.alarms[name]) for name in report.alarmed]
     worst += [_silent_row(name, "NO ANSWER") for name in report.silent]
+    worst += [_row(name, each, left_ms) for name, each in sorted(report.claimed.items())]
     slowest = sorted(report.stopped.items(), key=lambda each: -each[1].latency_ms)
     return [*worst, *(_row(*each, left_ms) for each in slowest)]
 
@@ -227,7 +250,8 @@ def report_rows(report: StopReport) -> list[tuple[Any, ...]]:
 def progress_rows(progress: Progress) -> list[tuple[Any, ...]]:
     """Return one row for each robot of a stop in progress."""
     answered = [_row(*each, progress.left_ms) for each in sorted(progress.answered.items())]
-    return [*(_silent_row(name, "unconfirmed") for name in progress.unconfirmed), *answered]
+    marks = {name: "WRONG KEY" if name in progress.alarms else "unconfirmed" for name in progress.unconfirmed}
+    return [*(_silent_row(name, mark) for name, mark in marks.items() if name not in progress.answered), *answered]
 
 
 def _table(rows: list[tuple[Any, ...]], title: str = "") -> Table:
@@ -261,7 +285,12 @@ def _row(name: str, answer: Answer, left_ms: float) -> tuple[Any, ...]:
     mark = label(still, slow or "green") if answer.stopped else label("DID NOT STOP", "bold red")
     if answer.stopped is None:
         mark = label("UNKNOWN", "bold red")
-    return name, mark, label(f"{took_ms:.1f}", slow), answer.why or _halted(answer.facts)
+    said = answer.why or _halted(answer.facts)
+    if answer.claimed and answer.stopped:
+        mark, said = label("claimed", "yellow"), f"not signed by {name}; {said}"
+    if answer.delay_s is not None and answer.delay_s * 1000 > LATE_MS:
+        said = f"{said}; it arrived {answer.delay_s:.1f} s after the press"
+    return name, mark, label(f"{took_ms:.1f}", slow), said
 
 
 def _silent_row(name: str, mark: str) -> tuple[Any, ...]:

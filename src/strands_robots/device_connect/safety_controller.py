@@ -10,6 +10,7 @@ from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots.device_connect._compat import emit, rpc
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.enrollment import enrolled_robots
 from strands_robots.device_connect.links import usual_link
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope, error, success
@@ -20,9 +21,10 @@ from strands_robots.utils import ValidationError, device_id, number, text
 def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
     """Return a :class:`SafetyController` on ``link``, else on the environment's.
 
-    Further arguments are those of :class:`SafetyController`.
+    Further arguments are those of :class:`SafetyController`. The robots enrolled at this machine have to sign.
     """
     link = link or usual_link()
+    options.setdefault("enrolled", lambda: enrolled_robots(link))
     return SafetyController(controller_id, lambda: stop_link(link), **options)
 
 
@@ -34,13 +36,18 @@ def envelope(report: StopReport) -> Envelope:
         "not_stopped": {name: each.why for name, each in report.not_stopped.items()},
         "refused": {name: each.why for name, each in report.refused.items()},
         "silent": list(report.silent),
+        "claimed": sorted(report.claimed),
+        "alarms": dict(report.alarms),
         "link": report.link,
         "elapsed_ms": round(report.elapsed_ms, 3),
+        "left_ms": round(report.left_ms, 3),
     }
     if report.ok:
         return success(f"Stopped {', '.join(sorted(report.stopped))}.", **fields)
     failures = [f"{name} did not stop" for name in report.not_stopped]
     failures += [f"{name} did not act on it" for name in report.refused]
+    failures += [f"ALARM: {name}: {report.alarms[name]}" for name in report.alarmed]
+    failures += [f"{name} is only claimed to have stopped: it did not sign" for name in report.claimed]
     failures += [f"{name} gave no answer" for name in report.silent]
     if not report.link:
         failures.append("the stop was not sent: the link is down")

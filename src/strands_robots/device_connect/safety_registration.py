@@ -12,13 +12,17 @@ from device_connect_edge.drivers import DeviceDriver
 
 from strands_robots.contract import Haltable
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.enrollment import local_name
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.identity import robot_identity
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
+from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.statements import Purpose, signed
 
 logger = logging.getLogger(__name__)
 
@@ -57,12 +61,13 @@ class SafetyRegistration:
     def __init__(self, device_id: str, robot: Any, link: LinkConfig, key: str | None) -> None:
         self.device_id = device_id
         # Two tenants may each have a device of this id in one process.
-        name = device_id if link.tenant == "default" else f"{link.tenant}.{device_id}"
+        name = local_name(link.tenant, device_id)
+        self.identity = robot_identity(name)
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
         self._held: Registered | None = self.entry
         try:
             self._listener: ListenerRegistration = estop_listener().register(
-                name, ("device-connect", link), lambda: stop_link(link)
+                name, ("device-connect", link), lambda: stop_link(link), self.identity
             )
         except BaseException:
             self.entry.close()
@@ -88,18 +93,28 @@ class SafetyRegistration:
         estop_listener().stop_here(StopOrder(epoch, self.device_id, reason))
 
     def resume(self, assertion: object) -> Envelope:
-        """Check a signed resume; its signature is its authorization."""
-        return self.entry.resume(assertion, "device-connect")
+        """Check a signed resume, which authorizes itself; sign the answer."""
+        answer = self.entry.resume(assertion, "device-connect")
+        nonce = assertion.get("nonce") if isinstance(assertion, Mapping) else None
+        fields = {"status": answer["status"], "nonce": nonce if is_epoch(nonce) else "", **self._lock_fields()}
+        return {**answer, "statement": signed(self.identity, Purpose.RESUME_ANSWER, self.device_id, fields)}
 
     def facts(self) -> dict[str, Any]:
         """Return the lockouts and the check-in of the robot, for ``getStatus``."""
         lockouts = self.entry.latch.state.all
+        check_in = plane().checkin.fields(time.monotonic())
+        fields = {**self._lock_fields(), "check_in": check_in}
         return {
             "locked": bool(lockouts),
             "lockout": [each.fields() for each in lockouts],
-            "check_in": plane().checkin.fields(time.monotonic()),
+            "check_in": check_in,
             "stop_lane": self.up,
+            "statement": signed(self.identity, Purpose.LOCKOUT_STATE, self.device_id, fields),
         }
+
+    def _lock_fields(self) -> dict[str, Any]:
+        epochs = self.entry.epochs
+        return {"device_id": self.device_id, "locked": bool(epochs), "epochs": list(epochs)}
 
     def leave(self) -> None:
         """Leave listener and plane; block while a link closes. Safe to call twice."""

@@ -62,3 +62,10 @@ class ObservedClocks:
             while len(self._smallest) > SOURCES_MAX:
                 self._smallest.pop(next(iter(self._smallest)), None)
         return None if known is None else known[0]
+
+
+def seconds_of(t: object) -> float | None:
+    """Return a time of a message: a finite number that a float holds, else None."""
+    if isinstance(t, bool) or not isinstance(t, int | float) or not abs(t) < 1e18:
+        return None
+    return float(t)

@@ -11,12 +11,15 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.safety import ed25519
+from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
 from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, RenewableLink, StopLink, notification
+from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import REASON_MAX, new_epoch, signed_bytes
 from strands_robots.safety.statements import Purpose
 from strands_robots.utils import ValidationError, device_id, number
@@ -34,21 +37,11 @@ SETTLE_S = 1.0
 """A stop goes on for at least so long before it has the connection made anew."""
 
 DEADLINE_S = 3.0
+INBOX_PER_ROBOT = 16
+"""Answers of one robot that wait to be graded; a robot answers again at each repetition."""
+
 PRESSES_MAX = 64
 """Presses remembered, so that a stop that goes on under its id keeps the time of its press."""
-
-REFUSED = "resumed before"
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """One robot's verdict; ``latency_ms`` is from the press to its receipt here."""
-
-    device_id: str
-    stopped: bool | None
-    latency_ms: float
-    why: str
-    facts: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +56,11 @@ class Press:
 class StopReport:
     """Outcome of one emergency stop, by robot.
 
-    ``stopped``, ``not_stopped`` and ``refused`` map a robot to its answer; ``silent`` are the expected ones that
-    gave none. ``link``: the stop left this machine at least once. ``elapsed_ms`` is the time from the press until the
-    last answer or the deadline, ``left_ms`` until the stop first left this machine.
+    ``stopped``, ``not_stopped``, ``refused`` and ``claimed`` map a robot to its answer: a robot is *claimed* to have
+    stopped when its signature was needed and is missing. ``silent`` are the expected ones that gave no answer, and
+    ``alarms`` those in whose name a wrong key answered, with the reason. ``link``: the stop left this machine at least
+    once. ``elapsed_ms`` is the time from the press until the last answer or the deadline, ``left_ms`` until the stop
+    first left this machine.
     """
 
     estop_id: str
@@ -76,11 +71,24 @@ class StopReport:
     link: bool
     elapsed_ms: float
     left_ms: float = 0.0
+    claimed: Mapping[str, Answer] = field(default_factory=dict)
+    alarms: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def alarmed(self) -> tuple[str, ...]:
+        """The robots with an alarm, and without an answer of their own."""
+        return tuple(sorted(self.alarms.keys() - self.stopped.keys() - self.not_stopped.keys() - self.refused.keys()))
+
+    @property
+    def unanswered(self) -> tuple[str, ...]:
+        """The robots for which a stop goes on: they have to answer, and have not."""
+        return (*self.silent, *self.alarmed, *(name for name, each in self.claimed.items() if each.enrolled))
 
     @property
     def ok(self) -> bool:
         """True when every robot is known to be still; no answer at all is not ok."""
-        return bool(self.stopped) and not (self.not_stopped or self.refused or self.silent)
+        missing = self.not_stopped or self.refused or self.silent or self.claimed or self.alarmed
+        return bool(self.stopped) and not missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +101,7 @@ class Progress:
     link_up: bool
     elapsed_ms: float
     left_ms: float = 0.0
+    alarms: Mapping[str, str] = field(default_factory=dict)
 
 
 OnProgress = Callable[[Progress], None]
@@ -106,6 +115,8 @@ class SafetyController:
         make_link: gives the connection of its own.
         signing_key: Ed25519 private key, for fleets that ask for signed stops.
         on_link: called at once when the link is lost or back.
+        enrolled: gives the public keys of robots, read when this is made and once each stop has left.
+        require_signed: count a robot that is not enrolled as *claimed* only.
     """
 
     def __init__(
@@ -115,9 +126,14 @@ class SafetyController:
         *,
         signing_key: Any = None,
         on_link: Callable[[bool], None] = lambda up: None,
+        enrolled: Callable[[], Mapping[str, bytes]] = dict,
+        require_signed: bool = False,
     ) -> None:
         self.controller_id = device_id("controller_id", controller_id)
         self._key = signing_key
+        self._enrolled, self._require_signed = enrolled, require_signed
+        self._keys: Mapping[str, bytes] = {}
+        self._load_keys()
         self._on_link = on_link
         self._changed = threading.Condition()
         self._stops: dict[str, _Running] = {}
@@ -171,6 +187,8 @@ class SafetyController:
         try:
             # The first one is sent before anything else is done.
             self._send(run)
+            self._load_keys()
+            run.graded = Answers(self._keys, required=self._require_signed, pressed_at=press.wall)
             self._repeat(run, deadline_s, on_progress)
         finally:
             with self._changed:
@@ -229,10 +247,13 @@ class SafetyController:
         pause, next_send, again = 0.0, run.started, 0
         renew_at = run.started + max(SETTLE_S, RENEW_S - self._unanswered_s)
         while True:
+            with self._changed:
+                inbox, run.inbox = run.inbox, {}
+            run.grade(inbox)
             now = time.monotonic()
             late = now - run.started >= UNCONFIRMED_S
             with self._changed:
-                state = hash((len(run.answers), len(run.expected), late, self._link.up))
+                state = hash((run.changes, len(run.expected), late, self._link.up))
                 finished = run.complete or now - run.started >= deadline_s
             if state != reported or finished:
                 reported = state
@@ -252,30 +273,44 @@ class SafetyController:
                 next_send = now + pause
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
             with self._changed:
-                seen = (len(run.answers), self._link.up, len(run.expected))
+                seen = (self._link.up, len(run.expected))
                 self._changed.wait_for(
-                    lambda seen=seen: seen != (len(run.answers), self._link.up, len(run.expected)),  # type: ignore[misc]
+                    lambda seen=seen: run.inbox or seen != (self._link.up, len(run.expected)),  # type: ignore[misc]
                     max(0.0, min(marks) - time.monotonic()),
                 )
-                if self._link.up and not seen[1]:
+                if self._link.up and not seen[0]:
                     # Back on the network: now, not at the next turn.
                     next_send = 0.0
 
+    def _load_keys(self) -> None:
+        try:
+            self._keys = self._enrolled()
+        except (KeyFileError, OSError) as exc:
+            # Nothing can be proven: every answer is a claim, and the stop goes out all the same.
+            self._require_signed, self._keys = True, {}
+            logger.critical("The enrolled keys cannot be used, so no answer counts as a robot's own: %s", exc)
+
     def _report(self, run: _Running) -> StopReport:
-        answers = dict(run.answers)
-        refused = {name: each for name, each in answers.items() if REFUSED in each.why}
+        answers, alarms = dict(run.graded.by_robot), dict(run.graded.alarms)
+        refused = {name: each for name, each in answers.items() if each.refused}
         report = StopReport(
             run.estop_id,
-            {name: each for name, each in answers.items() if each.stopped is True},
+            {name: each for name, each in answers.items() if each.stopped is True and not each.claimed},
             {name: each for name, each in answers.items() if each.stopped is not True and name not in refused},
             refused,
-            tuple(sorted(run.expected - answers.keys())),
+            tuple(sorted(run.expected - answers.keys() - alarms.keys())),
             run.left is not None,
             run.since_press_ms(time.monotonic()),
             run.left_ms,
+            {name: each for name, each in answers.items() if each.stopped is True and each.claimed},
+            alarms,
         )
         for name, each in {**report.not_stopped, **refused}.items():
             logger.critical("%s DID NOT STOP: %s", name, each.why or each.facts)
+        for name, why in alarms.items():
+            logger.critical("ALARM: %s: %s.", name, why)
+        if report.claimed:
+            logger.critical("CLAIMED, and not signed by the robot: %s", ", ".join(report.claimed))
         if report.silent:
             logger.critical("NO ANSWER to emergency stop %s from: %s", run.estop_id, ", ".join(report.silent))
         if not report.link:
@@ -283,26 +318,17 @@ class SafetyController:
         return report
 
     def _receive(self, event: str, source: str, payload: bytes) -> None:
-        at = time.monotonic()
+        at, wall = time.monotonic(), time.time()
         try:
             params = json.loads(payload)["params"]
-            estop_id, stopped = params["estop_id"], params.get("stopped")
+            estop_id = params["estop_id"]
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             logger.warning("An answer of %s is not to be read; it counts as none.", source)
             return
         with self._changed:
             run = self._stops.get(estop_id) if isinstance(estop_id, str) else None
             if run is not None:
-                known = run.answers.get(source)
-                if known is None or known.stopped is not True:
-                    answer = Answer(
-                        source,
-                        stopped if isinstance(stopped, bool) else None,
-                        run.since_press_ms(at),
-                        _why(params),
-                        params,
-                    )
-                    run.answers[source] = answer
+                run.receive(source, Received(params, run.since_press_ms(at), wall))
                 self._changed.notify_all()
 
     def _link_changed(self, up: bool) -> None:
@@ -330,17 +356,31 @@ class _Running:
     started: float
     press: Press
     reason: str
-    answers: dict[str, Answer] = field(default_factory=dict)
+    inbox: dict[str, deque[Received]] = field(default_factory=dict)
+    graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
+    changes: int = 0
+
+    def receive(self, source: str, received: Received) -> None:
+        """Take a verdict; a flood in a robot's name pushes out only that robot's own."""
+        if source in self.inbox or len(self.inbox) < ANSWERS_MAX:
+            self.inbox.setdefault(source, deque(maxlen=INBOX_PER_ROBOT)).append(received)
+
+    def grade(self, inbox: Mapping[str, Iterable[Received]]) -> None:
+        """Grade what was received, on the thread of the stop."""
+        for source, received in inbox.items():
+            known = source in self.graded.by_robot or source in self.expected
+            if known or len(self.graded.by_robot) < ANSWERS_MAX:
+                self.changes += sum(self.graded.take(source, each) for each in received)
 
     @property
     def complete(self) -> bool:
-        return bool(self.expected) and self.expected <= self.answers.keys()
+        return bool(self.expected) and not self.graded.unsettled(self.expected)
 
     @property
     def unanswered(self) -> bool:
         """An expected robot, or every robot, has not answered yet."""
-        return not self.answers or not self.expected <= self.answers.keys()
+        return not self.graded.settled() or bool(self.graded.unsettled(self.expected))
 
     @property
     def left_ms(self) -> float:
@@ -353,11 +393,7 @@ class _Running:
 
     def progress(self, link_up: bool, now: float) -> Progress:
         late = now - self.started >= UNCONFIRMED_S
-        open_ = tuple(sorted(self.expected - self.answers.keys())) if late or not link_up else ()
+        open_ = self.graded.unsettled(self.expected) if late or not link_up else ()
         elapsed_ms = self.since_press_ms(now)
-        return Progress(self.estop_id, dict(self.answers), open_, link_up, elapsed_ms, self.left_ms)
-
-
-def _why(params: Mapping[str, Any]) -> str:
-    reasons = [params.get("not_stopped"), params.get("unknown")]
-    return "; ".join(f"{name}: {why}" for each in reasons if isinstance(each, Mapping) for name, why in each.items())
+        answers, alarms = dict(self.graded.by_robot), dict(self.graded.alarms)
+        return Progress(self.estop_id, answers, open_, link_up, elapsed_ms, self.left_ms, alarms)

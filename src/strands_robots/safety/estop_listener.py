@@ -21,8 +21,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.audit import log_safety_event
 from strands_robots.safety.checkin import CheckInRules
+from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import RobotReport, StopOrder, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
+from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -254,8 +256,11 @@ class RefusalLog:
 class ListenerRegistration:
     """Registration of a device with the listener; the last one closes the link."""
 
-    def __init__(self, listener: EstopListener, robot_id: str, key: Hashable, link: StopLink) -> None:
+    def __init__(
+        self, listener: EstopListener, robot_id: str, key: Hashable, link: StopLink, identity: SigningIdentity | None
+    ) -> None:
         self.robot_id = robot_id
+        self.identity = identity
         self.key = key
         self.link = link
         self._listener = listener
@@ -285,6 +290,7 @@ class EstopListener:
         self._check_ins = CheckInRules(self._rules)
         self._answered: dict[tuple[str, str], float] = {}
         self._redundant: dict[tuple[str, str], None] = {}
+        self._repeated: dict[Hashable, bytes] = {}
         self._queue: FairQueue | None = None
         self._thread: threading.Thread | None = None
         self._switch_s = sys.getswitchinterval()
@@ -294,8 +300,18 @@ class EstopListener:
         """The devices that are registered now."""
         return self._registrations
 
-    def register(self, robot_id: str, key: Hashable, make: Callable[[], StopLink]) -> ListenerRegistration:
-        """Serve a robot over the link of ``key``; ``make`` the link if it is new."""
+    def register(
+        self,
+        robot_id: str,
+        key: Hashable,
+        make: Callable[[], StopLink],
+        identity: SigningIdentity | None = None,
+    ) -> ListenerRegistration:
+        """Serve a robot over the link of ``key``; ``make`` the link if it is new.
+
+        Args:
+            identity: signs the robot's verdicts; without one they are not signed.
+        """
         with self._registering:
             if self._queue is None:
                 self._start()
@@ -303,7 +319,7 @@ class EstopListener:
             if link is None:
                 link = make()
                 link.open((ESTOP, CHECK_IN), self.receive, lambda up: None)
-            registration = ListenerRegistration(self, robot_id, key, link)
+            registration = ListenerRegistration(self, robot_id, key, link, identity)
             self._registrations = (*self._registrations, registration)
             return registration
 
@@ -415,8 +431,24 @@ class EstopListener:
             if each.robot_id == report.robot_id:
                 entry = self._plane.robots.get(report.robot_id)
                 device_id = entry.wire_id if entry else report.robot_id
-                answer = {**report.fields(), "device_id": device_id}
-                each.link.publish(device_id, VERDICT, notification(VERDICT, answer))
+                each.link.publish(device_id, VERDICT, self._verdict(report, device_id, each.identity))
+
+    def _verdict(self, report: RobotReport, device_id: str, identity: SigningIdentity | None) -> bytes:
+        """Encode a verdict and sign it.
+
+        One that repeats, or that says no more than *resumed before*, is signed once: repetitions arrive on the
+        listener's thread, and may be a flood.
+        """
+        same = (report.robot_id, report.epoch, report.stopped, report.epochs, identity and identity.public)
+        halted_now = report.received_at is not None and not report.repeated
+        payload = None if halted_now else self._repeated.get(same)
+        if payload is None:
+            fields = {**report.fields(), "device_id": device_id}
+            payload = notification(VERDICT, signed(identity, Purpose.STOP_VERDICT, device_id, fields))
+            if not halted_now:
+                self._repeated[same] = payload
+                _bound(self._repeated)
+        return payload
 
 
 def _bound(remembered: dict[Any, Any]) -> None:

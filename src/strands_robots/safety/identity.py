@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import os
 import secrets
 import time
@@ -23,6 +24,8 @@ from strands_robots.safety import ed25519
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.state_files import OPEN, StateFileError, make_private, read_private, require_private
 from strands_robots.utils import identifier
+
+logger = logging.getLogger(__name__)
 
 ROBOTS = "robots"
 """Folder of the keys of robots; a console's keys have a folder of their own."""
@@ -122,6 +125,31 @@ class KeyFile:
         if known is None:
             raise KeyFileError(f"{self.path} was removed while it was made.")
         return known
+
+
+def robot_identity(name: str) -> SigningIdentity | None:
+    """Return the identity of a robot of this machine, made at its first start.
+
+    A robot whose key cannot be used is none the less stopped; it answers without a signature, and the log says why.
+    """
+    try:
+        return KeyFile(ROBOTS, name).load_or_make()
+    except (StrandsRobotsError, OSError) as exc:
+        logger.critical("%s answers without a signature: %s", name, exc)
+        return None
+
+
+def robots_here(directory: Path | None = None) -> dict[str, SigningIdentity | str]:
+    """Return the identities of this machine's robots by name, or why one is unusable."""
+    found: dict[str, SigningIdentity | str] = {}
+    for path in sorted(((directory or state_dir()) / "keys" / ROBOTS).glob("*.key")):
+        try:
+            identity = KeyFile(ROBOTS, path.stem, directory).load()
+        except (StrandsRobotsError, OSError) as exc:
+            found[path.stem] = str(exc)
+        else:
+            found |= {path.stem: identity} if identity is not None else {}
+    return found
 
 
 class EnrolledKeys:

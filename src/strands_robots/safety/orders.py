@@ -16,7 +16,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import estop_refusal
-from strands_robots.safety.clocks import ObservedClocks
+from strands_robots.safety.clocks import ObservedClocks, seconds_of
 from strands_robots.safety.lockout import OVERFLOW
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, covered
@@ -119,6 +119,8 @@ class RobotReport:
     persisted: bool | None = None
     repeated: bool = False
     late: bool = False
+    sent_at: float | None = None
+    received_at: float | None = None
 
     @property
     def stopped(self) -> bool | None:
@@ -179,7 +181,7 @@ def signed_bytes(purpose: Purpose, source: str, params: Mapping[str, Any]) -> by
         "estop_id": params.get("estop_id"),
         "nonce": params.get("nonce"),
         "t": params.get("t"),
-        "pressed_at": None if _seconds(pressed) is None else pressed,
+        "pressed_at": None if seconds_of(pressed) is None else pressed,
         "reason": reason if isinstance(reason, str) and len(reason) <= REASON_MAX else None,
     }
     return covered(purpose, source, stated)
@@ -262,7 +264,7 @@ class StopRules:
             return StopRefused(source, why)
         distinct = raw if raw is not None and not params else _text(params)
         reason, received = params.get("reason"), time.monotonic() if received is None else received
-        received_at, issued = self._clock() - (time.monotonic() - received), _seconds(params.get("t"))
+        received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
         ahead = self._clocks.note(source, received_at - issued, received) if issued is not None else None
         return StopOrder(
             epoch_of(source, params, distinct),
@@ -272,7 +274,7 @@ class StopRules:
             remote=True,
             issued=issued,
             received=received,
-            pressed=_seconds(params.get("pressed_at")),
+            pressed=seconds_of(params.get("pressed_at")),
             received_at=received_at,
             clock_ahead_s=ahead,
         )
@@ -283,7 +285,7 @@ class StopRules:
             return None
         signature = ed25519.decode(params.get("sig"), 64)
         shaped = is_epoch(params.get("estop_id")) and is_epoch(params.get("nonce"))
-        if signature is None or not shaped or _seconds(params.get("t")) is None:
+        if signature is None or not shaped or seconds_of(params.get("t")) is None:
             return "it is not signed, and DEVICE_CONNECT_ESTOP_PUBLIC_KEYS asks for a signature"
         if not ed25519.signed_by_one_of(self._keys, signature, signed_bytes(purpose, source, params)):
             return f"none of DEVICE_CONNECT_ESTOP_PUBLIC_KEYS signed it as {purpose.value}"
@@ -291,7 +293,7 @@ class StopRules:
 
     def compare_clock(self, source: str, params: Mapping[str, Any], received: float) -> None:
         """Take the time of a check-in that counts as a comparison of clocks."""
-        sent = _seconds(params.get("t"))
+        sent = seconds_of(params.get("t"))
         if sent is not None:
             self._clocks.note(source, self._clock() - (time.monotonic() - received) - sent, received)
 
@@ -306,13 +308,6 @@ def params_of(payload: bytes) -> dict[str, Any]:
         return {}
     params = message.get("params") if isinstance(message, dict) else None
     return params if isinstance(params, dict) else {}
-
-
-def _seconds(t: object) -> float | None:
-    """A finite number that a float holds, else None."""
-    if isinstance(t, bool) or not isinstance(t, int | float) or not abs(t) < 1e18:
-        return None
-    return float(t)
 
 
 def _text(params: Mapping[str, Any]) -> bytes:

@@ -193,6 +193,8 @@ class Reporter:
             (at - run.order.received) * 1000,
             persisted=persisted,
             late=late,
+            sent_at=run.order.issued,
+            received_at=run.order.received_at,
         )
         run.reports[robot_id] = report
         if report.stopped is not True:

@@ -103,6 +103,11 @@ def test_robot_that_requires_signed_stops_ignores_others_over_a_broker(site: Sit
             code, said = site.json(*stop)
             assert (code, said["silent"]) == (3, ["arm-5"])
             assert site.json("lockout", *network)[1]["live"]["arm-5"]["locked"] is False
+            code, said = site.json(*stop, *signed)
+            assert (code, said["claimed"]) == (3, ["arm-5"])
+            code, said = site.json("enroll", "arm-5", *network)
+            assert (code, said["devices"]["arm-5"]["outcome"]) == (0, "enrolled")
+            assert said["devices"]["arm-5"]["fingerprint"] in site.run("doctor").stdout
             assert site.json("estop", "arm-5", *PATIENT, *network, *signed)[0] == 0
             assert site.json("lockout", *network)[1]["live"]["arm-5"]["locked"] is True
             assert site.signed(*network)[0] == 0

@@ -1,0 +1,23 @@
+"""Enrolled robots of a tenant."""
+
+from __future__ import annotations
+
+from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.safety.identity import EnrolledKeys
+
+
+def local_name(tenant: str, device_id: str) -> str:
+    """Return the name of a device here; two tenants may each have this id."""
+    return device_id if tenant == "default" else f"{tenant}.{device_id}"
+
+
+def enrolled_robots(link: LinkConfig) -> dict[str, bytes]:
+    """Return the enrolled public keys of the link's tenant, by device id.
+
+    Raises:
+        KeyFileError, OSError: the enrolled keys cannot be used.
+    """
+    prefix = local_name(link.tenant, "")
+    robots = {name.removeprefix(prefix): key for name, key in EnrolledKeys().load().items() if name.startswith(prefix)}
+    # A device id has no dot: what has one belongs to another tenant.
+    return {name: key for name, key in robots.items() if "." not in name}

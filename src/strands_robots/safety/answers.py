@@ -1,0 +1,146 @@
+"""Answers to one emergency stop, graded by the robot's own signature.
+
+A robot whose key is enrolled answers for itself: what is not signed with that key is only claimed, and what is signed
+with another one is an alarm. *Not stopped* outranks *stopped*, whichever arrives first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from strands_robots.safety.clocks import RoundTrip, seconds_of
+from strands_robots.safety.statements import Proof, Purpose, proof_of
+
+ANSWERS_MAX = 4096
+"""Robots that answer one stop; further names that are not expected are not taken, so that they use no memory."""
+
+REFUSED = "resumed before"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One robot's verdict.
+
+    Attributes:
+        latency_ms: from the press to its receipt here.
+        why: empty when it stopped.
+        facts: the fields of the verdict.
+        proof: grade of its signature.
+        required: a signature of the robot was needed.
+        enrolled: the robot's key is known here.
+        delay_s: from the press to the stop's receipt by the robot, or None where clocks were not compared.
+    """
+
+    device_id: str
+    stopped: bool | None
+    latency_ms: float
+    why: str
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    proof: Proof = Proof.CLAIMED
+    required: bool = False
+    enrolled: bool = False
+    delay_s: float | None = None
+
+    @property
+    def claimed(self) -> bool:
+        """True where the robot's signature was needed and is missing."""
+        return self.required and self.proof is not Proof.SIGNED
+
+    @property
+    def refused(self) -> bool:
+        """True when the robot says that this stop was resumed before."""
+        return REFUSED in self.why
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A verdict as it arrived: its fields, and both clocks at its receipt."""
+
+    params: Mapping[str, Any]
+    latency_ms: float
+    wall: float
+
+
+class Answers:
+    """Answers to one stop, the one that counts for each robot.
+
+    Args:
+        keys: enrolled public keys by robot.
+        required: a robot that is not enrolled is only claimed to have answered, too.
+        pressed_at: wall-clock seconds of the press.
+    """
+
+    def __init__(self, keys: Mapping[str, bytes], *, required: bool, pressed_at: float) -> None:
+        self._keys = keys
+        self._required = required
+        self._pressed_at = pressed_at
+        self._ahead_s: dict[str, tuple[float, float]] = {}
+        self.by_robot: dict[str, Answer] = {}
+        self.alarms: dict[str, str] = {}
+
+    def take(self, source: str, received: Received) -> bool:
+        """Grade a verdict, and keep it if it outranks the robot's last; True if so."""
+        key = self._keys.get(source)
+        proof = proof_of(Purpose.STOP_VERDICT, source, received.params, key)
+        if proof is Proof.WRONG:
+            fresh = source not in self.alarms
+            self.alarms[source] = "an answer in its name has a signature that is not of its enrolled key"
+            return fresh
+        params, stopped = received.params, received.params.get("stopped")
+        answer = Answer(
+            source,
+            stopped if isinstance(stopped, bool) else None,
+            received.latency_ms,
+            _why(params),
+            params,
+            proof,
+            required=self._required or key is not None,
+            enrolled=key is not None,
+        )
+        known = self.by_robot.get(source)
+        if known is not None and not _outranks(answer, known):
+            return False
+        self.by_robot[source] = replace(answer, delay_s=self._delay_s(source, received))
+        return True
+
+    def settled(self) -> frozenset[str]:
+        """Return the robots that have answered and were not only claimed to."""
+        return frozenset(name for name, each in self.by_robot.items() if not each.claimed)
+
+    def unsettled(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return those of ``names`` whose own answer is missing, sorted."""
+        return tuple(sorted(frozenset(names) - self.settled()))
+
+    def _delay_s(self, source: str, received: Received) -> float | None:
+        """Return the time from the press to the robot's receipt, by this clock."""
+        params = received.params
+        times = [seconds_of(params.get(name)) for name in ("sent_at", "received_at", "t")]
+        sent, there, answered = times
+        if there is None:
+            return None
+        if sent is not None and answered is not None and params.get("repeated") is not True:
+            trip = RoundTrip(sent, there, answered, received.wall)
+            known = self._ahead_s.get(source)
+            if known is None or trip.on_network_s < known[1]:
+                self._ahead_s[source] = (trip.ahead_s, trip.on_network_s)
+        measured = self._ahead_s.get(source)
+        return None if measured is None else there - measured[0] - self._pressed_at
+
+
+def _outranks(new: Answer, known: Answer) -> bool:
+    if new.claimed is not known.claimed:
+        return known.claimed
+    if {new.stopped, known.stopped} == {True, None}:
+        # A resume since does not undo a stop, and a robot of unknown state may stop yet.
+        return new.stopped is True
+    if new.proof is Proof.SIGNED and known.proof is Proof.SIGNED:
+        # The robot's latest statement counts, in whatever order they arrive.
+        return (seconds_of(new.facts.get("t")) or 0.0) > (seconds_of(known.facts.get("t")) or 0.0)
+    return new.stopped is False and known.stopped is not False
+
+
+def _why(params: Mapping[str, Any]) -> str:
+    reasons = [params.get("not_stopped"), params.get("unknown")]
+    return "; ".join(f"{name}: {why}" for each in reasons if isinstance(each, Mapping) for name, why in each.items())

@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from tests.cli.conftest import Run, connect
+from tests.cli.test_cli_safety_controller import FakeController, drawn
+
+from strands_robots.cli.output import Exit
+from strands_robots.cli.resume import LockoutReport
+from strands_robots.cli.safety_controller import FleetScreen, StopButton
+from strands_robots.cli.stop import exit_code, report_rows, style_of, summary
+from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.client import Peer
+from strands_robots.envelope import Envelope, success
+from strands_robots.safety import statements
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import StopReport
+from strands_robots.safety.ed25519 import keygen
+from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, SigningIdentity, fingerprint
+from strands_robots.safety.statements import Proof, Purpose, signed
+
+STRONG = "Plenty of 4 different words"
+EPOCH = "a" * 32
+
+
+class SigningFleet:
+    """One locked robot whose answers are signed by the key that the test gives it."""
+
+    def __init__(self, identity: SigningIdentity | None) -> None:
+        self.link = loopback_config()
+        self.identity = identity
+        self.locked = True
+        self.stale = ""
+        self.signs: dict[str, Any] = {}
+
+    def peers(self, timeout: float = 2.0) -> list[Peer]:
+        return [Peer("arm-1", functions=({"name": "resume"},))]
+
+    def call(self, device: str, function: str, params: dict[str, Any], timeout: float) -> Envelope:
+        if function == "resume":
+            self.locked = False
+        rows = [{"epoch": EPOCH, "source": "desk", "reason": "", "since": 0.0}] if self.locked else []
+        fields = {"locked": self.locked, "epochs": [each["epoch"] for each in rows]}
+        purpose = Purpose.LOCKOUT_STATE
+        if function == "resume":
+            purpose = Purpose.RESUME_ANSWER
+            fields |= {"status": "success", "nonce": params["assertion"]["nonce"]}
+        statement = signed(self.identity, purpose, device, {**fields, **self.signs})
+        return success("done", locked=self.locked, lockout=rows, statement=statement)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> SigningIdentity:
+    return KeyFile(ROBOTS, "arm-1", tmp_path / "robot").load_or_make()
+
+
+@pytest.fixture
+def stranger(tmp_path: Path) -> SigningIdentity:
+    return KeyFile(ROBOTS, "arm-1", tmp_path / "stranger").load_or_make()
+
+
+@pytest.fixture
+def fleet(monkeypatch: pytest.MonkeyPatch, robot: SigningIdentity) -> SigningFleet:
+    fake = SigningFleet(robot)
+    connect(monkeypatch, fake)
+    return fake
+
+
+@pytest.fixture
+def resume(tmp_path: Path) -> tuple[str, ...]:
+    (tmp_path / "passphrase").write_text(STRONG, encoding="utf-8")
+    keygen(tmp_path / "key.pem", STRONG)
+    return "resume", "--key", str(tmp_path / "key.pem"), "--passphrase-file", str(tmp_path / "passphrase"), "--json"
+
+
+def test_a_robot_is_enrolled_with_its_fingerprint(run: Run, fleet: SigningFleet, robot: SigningIdentity) -> None:
+    result = run("enroll")
+    assert result.exit_code == 0, result.output
+    assert robot.fingerprint in result.stdout
+    assert "strands-robots doctor" in result.stdout
+    assert EnrolledKeys().load() == {"arm-1": robot.public}
+    assert json.loads(run("enroll", "arm-1", "--json").stdout)["devices"]["arm-1"]["outcome"] == "known"
+
+
+def test_a_changed_key_is_an_alarm_and_changes_nothing(
+    run: Run, fleet: SigningFleet, robot: SigningIdentity, stranger: SigningIdentity
+) -> None:
+    run("enroll")
+    fleet.identity = stranger
+    result = run("enroll")
+    assert result.exit_code == 1
+    assert "CHANGED KEY" in result.stdout and fingerprint(stranger.public) in result.stdout
+    assert "ALARM: arm-1" in result.stderr
+    assert EnrolledKeys().load() == {"arm-1": robot.public}
+    assert run("enroll", "--replace").exit_code == 0
+    assert EnrolledKeys().load() == {"arm-1": stranger.public}
+
+
+def test_a_robot_without_a_key_is_named_and_not_enrolled(run: Run, fleet: SigningFleet) -> None:
+    fleet.identity = None
+    result = run("enroll")
+    assert result.exit_code == 3
+    assert "no key" in result.stdout
+    assert EnrolledKeys().load() == {}
+
+
+@pytest.mark.parametrize(
+    ("signer", "signs", "said"),
+    [
+        ("robot", {"locked": False}, "ALARM: its answer says something else than its signed part"),
+        ("robot", {"epochs": []}, "ALARM: its answer says something else than its signed part"),
+        ("stranger", {}, "ALARM: its answer has a signature"),
+        ("", {}, "only claimed"),
+    ],
+)
+def test_a_lockout_state_that_is_not_the_robots_own_is_not_shown(
+    run: Run,
+    fleet: SigningFleet,
+    robot: SigningIdentity,
+    stranger: SigningIdentity,
+    signer: str,
+    signs: dict[str, Any],
+    said: str,
+) -> None:
+    assert EPOCH in run("lockout").stdout
+    run("enroll")
+    assert EPOCH in run("lockout").stdout
+    fleet.identity, fleet.signs = {"robot": robot, "stranger": stranger}.get(signer), signs
+    result = run("lockout")
+    assert said in result.stdout
+    assert EPOCH not in result.stdout
+
+
+def test_a_recorded_lockout_state_is_not_shown(run: Run, fleet: SigningFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    run("enroll")
+    recorded = fleet.call("arm-1", "getStatus", {}, 1.0)
+    monkeypatch.setattr(fleet, "call", lambda *called: recorded)
+    assert EPOCH in run("lockout").stdout
+    now = time.time() + 120
+    monkeypatch.setattr(statements, "time", SimpleNamespace(time=lambda: now))
+    result = run("lockout")
+    assert "not of this minute" in result.stdout
+    assert EPOCH not in result.stdout
+
+
+def test_only_the_robot_itself_says_that_it_was_resumed(
+    run: Run, fleet: SigningFleet, robot: SigningIdentity, stranger: SigningIdentity, resume: tuple[str, ...]
+) -> None:
+    run("enroll")
+    assert json.loads(run(*resume).stdout)["devices"]["arm-1"] == {"free": True, "said": "done"}
+    fleet.locked, fleet.signs = True, {"nonce": "0" * 32}
+    answer = json.loads(run(*resume).stdout)["devices"]["arm-1"]
+    assert answer["free"] is False
+    assert "something else than its signed part" in answer["said"]
+
+
+def test_enrolled_keys_that_cannot_be_used_are_named(run: Run, fleet: SigningFleet) -> None:
+    run("enroll")
+    EnrolledKeys().path.chmod(0o666)
+    for line in (("enroll",), ("lockout",)):
+        result = run(*line)
+        assert "mode 0666" in result.stdout + result.stderr
+
+
+def test_doctor_shows_the_fingerprints_of_the_robots_of_this_machine(run: Run) -> None:
+    identity = KeyFile(ROBOTS, "arm-7").load_or_make()
+    KeyFile(ROBOTS, "arm-8").load_or_make()
+    KeyFile(ROBOTS, "arm-8").path.chmod(0o644)
+    output = " ".join(run("doctor").stdout.split())
+    assert identity.fingerprint in output
+    assert "0644" in output
+
+
+def claim(name: str, *, enrolled: bool = False) -> Answer:
+    return Answer(name, True, 3.0, "", {"halted": ["task"]}, Proof.CLAIMED, required=True, enrolled=enrolled)
+
+
+def test_a_claimed_stop_is_yellow_and_exits_with_3() -> None:
+    report = StopReport("e" * 32, {}, {}, {}, (), True, 12.0, claimed={"arm-1": claim("arm-1")})
+    assert not report.ok
+    assert exit_code(report) is Exit.SILENT
+    assert style_of(report) == "yellow"
+    assert "1 claimed" in summary(report)
+    row = report_rows(report)[0]
+    assert (str(row[1]), str(row[1].style)) == ("claimed", "yellow")
+    assert row[3] == "not signed by arm-1; halted task"
+
+
+def test_a_wrong_key_is_red_and_exits_with_1_unless_the_robot_answers_itself() -> None:
+    alarms = {"arm-1": "a signature that is not of its enrolled key"}
+    report = StopReport("e" * 32, {}, {}, {}, (), True, 12.0, alarms=alarms)
+    assert exit_code(report) is Exit.REFUSED
+    assert style_of(report) == "bold red"
+    row = report_rows(report)[0]
+    assert (row[0], str(row[1]), str(row[1].style), row[3]) == ("arm-1", "WRONG KEY", "bold red", alarms["arm-1"])
+    own = Answer("arm-1", True, 3.0, "", {}, Proof.SIGNED, required=True, enrolled=True)
+    answered = StopReport("e" * 32, {"arm-1": own}, {}, {}, (), True, 12.0, alarms=alarms)
+    assert answered.ok
+    assert exit_code(answered) is Exit.OK
+
+
+def test_the_space_bar_goes_on_for_an_enrolled_robot_that_is_only_claimed() -> None:
+    claimed = {"arm-1": claim("arm-1", enrolled=True), "arm-2": claim("arm-2")}
+    report = StopReport("e" * 32, {}, {}, {}, ("arm-3",), True, 12.0, claimed=claimed, alarms={"arm-4": "why"})
+    assert set(report.unanswered) == {"arm-1", "arm-3", "arm-4"}
+
+
+def test_the_fleet_screen_names_a_robot_with_a_wrong_key() -> None:
+    fleet = FleetScreen(FakeController(), loopback_config(), None)  # type: ignore[arg-type]
+    button = StopButton(FakeController(), lambda: (), "")  # type: ignore[arg-type]
+    fleet.update([LockoutReport("arm-1"), LockoutReport("arm-2", problem="ALARM: a wrong key")])
+    assert "arm-2: ALARM: a wrong key." in drawn(fleet, button)
