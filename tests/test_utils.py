@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots import utils
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, redacted
 
 ANYTHING = st.one_of(
     st.none(),
@@ -208,3 +208,15 @@ def test_yaw_is_the_heading_of_the_x_axis_when_the_body_pitches_as_well() -> Non
 def test_w_positive_picks_the_quaternion_with_a_positive_w() -> None:
     assert utils.w_positive((-0.5, 0.5, -0.5, 0.5)) == [0.5, -0.5, 0.5, -0.5]
     assert utils.w_positive((0.0, 1.0, 0.0, 0.0)) == [0.0, 1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["nats://ada:secret@host:4222", "no answer from tls://secret@host, nats://ada:secret@other:1", "'//x:secret@h'"],
+)
+def test_credentials_of_urls_are_left_out(text: str) -> None:
+    assert "secret" not in redacted(text) and "***@" in redacted(text)
+
+
+def test_text_without_credentials_stays() -> None:
+    assert redacted("nats://host:4222, mail ada@host") == "nats://host:4222, mail ada@host"

@@ -28,6 +28,7 @@ IDENTIFIER_MAX = 128
 _IDENTIFIER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")
 _DEVICE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*\Z")
 _HOSTNAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?\Z")
+_CREDENTIALS = re.compile(r"//[^\s\"']*@")
 _SHOWN_MAX = 80
 
 
@@ -68,6 +69,11 @@ def shown(value: object) -> str:
     except Exception as exc:  # noqa: BLE001 - a foreign __repr__ may raise anything
         return f"a {type(value).__name__} whose repr raises {type(exc).__name__}"
     return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
+
+
+def redacted(text: str) -> str:
+    """Return ``text`` without the credentials of URLs in it."""
+    return _CREDENTIALS.sub("//***@", text)
 
 
 def number(

@@ -3,6 +3,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from fixtures.waiting import free_port
+from tests.cli.conftest import Run
 
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Exit
@@ -71,3 +73,25 @@ def test_contradicting_flags_and_missing_files_are_wrong_usage(tmp_path: Path) -
 def test_nats_takes_several_servers() -> None:
     link = Network(nats=["nats://127.0.0.1:4222,nats://127.0.0.1:4223", "nats://127.0.0.1:4224"]).link()
     assert [url.rpartition(":")[2] for url in link.connect] == ["4222", "4223", "4224"]
+
+
+def url_with_a_password(port: int) -> str:
+    return f"nats://ada:secret@127.0.0.1:{port}"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["peers"], ["estop"], ["doctor"]],
+    ids=lambda each: each[0],
+)
+def test_password_in_a_url_is_never_printed(
+    run: Run,
+    arguments: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    url = url_with_a_password(free_port())
+    monkeypatch.setenv("NATS_URL", url)
+    monkeypatch.setenv("MESSAGING_BACKEND", "nats")
+    output = run(*arguments, "--nats", url, "--insecure").output
+    assert "secret" not in output + caplog.text

@@ -8,7 +8,10 @@ from typing import Any
 
 import pytest
 from fixtures.certificates import Authority
+from fixtures.toy_robots import ToyRobot
+from fixtures.waiting import free_port
 
+from strands_robots.device_connect import init_device_connect_sync
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.utils import ValidationError
@@ -136,3 +139,12 @@ def test_nats_url_is_no_zenoh_endpoint() -> None:
     with pytest.raises(ValidationError) as refused:
         LinkConfig(connect=("nats://user:secret@127.0.0.1:4222",))
     assert "secret" not in str(refused.value)
+
+
+def test_password_of_a_broker_that_does_not_answer_is_not_in_the_error(caplog: pytest.LogCaptureFixture) -> None:
+    url = f"nats://ada:secret@127.0.0.1:{free_port()}"
+    with pytest.raises(TimeoutError, match="was not up on") as failed:
+        init_device_connect_sync(
+            ToyRobot(), peer_id="arm-1", messaging_url=url, allow_insecure=True, bringup_timeout=1.0
+        )
+    assert "secret" not in f"{failed.value} {caplog.text}"

@@ -246,11 +246,10 @@ class Journal:
         return head, mismatches
 
     def _untouched(self, size: int) -> bool:
-        anchor_missing = not self._anchor_path.exists()
+        if size or self._head_path.exists() or any(path != self.path for path in self.files()):
+            return False
         begun = read_anchor(self._anchor_path, self._seal, log_id(self.path))
-        return (
-            size == 0 and not self._head_path.exists() and (anchor_missing or (begun is not None and begun.count == 0))
-        )
+        return begun.count == 0 if begun is not None else not self._anchor_path.exists()
 
     def _believed(self, found: Head | None, anchor: Anchor | None, log: str) -> tuple[Head, list[str]]:
         own = deepcopy(self._head)

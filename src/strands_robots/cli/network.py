@@ -15,7 +15,7 @@ from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
 from strands_robots.tools.networks import MeshUnavailableError, joined_mesh
-from strands_robots.utils import missing_extra, port
+from strands_robots.utils import missing_extra, port, redacted
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
@@ -141,7 +141,7 @@ def describe(link: LinkConfig) -> str:
     """Describe in one sentence who can reach a robot over ``link``."""
     proof = "both sides are authenticated" if link.authenticated else "neither side is authenticated"
     if link.transport == "nats":
-        return f"NATS at {', '.join(link.connect) or 'its default address'}; {proof}."
+        return f"NATS at {redacted(', '.join(link.connect)) or 'its default address'}; {proof}."
     if link.meeting_point:
         return f"This machine alone: {link.meeting_point}; nothing leaves 127.0.0.1."
     ways = [f"connects to {', '.join(link.connect)}"] if link.connect else []

@@ -24,7 +24,7 @@ from strands_robots.cli.output import CliError, Screen, first_line, label, plain
 from strands_robots.cli.record import record_robot
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import text_of
-from strands_robots.utils import ValidationError, device_id, number
+from strands_robots.utils import ValidationError, device_id, number, redacted
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -217,7 +217,7 @@ def _network_flags(link: LinkConfig, network: Network) -> str:
     """Return the flags for another terminal of the same network, without secrets."""
     flags = []
     for url in network.nats or []:
-        flags += ["--nats", url]
+        flags += ["--nats", redacted(url)]
     for endpoint in network.connect or network.listen or []:
         flags += ["--connect", endpoint.replace("0.0.0.0", "HOST").replace("[::]", "HOST")]
     flags += ["--multicast"] if network.multicast else []

@@ -33,7 +33,7 @@ from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.serving.workers import Share, called
-from strands_robots.utils import ValidationError, choice, device_id
+from strands_robots.utils import ValidationError, choice, device_id, redacted
 
 logger = logging.getLogger(__name__)
 
@@ -153,7 +153,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     except BaseException as exc:
         await asyncio.shield(_put_down(runtime, task))
         if isinstance(exc, TimeoutError):
-            where = ", ".join(reach.connect) or "the network"
+            where = redacted(", ".join(reach.connect)) or "the network"
             why = (runtime.problem or warnings.last).rstrip(".") + "."
             raise TimeoutError(f"{name} was not up on {where} within {bringup_timeout:g} s: {why}") from exc
         raise

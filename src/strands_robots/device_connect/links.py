@@ -8,7 +8,7 @@ from dataclasses import replace
 from strands_robots import settings
 from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
 from strands_robots.device_connect.backends.config import endpoints, split_urls
-from strands_robots.utils import ValidationError, choice, device_id, shown, text
+from strands_robots.utils import ValidationError, choice, device_id, redacted, shown, text
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ def transport_of(url: str) -> str:
     if lower.startswith(("zenoh://", "zenoh+tls://", "tcp/", "tls/", "udp/", "quic/")):
         return "zenoh"
     raise ValidationError(
-        f"messaging_url must be nats://host:port, tls://host:port or tcp/host:port, not {shown(url)}."
+        f"messaging_url must be nats://host:port, tls://host:port or tcp/host:port, not {shown(redacted(url))}."
     )
 
 
@@ -102,7 +102,7 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
             "INSECURE TRANSPORT: no peer is authenticated and %s. Anyone who reaches %s can drive "
             "and read this robot. Not for production.",
             "only the server proves who it is" if link.encrypted else "nothing is encrypted",
-            ", ".join(link.connect) or ("the local network" if link.uses_multicast else "this machine"),
+            redacted(", ".join(link.connect)) or ("the local network" if link.uses_multicast else "this machine"),
         )
         return True
     if allow_insecure is None and stated and link.loopback_only:

@@ -17,6 +17,7 @@ from strands_robots.policies.base import Action, numbers
 from strands_robots.recording import schemas
 from strands_robots.recording._compat import close_chunk
 from strands_robots.recording.schemas import Schema
+from strands_robots.recording.unpacking import read_messages
 from strands_robots.teleoperators.recorded import Frame
 from strands_robots.utils import ValidationError, missing_extra, shown
 
@@ -239,15 +240,14 @@ def read_items(path: Path) -> Iterator[RecordedItem]:
 
     Raises:
         MissingExtraError: the [record] extra is not installed.
-        ValidationError: the file cannot be read or is no recording.
+        ValidationError: the file cannot be read, is no recording, or unpacks to more than one does.
     """
     _mcap()
     from mcap.exceptions import EndOfFile, McapError  # noqa: PLC0415 - an extra
-    from mcap.reader import NonSeekingReader  # noqa: PLC0415
 
     try:
         with path.open("rb") as file:
-            for schema, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+            for schema, channel, message in read_messages(file):
                 item = _item(schema.name if schema else "", channel, message)
                 if item is not None:
                     yield item

@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlparse, urlsplit
 
 from ... import settings
-from ...utils import ValidationError, choice, device_id, port, shown
+from ...utils import ValidationError, choice, device_id, port, redacted, shown
 
 LOOPBACK = "127.0.0.1"
 INTERNET = ("tcp", "udp", "tls", "quic", "ws")
@@ -343,7 +343,7 @@ def _check_zenoh(name: str, endpoint: str) -> None:
     address = re.split(r"[?#]", rest, maxsplit=1)[0]
     host, colon, number = address.rpartition(":")
     if not (slash and colon and _is_host(host) and number.isascii() and number.isdigit() and int(number) <= 65535):
-        raise ValidationError(f"{name} must be like tcp/host:port or tls/host:port, not {shown(_safe(endpoint))}.")
+        raise ValidationError(f"{name} must be like tcp/host:port or tls/host:port, not {shown(redacted(endpoint))}.")
 
 
 def _check_nats(name: str, url: str) -> None:
@@ -359,7 +359,7 @@ def _check_nats(name: str, url: str) -> None:
         good = False
     if not good:
         # A URL may carry a password, which must not reach a log.
-        raise ValidationError(f"{name} must be like nats://host:port or tls://host:port, not {shown(_safe(url))}.")
+        raise ValidationError(f"{name} must be like nats://host:port or tls://host:port, not {shown(redacted(url))}.")
 
 
 def _is_host(host: str) -> bool:
@@ -367,10 +367,6 @@ def _is_host(host: str) -> bool:
         octets = host.split(".")
         return len(octets) == 4 and all(octet and int(octet) <= 255 for octet in octets)
     return bool(host) and not re.search(r"[\s/]", host)
-
-
-def _safe(url: str) -> str:
-    return re.sub(r"//[^@/]*@", "//***@", url)
 
 
 def _first_set(*names: str) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from device_connect_edge.messaging.exceptions import AuthenticationError, Messag
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 
+from ...utils import redacted
 from ._compat import EncryptedClient
 from .config import LinkConfig
 from .dispatch import Throttled
@@ -145,7 +146,7 @@ class NatsConnection:
             reasons = refused or problems
             reason = reasons[-1] if reasons else str(error) or f"no answer within {link.connect_timeout_s:g} s"
             kind = AuthenticationError if "authorization" in reason.lower() else MessagingConnectionError
-            raise kind(f"no NATS connection to {where}: {reason}") from error
+            raise kind(redacted(f"no NATS connection to {where}: {reason}")) from error
         except asyncio.CancelledError:
             await self._abandon()
             raise

@@ -23,6 +23,7 @@ from device_connect_edge.messaging.exceptions import (
     SubscribeError,
 )
 
+from ...utils import redacted
 from . import jsonrpc, zenoh_session
 from .base import Backend, NoResponderError, Undo
 from .config import LinkConfig
@@ -96,7 +97,7 @@ class ZenohBackend(Backend):
             where = ", ".join(link.connect or link.listeners)
             # Zenoh adds the place in its own sources to the reason.
             reason = str(error).partition(" at /")[0].strip()
-            raise MessagingConnectionError(f"no Zenoh link at {where}: {reason}") from error
+            raise MessagingConnectionError(redacted(f"no Zenoh link at {where}: {reason}")) from error
         self._closed = False
         self._shared.watch(self._on_link)
 
