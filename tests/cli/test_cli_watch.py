@@ -7,17 +7,19 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from strands_robots.cli import watch
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.cli.watch import (
     BAR_WIDTH,
     DeviceView,
+    SignsOfLife,
     describe_task,
+    follow,
     joint_bar,
     joint_limits,
     joints_table,
     motion_progress,
     print_changes,
-    until,
 )
 from strands_robots.device_connect.client import DeviceEvent
 
@@ -65,15 +67,57 @@ def test_each_change_is_one_line_without_a_terminal(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out.splitlines() == ["arm-1: idle", "arm-1: started 'a' with mock", "arm-1: idle"]
 
 
-def test_silent_device_is_exit_3() -> None:
-    with pytest.raises(CliError) as failure:
-        list(until(iter([event("stateUpdate")]), None, "arm-1"))
+class Clock:
+    """Time that passes while the watcher sleeps."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(watch.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(watch.time, "sleep", self.passes)
+
+    def passes(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("name", "beats", "after"), [("stateUpdate", False, 3.0), ("tick", False, 15.0), ("", True, 15.0), ("", False, 6.0)]
+)
+def test_device_that_misses_three_beats_is_silent_and_exit_3(
+    clock: Clock, name: str, beats: bool, after: float
+) -> None:
+    signs = SignsOfLife(lambda: 100.0 if beats else None)
+    if name:
+        signs.take(event(name))
+    ages = []
+    with pytest.raises(CliError, match="arm-1 is silent") as failure:
+        for _, age in follow(signs, None, "arm-1"):
+            ages.append(age)
     assert failure.value.code is Exit.SILENT
+    assert ages[-1] == pytest.approx(after, abs=0.2)
+    assert clock.now == pytest.approx(100 + after, abs=0.2)
 
 
-def test_watching_ends_after_its_time() -> None:
-    endless = iter(lambda: event("stateUpdate"), None)
-    assert list(until(endless, 0.001, "arm-1"))
+def test_everything_that_has_arrived_is_in_the_next_redraw(clock: Clock) -> None:
+    signs = SignsOfLife()
+    for _ in range(5000):
+        signs.take(event("streamStep"))
+    frames = follow(signs, 10.0, "arm-1")
+    assert len(next(frames)[0]) == 5000
+    assert next(frames)[0] == []
+
+
+def test_watching_ends_after_its_time(clock: Clock) -> None:
+    assert list(follow(SignsOfLife(), 0.5, "arm-1"))
+    assert clock.now == pytest.approx(100.5, abs=0.1)
+
+
+def test_screen_says_when_the_device_was_last_heard() -> None:
+    assert "last heard 2.5 s ago" in drawn(DeviceView("arm-1", {}).draw(2.5))
 
 
 def test_bar_mark_stays_between_the_limits() -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
 
 import typer
@@ -23,8 +24,18 @@ if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.client import DeviceEvent
 
-SILENCE_S = 5.0
-"""Seconds without an event after which a device counts as silent; it reports its state every second."""
+REDRAW_S = 0.07
+"""Seconds between two redraws."""
+
+STATE_EVERY_S, HEARTBEAT_EVERY_S = 1.0, 5.0
+"""Seconds between two states of our robots, and between two heartbeats of any device."""
+
+MISSED_BEATS = 3
+FIRST_SIGN_S = 6.0
+"""Seconds in which any live device has sent a first heartbeat."""
+
+EVENTS_MAX = 10_000
+"""Events that wait for the screen; a further one displaces the oldest."""
 
 BAR_WIDTH = 32
 NAME_WIDTH = 18
@@ -33,6 +44,7 @@ NAME_WIDTH = 18
 JOINTS_MAX = 24
 """Joints that are drawn; the rest is counted."""
 
+Frame = tuple[list["DeviceEvent"], float]
 Range = tuple[float, float]
 FULL_TURN: Range = (-math.pi, math.pi)
 """Range of the bar of a joint without limits, in radians."""
@@ -55,15 +67,55 @@ def watch(
         limits: dict[str, Range] = {}
         with contextlib.suppress(CliError):  # a device without getFeatures is drawn without its limits
             limits = joint_limits(call_device(fleet, device, "getFeatures", {}, 3.0))
-        with contextlib.closing(fleet.events(device, timeout=SILENCE_S)) as arriving:
-            events = until(arriving, longest, device)
+        signs = SignsOfLife(lambda: fleet.last_heartbeat(device))
+        with fleet.subscription(device, signs.take):
+            frames = follow(signs, longest, device)
             if screen.machine:
-                for event in events:
-                    screen.data({"device": event.device, "event": event.name, "payload": dict(event.payload)})
+                for events, _ in frames:
+                    for event in events:
+                        screen.data({"device": event.device, "event": event.name, "payload": dict(event.payload)})
             elif screen.live:
-                _draw_live(screen, _present_state(fleet, device, limits), events)
+                _draw_live(screen, _present_state(fleet, device, limits), frames)
             else:
-                print_changes(screen, events)
+                print_changes(screen, (event for events, _ in frames for event in events))
+
+
+class SignsOfLife:
+    """Events of one device as they arrive, and the age of its last sign of life.
+
+    Args:
+        last_heartbeat: time of the device's last heartbeat in monotonic seconds, or None.
+    """
+
+    def __init__(self, last_heartbeat: Callable[[], float | None] = lambda: None) -> None:
+        self._last_heartbeat = last_heartbeat
+        self._events: deque[DeviceEvent] = deque(maxlen=EVENTS_MAX)
+        self._began = time.monotonic()
+        self._event_at: float | None = None
+        self._reports_state = False
+
+    def take(self, event: DeviceEvent) -> None:
+        """Keep an event; on the client's thread."""
+        self._reports_state |= event.name == "stateUpdate"
+        self._event_at = time.monotonic()
+        self._events.append(event)
+
+    def drain(self) -> list[DeviceEvent]:
+        """Return the events that have arrived since the last time."""
+        return [self._events.popleft() for _ in range(len(self._events))]
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the last event or heartbeat, or since the start."""
+        signs = (self._began, self._event_at, self._last_heartbeat())
+        return time.monotonic() - max(each for each in signs if each is not None)
+
+    @property
+    def silent(self) -> bool:
+        """True when three beats in a row are missing."""
+        if self._event_at is None and self._last_heartbeat() is None:
+            return self.age_s > FIRST_SIGN_S
+        return self.age_s > MISSED_BEATS * (STATE_EVERY_S if self._reports_state else HEARTBEAT_EVERY_S)
 
 
 class DeviceView:
@@ -92,9 +144,13 @@ class DeviceView:
             self._joints[robot] = joints
         self.task = describe_task(event) or self.task
 
-    def draw(self) -> RenderableType:
-        """Return the device, its task and its joints."""
-        parts: list[Any] = [label(f"{self.device}: {self.task}", "bold")]
+    def draw(self, age_s: float = 0.0) -> RenderableType:
+        """Return the device, its task, the age of its last sign of life, and its joints."""
+        late = "bold red" if age_s > 2 * STATE_EVERY_S else "bright_black"
+        parts: list[Any] = [
+            label(f"{self.device}: {self.task}", "bold"),
+            label(f"last heard {age_s:.1f} s ago", late),
+        ]
         for robot, joints in self._joints.items():
             if len(self._joints) > 1:
                 parts.append(label(robot))
@@ -126,15 +182,20 @@ def describe_task(event: DeviceEvent) -> str:
     return f"{status}: {facts.get('instruction', '')!r}, step {facts.get('step_count', 0)}" if status else ""
 
 
-def until(events: Iterator[DeviceEvent], longest: float | None, device: str) -> Iterator[DeviceEvent]:
-    """Yield events for ``longest`` s; raise :class:`CliError` at silence."""
-    ends = None if longest is None else time.monotonic() + longest
-    for event in events:
-        yield event
-        if ends is not None and time.monotonic() >= ends:
-            return
-    if ends is None or time.monotonic() < ends:
-        raise CliError(f"{device} was silent for {SILENCE_S:g} s.", Exit.SILENT)
+def follow(signs: SignsOfLife, longest: float | None, device: str) -> Iterator[Frame]:
+    """Yield the new events and the age of the last sign of life, once a redraw.
+
+    Raises:
+        CliError: the device is silent.
+    """
+    ends = math.inf if longest is None else time.monotonic() + longest
+    while time.monotonic() < ends:
+        # All at once: a screen that drew each of them would fall behind a device that sends many.
+        events = signs.drain()
+        yield events, signs.age_s
+        if signs.silent:
+            raise CliError(f"{device} is silent: its last sign of life came {signs.age_s:.1f} s ago.", Exit.SILENT)
+        time.sleep(min(REDRAW_S, max(0.0, ends - time.monotonic())))
 
 
 def print_changes(screen: Screen, events: Iterator[DeviceEvent]) -> None:
@@ -220,10 +281,11 @@ def _present_state(fleet: FleetClient, device: str, limits: Mapping[str, Range])
     return view
 
 
-def _draw_live(screen: Screen, view: DeviceView, events: Iterator[DeviceEvent]) -> None:
+def _draw_live(screen: Screen, view: DeviceView, frames: Iterator[Frame]) -> None:
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
-    with Live(view.draw(), console=screen.out, refresh_per_second=15) as live:
-        for event in events:
-            view.take(event)
-            live.update(view.draw())
+    with Live(view.draw(), console=screen.out, auto_refresh=False) as live:
+        for events, age in frames:
+            for event in events:
+                view.take(event)
+            live.update(view.draw(age), refresh=True)

@@ -124,6 +124,10 @@ class FleetClient:
         """Return the ids of live devices announced since the last :meth:`peers`."""
         return self._found.known
 
+    def last_heartbeat(self, device: str) -> float | None:
+        """Return the monotonic time of a device's last heartbeat; None before the first."""
+        return self._found.last_heartbeat(device)
+
     def call(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0
     ) -> Envelope:

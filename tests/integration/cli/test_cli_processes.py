@@ -83,6 +83,17 @@ def test_watch_prints_one_json_value_a_line(machine: Machine, arm: dict[str, Any
     assert {"observationUpdate"} <= {event["event"] for event in events}
 
 
+def test_watched_robot_that_is_killed_is_silent_and_exit_3(machine: Machine) -> None:
+    with machine.serving("arm-9") as (served, _):
+        watching = machine.start("watch", "arm-9", "--json")
+        assert watching.stdout is not None
+        assert json.loads(watching.stdout.readline())["device"] == "arm-9"
+        served.kill()
+        said, _ = watching.communicate(timeout=WITHIN_S)
+    assert watching.returncode == 3
+    assert "arm-9 is silent" in json.loads(said.splitlines()[-1])["reason"]
+
+
 def test_ctrl_c_ends_watch_with_130(machine: Machine, arm: dict[str, Any]) -> None:
     watching = machine.start("watch", "arm-1", "--json")
     assert watching.stdout is not None
