@@ -198,7 +198,7 @@ class RunningStop:
 
         try:
             with FleetClient(self._link) as fleet:
-                found = [peer.id for peer in fleet.peers(min(2.0, self._deadline_s)) if peer.stop_verb]
+                found = [peer.id for peer in fleet.peers(min(2.0, self._deadline_s), thorough=True) if peer.stop_verb]
         except (MessagingError, TimeoutError):
             # The report still names every robot that answers before the deadline.
             return

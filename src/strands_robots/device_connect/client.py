@@ -106,14 +106,15 @@ class FleetClient:
         if not self._thread.is_alive():
             self._loop.close()
 
-    def peers(self, timeout: float = 2.0) -> list[Peer]:
+    def peers(self, timeout: float = 2.0, *, thorough: bool = False) -> list[Peer]:
         """Return the devices of the tenant, sorted by id.
 
         Args:
             timeout: seconds at most, but :data:`~discovery.HEARTBEATS_S` where the registry is expected and gives no
                 list; :attr:`stale` says so then. The collection ends early once no more devices come.
+            thorough: wait longer for a further device.
         """
-        return self.run(self._found.collect(timeout), max(timeout, HEARTBEATS_S) + COLLECT_MARGIN_S)
+        return self.run(self._found.collect(timeout, thorough=thorough), max(timeout, HEARTBEATS_S) + COLLECT_MARGIN_S)
 
     @property
     def stale(self) -> str:

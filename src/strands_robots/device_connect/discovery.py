@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
@@ -26,10 +27,20 @@ logger = logging.getLogger(__name__)
 PROBE_EVERY_S = 0.25
 """Seconds between two probes while peers are collected: the first one may leave before every link is up."""
 
-SETTLED_S = 0.5
-"""Seconds without a new device after which a collection ends early, where at least one has answered."""
+LOOK_EVERY_S = 0.02
+"""Seconds between two looks at whether the collection is over."""
 
-REGISTRY_S = 0.5
+SETTLED_S = 0.2
+"""Seconds without a new device after which a collection ends early, where at least one has answered.
+
+A device answers a probe within milliseconds. Peers of one another need longer, because their links come up one by one.
+"""
+
+SETTLED_AMONG_PEERS_S = 0.4
+SETTLED_FOR_SURE_S = 0.6
+"""The same for a thorough collection."""
+
+REGISTRY_S = 0.4
 """Seconds in which a registry that is not known to exist has to answer, where devices answered otherwise."""
 
 HEARTBEATS_S = 6.0
@@ -108,6 +119,10 @@ class Discovery:
         """Ids of the devices that were announced since the last collection."""
         return tuple(sorted(self._present))
 
+    def last_heartbeat(self, name: str) -> float | None:
+        """Return the monotonic time of a device's last heartbeat; None before the first."""
+        return self._beats.get(name)
+
     async def start(self) -> None:
         """Receive presence and heartbeats from now on."""
         self._listens_since = asyncio.get_running_loop().time()
@@ -119,9 +134,9 @@ class Discovery:
 
         Args:
             within: seconds at most. Where the registry is expected and gives no list, it lasts until heartbeats were
-                received for ``HEARTBEATS_S``. It ends early, half a second after the last new device.
+                received for ``HEARTBEATS_S``. It ends early, once no more devices come.
             found: called once with each device, when it is found.
-            thorough: where nothing was found, wait for heartbeats in any case.
+            thorough: wait longer for a further device, and where none was found for heartbeats.
         """
         loop = asyncio.get_running_loop()
         self._present.clear()
@@ -134,16 +149,21 @@ class Discovery:
                 self._changed_at = loop.time()
                 found(peer)
 
+        settled = SETTLED_AMONG_PEERS_S if self._messaging.link.is_peer else SETTLED_S
+        settled = SETTLED_FOR_SURE_S if thorough else settled
         self._found = found_once
         began = self._changed_at = loop.time()
         listing = asyncio.create_task(self._list(within))
         try:
-            while loop.time() < began + within:
-                await self._messaging.publish(f"{self._root}.discovery.probe", b'{"probe": true}')
-                await asyncio.sleep(min(PROBE_EVERY_S, within))
-                heard = listing.done() or not (self._expects_registry or loop.time() - began < REGISTRY_S)
-                if named and heard and loop.time() - self._changed_at >= SETTLED_S:
+            probe_at = began
+            while (now := loop.time()) < began + within:
+                if now >= probe_at:
+                    probe_at = now + PROBE_EVERY_S
+                    await self._messaging.publish(f"{self._root}.discovery.probe", b'{"probe": true}')
+                heard = listing.done() or not (self._expects_registry or now - began < REGISTRY_S)
+                if named and heard and now - self._changed_at >= settled:
                     break
+                await asyncio.sleep(min(LOOK_EVERY_S, within))
             await self._settle_registry(listing, began, sure=thorough and not named)
         finally:
             listing.cancel()
@@ -172,7 +192,8 @@ class Discovery:
             return
         asked: dict[str, asyncio.Task[None]] = {}
         while True:
-            alive = {name for name, at in self._beats.items() if at >= began - HEARTBEATS_S}
+            now = time.monotonic()
+            alive = {name for name, at in self._beats.items() if now - at <= HEARTBEATS_S + loop.time() - began}
             for name in alive - self._present.keys() - asked.keys():
                 asked[name] = asyncio.create_task(self._describe(name))
             # A device that sends heartbeats and no presence is in registry mode.
@@ -254,7 +275,7 @@ class Discovery:
             self._found(peer)
 
     async def _on_heartbeat(self, data: bytes, subject: str, reply: str | None) -> None:
-        self._beats[parts(subject)[2]] = asyncio.get_running_loop().time()
+        self._beats[parts(subject)[2]] = time.monotonic()
 
 
 def parts(subject: str) -> list[str]:
