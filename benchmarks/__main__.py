@@ -27,6 +27,7 @@ PARTS = {
     "simulation": "Physics",
     "reach": "Arms that reach and grasp",
     "safety": "From the controller's call to the last write",
+    "answers": "Strangers that answer for a robot",
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",
     "recording": "Recording where robots are served",
