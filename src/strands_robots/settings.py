@@ -100,6 +100,7 @@ _declare(
     Setting("ROS_SECURITY_STRATEGY", "text", "", "ROS 2's own rule for a node without keys: Enforce refuses it."),
     Setting("ROS_SECURITY_KEYSTORE", "path", "", "ROS 2's own folder of keys and permissions."),
     Setting("CYCLONEDDS_URI", "text", "", "Configuration of Cyclone DDS; the library reads it."),
+    Setting("STRANDS_POLICIES", "path", "", "File of policy profiles, by whose names callers choose a policy."),
     Setting(
         "STRANDS_ALLOW_MOCK", "boolean", "false", "Let the policy mock, which follows no instruction, move hardware."
     ),

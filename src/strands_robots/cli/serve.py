@@ -24,6 +24,8 @@ from strands_robots.cli.output import CliError, Screen, first_line, label, plain
 from strands_robots.cli.record import record_robot
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import text_of
+from strands_robots.policies import warm_profiles
+from strands_robots.policies.profiles import load_profiles
 from strands_robots.utils import ValidationError, device_id, number, redacted
 
 if TYPE_CHECKING:
@@ -74,6 +76,9 @@ def serve(
     command_allow: Annotated[
         str | None, _allow("--command-allow", "Verbs approved on real hardware: verb or verb@peer.")
     ] = None,
+    policies: Annotated[
+        Path | None, typer.Option("--policies", help="File of policy profiles, which callers choose by name.")
+    ] = None,
     allow_mock: Annotated[
         bool, typer.Option("--allow-mock", help="Let the policy mock, which follows no instruction, move hardware.")
     ] = False,
@@ -99,6 +104,9 @@ def serve(
     for name, value in flags.items():
         if value is not None:
             settings.put(name, value)
+    if policies is not None:
+        load_profiles(policies.expanduser())
+        settings.put("STRANDS_POLICIES", str(policies))
     peer_id = None if peer_id is None else device_id("--peer-id", peer_id)
     tcp_port, serial_port = parse_ports(port or [])
     network = replace(network, port=tcp_port)
@@ -113,6 +121,8 @@ def serve(
     mode = mode or ("real" if serial_port is not None or robot == "reachy_mini" else "sim")
     if serial_port is not None and mode == "sim":
         raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")
+    if policies is not None:
+        warm_profiles()
     body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
     try:
         with record_robot(screen, body, peer_id or str(body.tool_name_str), record, record_cameras):

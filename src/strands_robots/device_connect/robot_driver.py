@@ -17,6 +17,7 @@ from strands_robots.envelope import fields_of
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.serving.pipeline import Command
+from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments, Verb
 
@@ -57,7 +58,7 @@ class RobotDeviceDriver(RobotDriver):
             device_type=self.device_type,
             manufacturer="strands-robots",
             model=self._model,
-            description=f"Robot {self._model}",
+            description=f"Robot {self._model}{profile_list()}",
         )
 
     def authorize(self, command: Command, arguments: Arguments) -> None:

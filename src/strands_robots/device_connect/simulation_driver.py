@@ -16,6 +16,7 @@ from strands_robots.envelope import Envelope, fields_of
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import WORLD_VERBS, WorldStop, served_world, world_stop_answer
 from strands_robots.serving.verbs import Verb
 
@@ -53,7 +54,7 @@ class SimulationDeviceDriver(RobotDriver):
             device_type=self.device_type,
             manufacturer="strands-robots",
             model=self._model,
-            description=f"Simulation {self._model}",
+            description=f"Simulation {self._model}{profile_list()}",
         )
 
     def stop_target(self) -> Haltable:

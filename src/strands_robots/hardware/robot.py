@@ -21,7 +21,10 @@ from strands_robots.hardware.body import READ_TRIES, DeviceBody, is_velocity
 from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
 from strands_robots.hardware.settling import Settling, checked_rest_pose
 from strands_robots.policies import create_policy, resolve_provider
-from strands_robots.policies.base import checked_action
+from strands_robots.policies.base import checked_action, numbers
+from strands_robots.policies.check import RobotFacts
+from strands_robots.policies.profiled import ProfiledPolicy
+from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options, unfollowed
 from strands_robots.recording.cameras import LazyFrames
 from strands_robots.safety.gate import (
@@ -221,6 +224,18 @@ class HardwareRobot(TeleopMixin):
                 logger.exception("%s did not take an action.", self.tool_name_str)
             return error(str(exc) if isinstance(exc, ValidationError) else f"{type(exc).__name__}: {exc}")
         return success(f"Sent {len(targets)} targets.", sent=dict(sent))
+
+    def policy_facts(self) -> RobotFacts:
+        """Return what a policy is checked against; the joints are read."""
+        pictures = {key: tuple(shape) for key, shape in self.device.observation_features.items() if _is_size(shape)}
+        return RobotFacts(
+            self.tool_name_str,
+            numbers(self._body.get_joints()),
+            list(self._body.bounds),
+            joint_units(self.device),
+            {key: (size[0], size[1], size[2]) for key, size in pictures.items()},
+            self.control_hz,
+        )
 
     def body(self, robot_name: str | None = None) -> DeviceBody:
         """The one body of this robot, by its name or without one."""
@@ -473,8 +488,11 @@ class HardwareRobot(TeleopMixin):
         return ends | self.teleop_stops(deadline)
 
     def _start(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
-        chosen = rollout_options(instruction, duration, options, self.control_hz)
         name = resolve_provider(provider)
+        profile = profiles().get(name)
+        if profile is not None:
+            options = profile.loop_options(options, self.control_hz)
+        chosen = rollout_options(instruction, duration, options, self.control_hz)
         # Before the wait for the robot: a stop that comes while this waits, connects or loads is newer.
         permit = self.gate.permit("start_task")
         with self._waiting.until_begun(permit), self.starting:
@@ -485,6 +503,8 @@ class HardwareRobot(TeleopMixin):
             if not self._body.is_connected:
                 raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
             policy = create_policy(name, **options)
+            if isinstance(policy, ProfiledPolicy):
+                policy.fit(self.policy_facts())
             permit.check()
             task = self._task = Rollout(
                 self._body, policy, permit=permit, policy_name=name, observers=self.observers, **chosen
@@ -611,6 +631,10 @@ def _picture(camera: Any) -> Any:
     """Return the newest picture; older LeRobot cameras only give new ones."""
     newest = getattr(camera, "read_latest", None)
     return newest() if callable(newest) else camera.async_read()
+
+
+def _is_size(feature: Any) -> bool:
+    return isinstance(feature, tuple | list) and len(feature) == 3
 
 
 def _kind(feature: Any) -> Any:

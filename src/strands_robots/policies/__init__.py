@@ -8,8 +8,10 @@ from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
+from urllib.parse import urlsplit
 
 from strands_robots.policies.base import Action, Policy, Ranges
+from strands_robots.policies.profiles import Profile, profiles
 from strands_robots.utils import ValidationError, shown
 
 __all__ = ["ALIASES", "Action", "Policy", "Ranges", "create_policy", "policy_names", "resolve_provider"]
@@ -27,6 +29,11 @@ _BUILT_IN = {
 
 
 def policy_names() -> tuple[str, ...]:
+    """Return the names of all providers, then those of the operator's profiles."""
+    return (*provider_names(), *profiles())
+
+
+def provider_names() -> tuple[str, ...]:
     """Return the names of all providers: built-in ones first, then plug-ins."""
     return (*_BUILT_IN, *(name for name in sorted(_plug_ins()) if name not in _BUILT_IN))
 
@@ -56,6 +63,9 @@ def create_policy(provider: str, **options: Any) -> Policy:
         MissingExtraError: the provider needs an extra that is not installed.
     """
     name = resolve_provider(provider)
+    profile = profiles().get(name)
+    if profile is not None:
+        return _profiled(profile)
     factory = policy_factory(name)
     if not options.get("policy_port"):
         options.pop("policy_port", None)
@@ -71,6 +81,39 @@ def create_policy(provider: str, **options: Any) -> Policy:
             f"policy_provider {name} made {shown(policy)}, which lacks uses_cameras, reset, act, interrupt or close."
         )
     return policy
+
+
+def warm_profiles() -> None:
+    """Begin to load the policy of every profile; raise as :func:`create_policy`."""
+    for name in profiles():
+        policy = create_policy(name)
+        if hasattr(policy, "warm"):
+            policy.warm()
+
+
+def _profiled(profile: Profile) -> Policy:
+    """Make the policy of a profile, with the options that its provider takes."""
+    from strands_robots.policies.profiled import ProfiledPolicy  # noqa: PLC0415 - loaded where profiles are used
+
+    if profile.provider not in provider_names():
+        known = ", ".join(provider_names())
+        raise ValidationError(
+            f"profile {profile.name}: provider must be one of {known}, not {shown(profile.provider)}."
+        )
+    factory, address = policy_factory(profile.provider), urlsplit(profile.url)
+    offered: dict[str, Any] = {
+        "profile": profile,
+        "pretrained_name_or_path": profile.checkpoint,
+        "device": profile.device,
+        "policy_host": address.hostname,
+        "policy_port": address.port or 0,
+        "deadline_s": profile.deadline_s,
+        "reset_deadline_s": profile.first_deadline_s,
+        "uses_cameras": bool(profile.cameras),
+        "frames": "msgpack" if profile.cameras else "json",
+    }
+    taken = inspect.signature(factory).parameters
+    return ProfiledPolicy(profile, factory(**{key: each for key, each in offered.items() if key in taken and each}))
 
 
 def policy_factory(name: str) -> Callable[..., Any]:

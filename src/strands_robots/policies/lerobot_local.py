@@ -11,7 +11,11 @@ from importlib import import_module
 from typing import Any
 
 from strands_robots.policies.base import Action, Ranges
+from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, missing_extra, text
+
+_MODELS = WarmModels()
+"""Loaded checkpoints by path and device."""
 
 
 class LeRobotPolicy:
@@ -40,19 +44,36 @@ class LeRobotPolicy:
         self._instruction = ""
         self._keys: tuple[str, ...] = ()
         self._features: dict[str, Any] = {}
+        self._loaded: tuple[Any, Any, Any] | None = None
         self._model: Any = None
         self._before: Any = None
         self._after: Any = None
 
-    def reset(self, instruction: str, ranges: Ranges) -> None:
-        """Load the checkpoint; fetching it from the hub first takes minutes."""
+    def warm(self) -> str | None:
+        """Load the checkpoint on a thread; see :class:`Warmable`."""
+        return _MODELS.warm((self._checkpoint, self._device), self._load)
+
+    def _load(self) -> tuple[Any, Any, Any]:
+        """Return model and processors; fetching them from the hub first takes minutes."""
         factory = import_module("lerobot.policies.factory")
         config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(self._checkpoint)
         if self._device:
             config.device = self._device
-        self._model = factory.get_policy_class(config.type).from_pretrained(self._checkpoint, config=config)
-        self._before, self._after = factory.make_pre_post_processors(config, pretrained_path=self._checkpoint)
-        self._model.reset()
+        # Strictly: a weight that is missing would be a random one, with a line in the log.
+        model = factory.get_policy_class(config.type).from_pretrained(self._checkpoint, config=config, strict=True)
+        # A checkpoint that was saved on CUDA has processors that ask for it.
+        on_device = {"device_processor": {"device": config.device}}
+        before, after = factory.make_pre_post_processors(
+            config, pretrained_path=self._checkpoint, preprocessor_overrides=on_device
+        )
+        return model, before, after
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        """Take the loaded checkpoint, or load it."""
+        self._loaded = _MODELS.take((self._checkpoint, self._device), self._load)
+        self._model, self._before, self._after = self._loaded
+        for each in self._loaded:
+            each.reset()
         self._instruction = instruction
         self._keys = tuple(ranges)
         self._features = {}
@@ -77,6 +98,9 @@ class LeRobotPolicy:
 
     def close(self) -> None:
         self._model = self._before = self._after = None
+        loaded, self._loaded = self._loaded, None
+        if loaded is not None:
+            _MODELS.give((self._checkpoint, self._device), loaded)
 
     def _dataset_features(self, observation: Mapping[str, Any]) -> dict[str, Any]:
         convert = import_module("lerobot.datasets.utils").hw_to_dataset_features

@@ -7,7 +7,8 @@ import re
 from functools import lru_cache
 
 from strands_robots import settings
-from strands_robots.policies import policy_names
+from strands_robots.policies import provider_names
+from strands_robots.policies.profiles import profiles
 from strands_robots.safety.authorization import provider_refusal
 from strands_robots.serving.verbs import Check
 from strands_robots.utils import ValidationError, identifier, number, shown, text
@@ -37,15 +38,22 @@ def mock_refusal() -> str | None:
     if settings.boolean("STRANDS_ALLOW_MOCK"):
         return None
     return (
-        "the policy mock plays slow waves and follows no instruction. Name a trained one as policy_provider; to let "
+        "the policy mock plays slow waves and follows no instruction. Name a profile of --policies FILE "
+        "as policy_provider; to let "
         "mock move real hardware, serve the robot with --allow-mock (STRANDS_ALLOW_MOCK=true)."
     )
+
+
+def profile_list() -> str:
+    """Return the operator's profiles for a device's description; empty without any."""
+    names = profiles()
+    return f"; policies: {', '.join(names)}" if names else ""
 
 
 @lru_cache(maxsize=1)
 def registered_providers() -> tuple[str, ...]:
     """Return this machine's policy providers, read from the disk once."""
-    return policy_names()
+    return provider_names()
 
 
 def policy_host_refusal(host: str) -> str | None:
@@ -68,9 +76,9 @@ def known_provider(name: str, value: object) -> str:
     provider = identifier(name, value)
     allow = settings.items("STRANDS_MESH_POLICY_TYPE_ALLOW")
     if provider not in PROVIDERS and provider not in FOREIGN_PROVIDERS and provider not in allow:
-        registered = registered_providers()
+        registered = {*registered_providers(), *profiles()}
         if provider not in registered:
-            known = ", ".join(sorted(PROVIDERS | set(registered)))
+            known = ", ".join(sorted(PROVIDERS | registered))
             raise ValidationError(f"{name} must be one of {known}, not {shown(value)}.", POLICY_TYPE_NOT_ALLOWED)
     refusal = provider_refusal(provider, allow)
     if refusal is not None:

@@ -19,6 +19,9 @@ from strands_robots.kinematics.arm import Arm
 from strands_robots.kinematics.grasp import SeenObject
 from strands_robots.kinematics.motion import Motion
 from strands_robots.policies import create_policy
+from strands_robots.policies.check import RobotFacts
+from strands_robots.policies.profiled import ProfiledPolicy
+from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options, unfollowed
 from strands_robots.safety.gate import MotionGate, Waiting, answered
 from strands_robots.safety.stopping import StopVerdict, halt_each
@@ -426,6 +429,12 @@ class Simulation(ArmMixin, TeleopMixin):
         """Return why the last policy of a robot failed, by robot, until its next one."""
         return {name: rollout.error for name, rollout in list(self._rollouts.items()) if rollout.state == "error"}
 
+    def policy_facts(self, robot_name: str | None = None) -> RobotFacts:
+        """Return what a policy is checked against; a rollout gets no pictures here."""
+        body = self.body(robot_name)
+        rate = settings.number("STRANDS_CONTROL_HZ")
+        return RobotFacts(body.name, body.get_observation(), list(body.bounds), body.joint_units, {}, rate)
+
     def occupied(self, robot: str) -> str:
         """Name the rollout that drives this robot, for a refusal; empty without one."""
         rollout = self._running().get(robot)
@@ -604,12 +613,17 @@ class Simulation(ArmMixin, TeleopMixin):
     def _start_rollout(
         self, robot_name: str, instruction: str, provider: str, duration: float, options: dict[str, Any]
     ) -> Rollout:
-        chosen = rollout_options(instruction, duration, options, settings.number("STRANDS_CONTROL_HZ"))
+        profile, hz = profiles().get(provider), settings.number("STRANDS_CONTROL_HZ")
+        if profile is not None:
+            options = profile.loop_options(options, hz)
+        chosen = rollout_options(instruction, duration, options, hz)
         permit = self.gate.permit("start_policy")
         with self._waiting.until_begun(permit, self.body(robot_name).name):
             policy = create_policy(provider, **options)
             with self.starting:
                 body = self._free_body(robot_name)
+                if isinstance(policy, ProfiledPolicy):
+                    policy.fit(self.policy_facts(body.name))
                 if not permit.valid:
                     raise ValidationError(f"start_policy: {body.name} was halted while its policy was made ready.")
                 rollout = Rollout(body, policy, permit=permit, policy_name=provider, observers=self.observers, **chosen)

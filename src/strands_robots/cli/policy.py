@@ -1,0 +1,71 @@
+"""``policy check``: compare a policy profile with a robot before it moves."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from strands_robots import settings
+from strands_robots.cli.command import assignments, command
+from strands_robots.cli.output import CliError, Screen, label, table
+from strands_robots.policies.check import PolicyCheck, check_policy, statements_of
+from strands_robots.policies.profiles import load_profiles
+from strands_robots.utils import ValidationError, shown
+
+_STYLES = {"ok": "green", "confirmed": "green", "unverified": "yellow", "refused": "bold red"}
+
+PoliciesFile = Annotated[
+    Path | None, typer.Option("--policies", help="The file of policy profiles; STRANDS_POLICIES by default.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``policy`` to the application."""
+    group = typer.Typer(help="Look at trained policies before a robot moves by them.", no_args_is_help=True)
+    command(group, "check")(check)
+    app.add_typer(group, name="policy")
+
+
+def check(
+    screen: Screen,
+    *,
+    name: Annotated[str, typer.Argument(help="The profile.")],
+    robot: Annotated[str, typer.Option("--robot", help="Such as so101, or an MJCF or URDF file.")],
+    policies: PoliciesFile = None,
+    mode: Annotated[str, typer.Option("--mode", help="sim or real.")] = "sim",
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="An option of the robot, such as port=/dev/ttyACM0.", metavar="KEY=VALUE"),
+    ] = None,
+) -> None:
+    """Compare a policy with a robot that keeps still. Exits with 1 on a mismatch."""
+    path = policies or (Path(settings.raw("STRANDS_POLICIES")) if settings.raw("STRANDS_POLICIES") else None)
+    if path is None:
+        raise ValidationError("--policies must name the file of profiles; STRANDS_POLICIES is not set.")
+    profiles = load_profiles(path.expanduser())
+    if name not in profiles:
+        raise ValidationError(f"NAME must be one of {', '.join(profiles) or 'no profiles'}, not {shown(name)}.")
+    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
+
+    body = Robot(robot, mode=mode, **assignments(options or []))
+    try:
+        facts = body.policy_facts()
+    finally:
+        body.cleanup()
+    found = check_policy(profiles[name], statements_of(profiles[name]), facts)
+    show(screen, found)
+    if not found.passed:
+        raise CliError(f"{name} may not move {facts.name}: {len(found.failures)} of {len(found.rows)} rows fail.")
+
+
+def show(screen: Screen, found: PolicyCheck) -> None:
+    """Print the rows of a check."""
+    screen.data({"passed": found.passed, "rows": [asdict(row) for row in found.rows]})
+    rows: list[tuple[Any, ...]] = [
+        (row.question, row.policy, row.robot, label(row.outcome, _STYLES[row.outcome]), row.change)
+        for row in found.rows
+    ]
+    screen.show(table("", ("question", "policy", "robot", "result", "to do"), rows))
