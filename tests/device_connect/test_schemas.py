@@ -12,6 +12,7 @@ from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
 
 DRIVERS = [RobotDeviceDriver(ToyRobot()), SimulationDeviceDriver(ToyWorld())]
@@ -34,6 +35,9 @@ def test_every_function_event_and_parameter_is_described(driver: Any) -> None:
             assert len(prop.get("description", "")) > 2, (part.name, name)
 
 
+CONTROL_EVENTS = ("controlTaken", "controlExpired")
+
+
 def test_the_types_are_those_of_the_arguments() -> None:
     execute = next(f for f in DRIVERS[0].functions if f.name == "execute").parameters
     assert {name: prop["type"] for name, prop in execute["properties"].items()} == {
@@ -41,6 +45,7 @@ def test_the_types_are_those_of_the_arguments() -> None:
         "policy_provider": "string",
         "duration": "number",
         "policy_port": "integer",
+        "lease_id": "string",
     }
     assert execute["required"] == ["instruction"]
     update = next(e for e in DRIVERS[1].events if e.name == "observationUpdate").payload_schema
@@ -56,23 +61,22 @@ def test_the_types_are_those_of_the_arguments() -> None:
                 *("execute", "stop", "releaseTorque", "resume", "getStatus", "getFeatures", "getState"),
                 *ARM_MOTION_VERBS,
                 *PICTURE_VERBS,
+                *CONTROL_VERBS,
             },
-            {"taskStarted", "taskComplete", "streamStep", "stateUpdate", "emergencyStop"},
+            {"taskStarted", "taskComplete", "streamStep", "stateUpdate", "emergencyStop", *CONTROL_EVENTS},
         ),
         (
             DRIVERS[1],
             {
-                "execute",
-                "stop",
-                "resume",
-                "getStatus",
-                "getFeatures",
-                "step",
-                "reset",
+                *("execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset"),
                 *ARM_MOTION_VERBS,
+                *CONTROL_VERBS,
                 *PICTURE_VERBS,
             },
-            {"policyStarted", "policyComplete", "observationUpdate", "streamStep", "stateUpdate", "emergencyStop"},
+            {
+                *("policyStarted", "policyComplete", "observationUpdate", "streamStep", "stateUpdate", "emergencyStop"),
+                *CONTROL_EVENTS,
+            },
         ),
     ],
     ids=["robot", "simulation"],

@@ -28,7 +28,7 @@ def test_joints_must_be_degrees_by_name(joints: Any) -> None:
 
 def test_approach_may_be_left_out_and_the_other_options_have_defaults() -> None:
     checked = ARM_MOTION_VERBS["moveTo"].checked({"x": 0, "y": 0, "z": 0.1})
-    assert checked == {"x": 0.0, "y": 0.0, "z": 0.1, "approach": None, "speed": 0.5, "wait": True}
+    assert checked == {"x": 0.0, "y": 0.0, "z": 0.1, "approach": None, "speed": 0.5, "wait": True, "lease_id": ""}
 
 
 def test_a_world_names_the_robot_besides() -> None:

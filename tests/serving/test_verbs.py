@@ -14,6 +14,7 @@ from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.mesh.security import validate_command
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.robot_verbs import ARM_VERBS, PEER_VERBS
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
@@ -67,10 +68,11 @@ def test_the_mesh_knows_the_documented_actions() -> None:
         *("teleop_status", "teleop_receive", "teleop_stop", "releaseTorque", "resume", "ping"),
         *ARM_MOTION_VERBS,
         *PICTURE_VERBS,
+        *CONTROL_VERBS,
     }
     moving = {name for name, verb in PEER_VERBS.items() if verb.kind is Kind.MOTION}
     arm = {"moveJoints", "moveTo", "moveBy", "setGripper", "goTo", "savePlace", "pick", "place"}
-    assert moving == {"execute", "start", "step", "reset", "teleop_receive", "releaseTorque"} | arm
+    assert moving == {"execute", "start", "step", "reset", "teleop_receive", "releaseTorque", "acquireControl"} | arm
 
 
 def test_the_mesh_fills_in_defaults_and_drops_what_an_action_does_not_have() -> None:
@@ -95,7 +97,7 @@ GO = Verb(
 
 
 def test_checked_arguments_have_their_defaults() -> None:
-    assert GO.checked({"steps": 3}) == {"steps": 3, "turns": 2}
+    assert GO.checked({"steps": 3}) == {"steps": 3, "turns": 2, "lease_id": ""}
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import typer
 from strands_robots import __version__
 from strands_robots.cli import (
     audit,
+    control,
     demo,
     doctor,
     enroll,
@@ -67,6 +68,7 @@ def build() -> typer.Typer:
         stop,
         safety_controller,
         resume,
+        control,
         watch,
         teleop,
         record,

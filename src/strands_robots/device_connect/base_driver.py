@@ -32,6 +32,7 @@ from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.control import ControlChange
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
@@ -108,7 +109,7 @@ def enveloped(verb: str, answer: object) -> Envelope:
 
 
 class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
-    """A robot as a device. Subclasses name its verbs, read its state and name its events.
+    """Robot as a device; subclasses name its verbs and events and read its state.
 
     Args:
         robot: what is driven, behind its contract.
@@ -158,6 +159,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         self._rolling: set[str] = set()
         self._watchers: list[asyncio.Task[None]] = []
         self._unsubscribe: Unsubscribe | None = None
+        self._end_control: Callable[[], None] = lambda: None
 
     # Commands.
 
@@ -215,12 +217,14 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         return error("resume rejected") if registration is None else registration.resume(arguments["assertion"])
 
     def _status(self, arguments: Arguments) -> object:
-        """The robot's status with its lockouts and the dead-man check-in."""
+        """The robot's status with its lockouts, the dead-man check-in and who holds it."""
         verb = self.verbs["getStatus"]
         answer = verb.run(self.robot, arguments) if verb.run is not None else getattr(self.robot, verb.method)()
-        if self.registration is None or not isinstance(answer, dict):
+        if not isinstance(answer, dict):
             return answer
-        return {**answer, **self.registration.facts()}
+        lockouts = {} if self.registration is None else self.registration.facts()
+        control = {} if self.pipeline.leases is None else {"control": self.pipeline.leases.facts()}
+        return {**answer, **lockouts, **control}
 
     # Stops.
 
@@ -299,6 +303,42 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             reason = answer.get("reason")
             logger.critical("%s: EMERGENCY STOP of %s DID NOT STOP IT: %s", self.peer_id, device_id, reason)
 
+    # Control.
+
+    @emit(labels={"safety": "informational"})
+    async def controlTaken(self, robot: str, holder: str, epoch: int, reason: str = "") -> None:
+        """A human took the robot from its holder.
+
+        Args:
+            robot: the robot of a world, or this one
+            holder: who has it now
+            epoch: number of the lease
+            reason: why
+        """
+
+    @emit(labels={"safety": "informational"})
+    async def controlExpired(self, robot: str, holder: str, epoch: int) -> None:
+        """The holder was silent for too long; what it moved is halted.
+
+        Args:
+            robot: the robot of a world, or this one
+            holder: who had it
+            epoch: number of the lease
+        """
+
+    def _on_control(self, change: ControlChange) -> None:
+        facts: dict[str, Any] = {"robot": change.robot, "holder": change.holder, "epoch": change.epoch}
+        if change.event == "taken":
+            self._emit_from_thread("controlTaken", {**facts, "reason": change.reason})
+        elif change.event == "expired":
+            self._emit_from_thread("controlExpired", facts)
+
+    def _emit_from_thread(self, event: str, payload: dict[str, Any]) -> None:
+        try:
+            self.runtime.emit_from_thread(event, payload)
+        except RuntimeError as exc:
+            logger.warning("%s: %s was not told: %s", self.peer_id, event, exc)
+
     # State.
 
     def glance(self) -> Activity:
@@ -373,6 +413,8 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         subscribe = partial(self.robot.subscribe, pump.observe)
         self._unsubscribe = await called(self.pipeline.shares.read, subscribe, READ_DEADLINE_S)
         self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
+        if self.pipeline.leases is not None:
+            self._end_control = self.pipeline.leases.observe(self._on_control)
 
     def watches(self) -> list[Any]:
         """Return the coroutines that run while the device is connected."""
@@ -387,6 +429,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             watcher.cancel()
         await asyncio.gather(*watchers, return_exceptions=True)
         self._looked_once = False
+        self._end_control()
         unsubscribe, self._unsubscribe = self._unsubscribe, None
         if unsubscribe is not None:
             try:

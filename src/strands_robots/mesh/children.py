@@ -224,6 +224,7 @@ class Children:
             },
             pending=self._pipeline.pending.of(name),
             shares=self._pipeline.shares,
+            leases=None if self._pipeline.leases is None else self._pipeline.leases.only(name),
         )
         server = CommandReceiver(
             context,

@@ -1,7 +1,7 @@
 """Pipeline of a command from any network to a robot's method.
 
-In order: arguments, caller, lockout, the operator's approval, the robot's method. The first that refuses raises
-:class:`Refused`, which says which it was. Whatever is raised on the way becomes an
+In order: arguments, caller, control lease, lockout, the operator's approval, the robot's method. The first that refuses
+raises :class:`Refused`, which says which it was. Whatever is raised on the way becomes an
 :class:`Result` here alone. Stops take no part in it: they go to the stop executor at once, for every caller.
 """
 
@@ -21,8 +21,9 @@ from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
+from strands_robots.serving.control import Admission, ControlLeases, NotHolderError, leases_of
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
-from strands_robots.serving.verbs import Arguments, Kind, Verb
+from strands_robots.serving.verbs import LEASE_ID, Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.utils import ValidationError
 
@@ -34,6 +35,7 @@ class RefusalReason(Enum):
 
     ARGUMENTS = "arguments"
     CALLER = "caller"
+    CONTROL = "control"
     LOCKOUT = "lockout"
     APPROVAL = "approval"
     BUSY = "busy"
@@ -153,6 +155,7 @@ class Pipeline:
         own: verbs that the peer carries out itself, by name.
         pending: commands that a stop has to reach before they begin.
         shares: the robot's threads.
+        leases: who holds the robot, on every network.
     """
 
     robot: Robot | None
@@ -163,6 +166,7 @@ class Pipeline:
     own: Mapping[str, Own] = field(default_factory=dict)
     pending: PendingCommands = field(default_factory=lambda: PendingCommands(None))
     shares: Shares = field(default_factory=Shares)
+    leases: ControlLeases | None = None
     _serving: list[str] = field(default_factory=list, init=False)
     _closed: bool = field(default=False, init=False)
     _changed: threading.Condition = field(default_factory=threading.Condition, init=False, repr=False)
@@ -173,6 +177,7 @@ class Pipeline:
         gate = None if robot is None else robot.gate
         parts.setdefault("pending", PendingCommands(gate))
         parts.setdefault("shares", Shares() if robot is None else shares_of(robot))
+        parts.setdefault("leases", None if robot is None else leases_of(robot, hardware=parts["hardware"]))
         return cls(robot, peer_id, **parts)
 
     def share(self, verb: Verb) -> Share:
@@ -185,7 +190,7 @@ class Pipeline:
 
     def serve(self, command: Command, answered: Answered) -> None:
         """Carry ``command`` out on this thread and hand its answer to ``answered``."""
-        verb, claim = command.verb, Claim()
+        verb, claim, admission = command.verb, Claim(), Admission()
         result: object = None
         refusal: Refused | None = None
         with self._changed:
@@ -193,6 +198,7 @@ class Pipeline:
         try:
             arguments = self._checked(command)
             self.authorize(command, arguments)
+            admission = self._admitted(command, arguments)
             with self.pending.serving(command.asked):
                 if verb.kind is Kind.MOTION:
                     claim = self._claim(verb, arguments)
@@ -206,14 +212,15 @@ class Pipeline:
                     result = getattr(self.robot, verb.method)(**arguments)
         except Refused as refused:
             refusal, result = refused, refused.envelope
-        except (ValidationError, MotionRefused) as exc:
-            result = exc.envelope if isinstance(exc, MotionRefused) else error(str(exc))
+        except (ValidationError, MotionRefused, NotHolderError) as exc:
+            result = error(str(exc)) if isinstance(exc, ValidationError) else exc.envelope
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)
             refusal = Refused(RefusalReason.FAILED, f"{verb.name} failed inside the device; its log has the details.")
             result = refusal.envelope
         try:
+            admission.close()
             if result is None or is_error(result):
                 claim.give_back()
             else:
@@ -245,6 +252,23 @@ class Pipeline:
             return command.verb.checked(command.arguments)
         except ValidationError as exc:
             raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None
+
+    def _admitted(self, command: Command, arguments: dict[str, Any]) -> Admission:
+        """Ask the control lease for a motion; give its own verbs what they act on."""
+        verb, leases = command.verb, self.leases
+        if verb.on_lease:
+            if leases is None:
+                raise Refused(RefusalReason.CONTROL, f"{verb.name}: no robot is registered on this peer.")
+            arguments |= {"caller": command.caller, "robot": self.peer_id(), "leases": leases}
+            return Admission()
+        lease_id = arguments.pop(LEASE_ID, "") or "" if verb.leased else ""
+        if leases is None or not verb.leased:
+            return Admission()
+        name = arguments.get("robot_name", "") if "robot_name" in verb.by_name else None
+        try:
+            return leases.admit(verb.name, command.caller, lease_id, name)
+        except NotHolderError as exc:
+            raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
 
     def _claim(self, verb: Verb, arguments: Arguments) -> Claim:
         """Check the lockout and, for hardware, the policy and the operator's approval."""

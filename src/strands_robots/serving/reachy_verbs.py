@@ -11,6 +11,7 @@ from strands_robots.drivers.reachy.driver import LIBRARIES, motor_names
 from strands_robots.drivers.reachy.rest import DaemonError
 from strands_robots.drivers.reachy.target import HeadPose, Target, bounded
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.verbs import (
     RESUME,
     Arguments,
@@ -171,6 +172,7 @@ REACHY_VERBS = table(
             returns="stopped, halted, not_stopped, unknown, elapsed_ms",
         ),
         RESUME,
+        *CONTROL_VERBS.values(),
         _read(
             "getStatus",
             "Read link, daemon state and version, motor mode, application, data age, motion and lockouts.",

@@ -18,6 +18,7 @@ from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS, for_robot
+from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.verbs import (
@@ -328,6 +329,7 @@ ARM_VERBS = table(
         GET_STATE,
         *ARM_MOTION_VERBS.values(),
         *PICTURE_VERBS.values(),
+        *CONTROL_VERBS.values(),
     ]
 )
 WORLD_VERBS = table(
@@ -373,6 +375,7 @@ WORLD_VERBS = table(
         ),
         *WORLD_MOTION_VERBS.values(),
         *PICTURE_VERBS.values(),
+        *(for_robot(verb, ROBOT_NAME) for verb in CONTROL_VERBS.values()),
     ]
 )
 
@@ -440,7 +443,10 @@ PEER_VERBS = table(
         ),
         _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
-        *(for_robot(verb, _PEER_ROBOT, drops_unknown=True) for verb in ARM_MOTION_VERBS.values()),
+        *(
+            for_robot(verb, _PEER_ROBOT, drops_unknown=True)
+            for verb in (*ARM_MOTION_VERBS.values(), *CONTROL_VERBS.values())
+        ),
         *(replace(verb, drops_unknown=True) for verb in PICTURE_VERBS.values()),
     ]
 )

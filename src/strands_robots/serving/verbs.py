@@ -7,7 +7,7 @@ Device Connect makes its RPC methods and their schemas from these descriptions, 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -39,7 +39,7 @@ class Kind(Enum):
     """Carried out for every caller, on threads of its own."""
 
     RESUME = "resume"
-    """Authorized by the operator's signature that it brings."""
+    """Authorized by what it brings: the operator's signature, or the secret of a lease."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,19 @@ class Parameter:
     default: Any = REQUIRED
 
 
+LEASE_ID = "lease_id"
+
+LEASE_ID_MAX = 64
+
+_LEASE_ID = Parameter(
+    LEASE_ID,
+    str,
+    "The lease_id of acquireControl; empty on a robot that nobody holds",
+    lambda name, value: text(name, value, longest=LEASE_ID_MAX, empty=True),
+    default="",
+)
+
+
 @dataclass(frozen=True)
 class Verb:
     """One thing that a caller may ask of a robot.
@@ -73,6 +86,7 @@ class Verb:
         urgent: it takes energy away, and waits for no read and no motion.
         while_locked: it works under a lockout; caller and operator are asked as for any motion.
         instead: the verb that a locked robot offers in the place of this one.
+        on_lease: a verb of the control lease; its ``run`` gets ``caller``, ``robot`` and ``leases`` besides.
     """
 
     name: str
@@ -88,10 +102,19 @@ class Verb:
     urgent: bool = False
     while_locked: bool = False
     instead: str = ""
+    on_lease: bool = False
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if self.leased and all(each.name != LEASE_ID for each in self.parameters):
+            lease_id = _LEASE_ID if not self.drops_unknown else replace(_LEASE_ID, default=None)
+            object.__setattr__(self, "parameters", (*self.parameters, lease_id))
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
+
+    @property
+    def leased(self) -> bool:
+        """True for a motion of the lease's holder alone; it takes ``lease_id`` besides."""
+        return self.kind is Kind.MOTION and not self.while_locked
 
     def unfit(self, names: Collection[str]) -> str | None:
         """Return the reason why arguments of these names do not fit, or None."""

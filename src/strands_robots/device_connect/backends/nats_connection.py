@@ -183,7 +183,7 @@ _CONNECTIONS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], NatsConnection]
 
 
 def connection_for(link: LinkConfig, sign: Sign | None = None) -> NatsConnection:
-    """Return the connection of the running loop for ``link``; one of its own with ``sign``."""
+    """Return the running loop's connection for ``link``; a private one with ``sign``."""
     if sign is not None:
         return NatsConnection(link, sign)
     key = (asyncio.get_running_loop(), link)

@@ -1,0 +1,583 @@
+"""Control lease of one robot: its holder, and the motions that it admits.
+
+A robot is free or held. Motion carries the secret ``lease_id`` of the holder. On a free robot a motion without one
+holds the robot until it has ended, so that two programs never move one arm in turns. Stops and reads ask for no lease,
+and a lockout is separate and stronger. A lease prevents accidents among programs that behave; what keeps out others is
+authorization and the operator's approval.
+
+Leases live in memory: a restart of the robot's process voids them all.
+"""
+
+from __future__ import annotations
+
+import hmac
+import logging
+import secrets
+import threading
+import time
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from strands_robots.contract import RUNNING, Robot, WorldRobot, body_of
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety import ed25519
+from strands_robots.safety.authorization import ANONYMOUS, caller_name
+from strands_robots.safety.resume import NEWEST_S, NONCES_MAX, OLDEST_S, configured_keys
+from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.utils import shown
+
+logger = logging.getLogger(__name__)
+
+HUMAN, AGENT, POLICY = "human", "agent", "policy"
+KINDS = (HUMAN, AGENT, POLICY)
+
+TTL_MIN_S, TTL_MAX_S, TTL_S = 0.5, 600.0, 60.0
+"""Bounds of a lease's time, and the time where none is asked for."""
+
+DISPLACED_MAX = 16
+"""Former holders of a robot that are still told that they were displaced."""
+
+PURPOSE = "take-control"
+TAKE_FIELDS = frozenset({"v", "purpose", "robot", "epoch", "t", "nonce", "sig"})
+"""Fields of the operator's assertion; ``sig`` is the Ed25519 signature over the canonical JSON of the others."""
+
+VERSION = 1
+
+
+class NotHolderError(StrandsRobotsError, RuntimeError):
+    """Motion of one who does not hold the robot; ``envelope`` is the answer.
+
+    Its ``code`` is ``not_holder``, ``displaced`` or ``lease_over``.
+    """
+
+    def __init__(self, text: str, code: str, **facts: Any) -> None:
+        super().__init__(text)
+        self.envelope: Envelope = error(text, code=code, **facts)
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """One holder's lease. Times are monotonic seconds.
+
+    Attributes:
+        ttl_s: it is over so long after its last use; None for the lease of one motion, which is over with it.
+        until: the moment at which it is over.
+    """
+
+    holder: str
+    kind: str
+    lease_id: str = field(repr=False)
+    ttl_s: float | None = None
+    until: float | None = None
+
+    def left(self, now: float) -> float | None:
+        """Return the seconds left, None for the lease of one motion."""
+        return None if self.until is None else max(self.until - now, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ControlChange:
+    """A change of the holder, as observers are told.
+
+    Attributes:
+        event: ``acquired``, ``released``, ``expired`` or ``taken``.
+        reason: the one that a human gave for taking control.
+    """
+
+    event: str
+    robot: str
+    holder: str
+    kind: str
+    epoch: int
+    reason: str = ""
+
+
+OnChange = Callable[[ControlChange], None]
+
+
+class Admission:
+    """Leave of one motion to begin; of a holder with a lease it is nothing to end.
+
+    Args:
+        starting: the motions of this robot that were admitted and have not begun or been refused.
+    """
+
+    def __init__(self, starting: set[Admission] | None = None) -> None:
+        self._starting = starting
+        if starting is not None:
+            starting.add(self)
+
+    def close(self) -> None:
+        """Report that the motion has begun, or that it was refused."""
+        if self._starting is not None:
+            self._starting.discard(self)
+
+
+def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], float] = time.time) -> dict[str, Any]:
+    """Return the operator's assertion that takes ``robot`` from its holder."""
+    body = {
+        "v": VERSION,
+        "purpose": PURPOSE,
+        "robot": robot,
+        "epoch": epoch,
+        "t": clock(),
+        "nonce": secrets.token_hex(16),
+    }
+    return {**body, "sig": ed25519.encode(signing_key.sign(ed25519.canonical(body)))}
+
+
+class _Watch:
+    """One thread that ends leases in time; it lives as long as there is one."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._leases: set[ControlLease] = set()
+        self._thread: threading.Thread | None = None
+
+    def add(self, lease: ControlLease) -> None:
+        """Watch a lease until it is over."""
+        with self._changed:
+            self._leases.add(lease)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, name="control-leases", daemon=True)
+                self._thread.start()
+            self._changed.notify_all()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._leases = {each for each in self._leases if each.due is not None}
+                if not self._leases:
+                    self._thread = None
+                    return
+                due = [(at, each) for each in self._leases if (at := each.due) is not None]
+                wait = min((at for at, _ in due), default=time.monotonic()) - time.monotonic()
+                if wait > 0:
+                    self._changed.wait(wait)
+                    continue
+            for at, each in due:
+                if at <= time.monotonic():
+                    each.expire()
+
+
+watch: Callable[[ControlLease], None] = _Watch().add
+"""Ends a lease when its time is over."""
+
+
+class ControlLease:
+    """The lease of one robot, or of one robot of a world; thread-safe.
+
+    Args:
+        robot: its name in messages.
+        halt: stops what the robot does, without a lockout.
+        moving: whether it moves now; asked only while the lease of one motion is in the way, and under no lock.
+        hardware: False for a simulation, which a human may take without a key where none is configured.
+        clock: monotonic seconds.
+        wall: wall-clock seconds, against which an assertion's age is held.
+        watched: has :meth:`expire` called at :attr:`due`.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        halt: Callable[[str], object],
+        moving: Callable[[], bool],
+        *,
+        hardware: bool = True,
+        keys: Callable[[], Sequence[bytes]] = configured_keys,
+        clock: Callable[[], float] = time.monotonic,
+        wall: Callable[[], float] = time.time,
+        watched: Callable[[ControlLease], None] = watch,
+    ) -> None:
+        self._robot = robot
+        self._halt = halt
+        self._moving = moving
+        self._hardware = hardware
+        self._keys = keys
+        self._clock, self._wall, self._watched = clock, wall, watched
+        self._changing = threading.RLock()
+        self._lease: Lease | None = None
+        self._starting: set[Admission] = set()
+        self._displaced: dict[str, str] = {}
+        self._nonces: dict[str, float] = {}
+        self._observers: tuple[OnChange, ...] = ()
+        self.epoch = 0
+        """Rises with every new holder."""
+
+    @property
+    def due(self) -> float | None:
+        """The monotonic moment at which the lease is over; None where there is none."""
+        lease = self._lease
+        return None if lease is None else lease.until
+
+    def observe(self, observer: OnChange) -> Callable[[], None]:
+        """Tell ``observer`` of every change of the holder; return what ends that."""
+        with self._changing:
+            self._observers = (*self._observers, observer)
+
+        def end() -> None:
+            with self._changing:
+                self._observers = tuple(each for each in self._observers if each is not observer)
+
+        return end
+
+    def facts(self) -> dict[str, Any]:
+        """Return the holder as everyone may read it."""
+        self._settle()
+        lease = self._lease
+        if lease is None:
+            return {"held": False, "epoch": self.epoch}
+        return {
+            "held": True,
+            "holder": lease.holder,
+            "kind": lease.kind,
+            "epoch": self.epoch,
+            "for_one_motion": lease.until is None,
+            "expires_in_s": lease.left(self._clock()),
+        }
+
+    def acquire(self, caller: object, kind: str, ttl_s: float, lease_id: str = "") -> Envelope:
+        """Give the free robot to ``caller``; its holder gets a lease anew.
+
+        Raises:
+            NotHolderError: another holds it.
+        """
+        holder = _name(caller)
+        self._settle()
+        with self._changing:
+            lease = self._lease
+            own = lease is not None and (_is(lease, lease_id) or (lease.until is None and lease.holder == holder))
+            if lease is not None and not own:
+                raise self._not_holder("acquireControl", lease)
+            return self._give(holder, kind, ttl_s, "acquired")
+
+    def renew(self, lease_id: str) -> Envelope:
+        """Start the lease's time anew.
+
+        Raises:
+            NotHolderError: the lease is not held any more.
+        """
+        self._settle()
+        with self._changing:
+            lease = self._used("renewControl", lease_id)
+            return success(f"{lease.holder} holds control.", epoch=self.epoch, expires_in_s=lease.left(self._clock()))
+
+    def release(self, lease_id: str) -> Envelope:
+        """Free the robot; what it does goes on to its own end.
+
+        Raises:
+            NotHolderError: the lease is not held any more.
+        """
+        self._settle()
+        with self._changing:
+            lease = self._used("releaseControl", lease_id)
+            self._lease = None
+        self._tell("released", lease)
+        return success(f"{lease.holder} has released control.", epoch=self.epoch)
+
+    def take(self, caller: object, reason: str, robot: str, assertion: object) -> Envelope:
+        """Give the robot to a human; its motion is halted before the answer.
+
+        Args:
+            robot: the name that the assertion has to bear.
+            assertion: of :func:`sign_take`.
+        """
+        holder = _name(caller)
+        with self._changing:
+            problem = self._unproven(robot, assertion)
+            if problem is not None:
+                logger.warning("%s: takeControl of %s refused: %s.", robot, holder, problem)
+                return error(f"takeControl is refused: {problem}.", code="not_proven", epoch=self.epoch)
+            before = self._lease
+            if before is not None:
+                self._displaced[before.lease_id] = holder
+                while len(self._displaced) > DISPLACED_MAX:
+                    del self._displaced[next(iter(self._displaced))]
+            answer = self._give(holder, HUMAN, TTL_S, "taken", reason)
+        # Before the answer: whoever took control must not meet the last write of the one who lost it.
+        self._halt(f"control taken by {holder}: {reason}")
+        return answer
+
+    def admit(self, verb: str, caller: object, lease_id: str) -> Admission:
+        """Admit a motion of the holder, or hold a free robot for it.
+
+        Raises:
+            NotHolderError: another holds the robot, or the lease is over.
+        """
+        self._settle()
+        with self._changing:
+            if lease_id:
+                self._used(verb, lease_id)
+                return Admission()
+            holder, lease = _name(caller), self._lease
+            if lease is None:
+                # Known by its name alone; without a lease_id nobody can renew it.
+                self._lease = Lease(holder, AGENT, secrets.token_hex(16))
+            elif lease.until is not None or lease.holder != holder:
+                raise self._not_holder(verb, lease)
+            return Admission(self._starting)
+
+    def refuse_others(self, verb: str, caller: object, lease_id: str) -> None:
+        """Refuse a motion of the whole world, unless it is the holder's.
+
+        Raises:
+            NotHolderError: another holds the robot.
+        """
+        self._settle()
+        with self._changing:
+            lease = self._lease
+            own = lease is None or _is(lease, lease_id) or (lease.until is None and lease.holder == _name(caller))
+            if lease is not None and not own:
+                raise self._not_holder(verb, lease)
+
+    def expire(self) -> None:
+        """End a lease whose time is over, and halt what its holder began."""
+        with self._changing:
+            lease = self._lease
+            if lease is None or lease.until is None or self._clock() < lease.until:
+                return
+            self._lease = None
+        logger.warning("%s: the control lease of %s is over; what it moved is halted.", self._robot, lease.holder)
+        self._halt(f"the control lease of {lease.holder} is over")
+        self._tell("expired", lease)
+
+    def _settle(self) -> None:
+        """End a lease that is over, by its time or with its motion."""
+        self.expire()
+        lease = self._lease
+        if lease is None or lease.until is not None or self._starting or self._moving():
+            return
+        with self._changing:
+            if self._lease is lease and not self._starting:
+                self._lease = None
+
+    def _give(self, holder: str, kind: str, ttl_s: float, event: str, reason: str = "") -> Envelope:
+        lease = self._lease = Lease(holder, kind, secrets.token_hex(16), ttl_s, self._clock() + ttl_s)
+        self.epoch += 1
+        self._watched(self)
+        self._tell(event, lease, reason)
+        return success(
+            f"{holder} holds control for {ttl_s:g} s; give lease_id with every motion, each one renews it.",
+            lease_id=lease.lease_id,
+            epoch=self.epoch,
+            kind=kind,
+            expires_in_s=ttl_s,
+        )
+
+    def _used(self, verb: str, lease_id: str) -> Lease:
+        lease = self._lease
+        if lease is not None and _is(lease, lease_id):
+            if lease.ttl_s is not None:
+                lease = self._lease = replace(lease, until=self._clock() + lease.ttl_s)
+            return lease
+        taker = self._displaced.get(lease_id)
+        if taker is not None:
+            text = f"{verb} is refused: {taker} has taken control. Acquire it anew when it is free."
+            raise NotHolderError(text, "displaced", holder=taker)
+        if lease is not None:
+            raise self._not_holder(verb, lease)
+        raise NotHolderError(f"{verb} is refused: this lease is over. Acquire control anew.", "lease_over")
+
+    def _not_holder(self, verb: str, lease: Lease) -> NotHolderError:
+        left = lease.left(self._clock())
+        until = "until its motion ends" if left is None else f"for {left:.1f} s more"
+        return NotHolderError(
+            f"{verb} is refused: {lease.holder} ({lease.kind}) holds control {until}.",
+            "not_holder",
+            holder=lease.holder,
+            kind=lease.kind,
+            expires_in_s=left,
+        )
+
+    def _unproven(self, robot: str, assertion: object) -> str | None:
+        keys = self._keys()
+        if not keys:
+            if not self._hardware:
+                return None
+            return "no operator's key is configured here (STRANDS_MESH_RESUME_PUBLIC_KEY; strands-robots keys resume)"
+        if not isinstance(assertion, Mapping) or set(assertion) != TAKE_FIELDS:
+            return f"assertion must have exactly the fields {', '.join(sorted(TAKE_FIELDS))}"
+        body = {name: value for name, value in assertion.items() if name != "sig"}
+        signature = ed25519.decode(assertion["sig"], 64)
+        try:
+            signed = signature is not None and ed25519.signed_by_one_of(keys, signature, ed25519.canonical(body))
+        except (ValueError, TypeError, RecursionError):
+            signed = False
+        if not signed:
+            return "no configured key made the signature"
+        if (body["v"], body["purpose"], body["robot"]) != (VERSION, PURPOSE, robot):
+            return f"the assertion is for something else than taking control of {robot}"
+        if body["epoch"] != self.epoch or isinstance(body["epoch"], bool):
+            return f"the assertion names epoch {shown(body['epoch'])}, and the lease has epoch {self.epoch}"
+        return self._stale(body["t"], body["nonce"])
+
+    def _stale(self, at: object, nonce: object) -> str | None:
+        if isinstance(at, bool) or not isinstance(at, int | float) or not -NEWEST_S < self._wall() - at < OLDEST_S:
+            return "the assertion is not fresh"
+        now = self._clock()
+        self._nonces = {key: used for key, used in self._nonces.items() if now - used <= OLDEST_S + NEWEST_S}
+        if not isinstance(nonce, str) or nonce in self._nonces or len(self._nonces) >= NONCES_MAX:
+            return "the assertion was used before"
+        self._nonces[nonce] = now
+        return None
+
+    def _tell(self, event: str, lease: Lease, reason: str = "") -> None:
+        change = ControlChange(event, self._robot, lease.holder, lease.kind, self.epoch, reason)
+        for observer in self._observers:
+            try:
+                observer(change)
+            except Exception:
+                logger.exception("An observer of the control lease failed.")
+
+
+class ControlLeases:
+    """The leases of one robot, one for each robot of a world.
+
+    They keep no robot alive: they refer to what its networks serve, as long as that lives.
+    """
+
+    def __init__(self) -> None:
+        self._hardware = False
+        self._served: list[weakref.ref[Robot]] = []
+        self._by_name: dict[str, ControlLease] = {}
+        self._changing = threading.Lock()
+        self._observers: tuple[OnChange, ...] = ()
+
+    def only(self, name: str) -> ControlLeases:
+        """Return the same leases, for a network peer that is one robot of the world."""
+        return _OneOf(self, name)
+
+    def serve(self, robot: Robot, *, hardware: bool) -> None:
+        """Add the robot as one of its networks serves it."""
+        with self._changing:
+            self._hardware = self._hardware or hardware
+            self._served = [*(each for each in self._served if each() is not None), weakref.ref(robot)]
+
+    def observe(self, observer: OnChange) -> Callable[[], None]:
+        """Tell ``observer`` of every change of a holder; return what ends that."""
+        with self._changing:
+            self._observers = (*self._observers, observer)
+
+        def end() -> None:
+            with self._changing:
+                self._observers = tuple(each for each in self._observers if each is not observer)
+
+        return end
+
+    def of(self, name: str = "") -> ControlLease:
+        """Return the lease of the robot, or of the named robot of the world."""
+        robot = self._robot()
+        if not isinstance(robot, WorldRobot):
+            name = ""
+        elif not name:
+            name = next(iter(robot.list_robots()), "")
+        with self._changing:
+            lease = self._by_name.get(name)
+            if lease is None:
+                shown_as = name or ("" if robot is None else robot.tool_name_str)
+                lease = self._by_name[name] = ControlLease(
+                    shown_as,
+                    lambda reason: self._halt(name, reason),
+                    lambda: self._moves(name),
+                    hardware=self._hardware,
+                )
+                lease.observe(self._tell)
+        return lease
+
+    def admit(self, command: str, caller: object, lease_id: str, name: str | None) -> Admission:
+        """Admit a motion of the named robot; with None of all robots of the world.
+
+        Raises:
+            NotHolderError: another holds the robot, or the lease is over.
+        """
+        if name is not None or not isinstance(self._robot(), WorldRobot):
+            return self.of(name or "").admit(command, caller, lease_id)
+        for each in tuple(self._by_name.values()):
+            each.refuse_others(command, caller, lease_id)
+        return Admission()
+
+    def facts(self) -> dict[str, Any]:
+        """Return the holder of the robot; by name for the robots of a world."""
+        robot = self._robot()
+        if not isinstance(robot, WorldRobot) or len(robot.list_robots()) < 2:
+            return self.of().facts()
+        return {name: self.of(name).facts() for name in robot.list_robots()}
+
+    def _robot(self) -> Robot | None:
+        return next((robot for each in self._served if (robot := each()) is not None), None)
+
+    def _moves(self, name: str) -> bool:
+        robot = self._robot()
+        if isinstance(robot, WorldRobot):
+            return any(row.get("robot") == name for row in robot.list_policies_running())
+        return robot is not None and str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
+
+    def _halt(self, name: str, reason: str) -> None:
+        robot = self._robot()
+        if isinstance(robot, WorldRobot):
+            robot.stop_policy(name)
+        elif robot is not None:
+            stop_executor().halt(robot, robot.tool_name_str, reason)
+
+    def _tell(self, change: ControlChange) -> None:
+        for observer in self._observers:
+            observer(change)
+
+
+_LEASES: WeakKeyDictionary[Any, ControlLeases] = WeakKeyDictionary()
+
+
+def leases_of(robot: Robot, *, hardware: bool) -> ControlLeases:
+    """Return the leases of a robot, the same on every network that serves it."""
+    body = body_of(robot)
+    try:
+        leases = _LEASES.setdefault(body, ControlLeases())
+        leases.serve(robot, hardware=hardware)
+    except TypeError:  # no weak reference to it, or no hash
+        leases = _Strong(robot, hardware=hardware)
+    return leases
+
+
+class _OneOf(ControlLeases):
+    """The leases of a world as one of its robots has them."""
+
+    def __init__(self, world: ControlLeases, name: str) -> None:
+        super().__init__()
+        self._world = world
+        self._name = name
+
+    def of(self, name: str = "") -> ControlLease:
+        """Return the lease of this robot."""
+        return self._world.of(self._name)
+
+    def admit(self, command: str, caller: object, lease_id: str, name: str | None) -> Admission:
+        """Admit a motion of this robot."""
+        return self._world.admit(command, caller, lease_id, self._name)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the holder of this robot."""
+        return self.of().facts()
+
+
+class _Strong(ControlLeases):
+    """Leases of a robot without weak references; they live with its pipeline."""
+
+    def __init__(self, robot: Robot, *, hardware: bool) -> None:
+        super().__init__()
+        self._hardware = hardware
+        self._kept = robot
+
+    def _robot(self) -> Robot | None:
+        return self._kept
+
+
+def _name(caller: object) -> str:
+    return caller_name(caller) or ANONYMOUS
+
+
+def _is(lease: Lease, lease_id: str) -> bool:
+    return bool(lease_id) and hmac.compare_digest(lease.lease_id.encode(), lease_id.encode())

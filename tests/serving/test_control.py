@@ -1,0 +1,293 @@
+"""The control lease: who holds a robot, and what it admits."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.toy_robots import ToyRobot, ToyWorld
+from fixtures.waiting import eventually
+
+from strands_robots.safety import ed25519
+from strands_robots.serving.control import (
+    PURPOSE,
+    VERSION,
+    ControlChange,
+    ControlLease,
+    NotHolderError,
+    leases_of,
+    sign_take,
+)
+from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Result
+from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+
+KEY = Ed25519PrivateKey.generate()
+PUBLIC = ed25519.public_half(KEY)
+
+
+class Clock:
+    """A clock that the test turns."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Body:
+    """A robot that moves or not, and remembers why it was halted."""
+
+    def __init__(self) -> None:
+        self.moves = False
+        self.halts: list[str] = []
+
+    def halt(self, reason: str) -> None:
+        self.moves = False
+        self.halts.append(reason)
+
+
+class Bench:
+    """One lease with a body, a clock and the changes that it told."""
+
+    def __init__(self, *, hardware: bool = True, keys: tuple[bytes, ...] = (PUBLIC,)) -> None:
+        self.body, self.clock = Body(), Clock()
+        self.changes: list[ControlChange] = []
+        self.lease = ControlLease(
+            "arm-1",
+            self.body.halt,
+            lambda: self.body.moves,
+            hardware=hardware,
+            keys=lambda: keys,
+            clock=self.clock,
+            wall=self.clock,
+            watched=lambda lease: None,
+        )
+        self.lease.observe(self.changes.append)
+
+    def acquire(self, who: str = "agent-a", ttl_s: float = 60.0, kind: str = "agent") -> str:
+        return str(self.lease.acquire(who, kind, ttl_s)["lease_id"])
+
+    def take(self, who: str = "ann", **changed: Any) -> dict[str, Any]:
+        """Take control with an assertion in which some fields were changed before it was signed."""
+        body = {name: v for name, v in self.assertion().items() if name != "sig"} | changed
+        signed = {**body, "sig": ed25519.encode(KEY.sign(ed25519.canonical(body)))}
+        return self.lease.take(who, "because", "arm-1", signed)
+
+    def assertion(self) -> dict[str, Any]:
+        return sign_take(KEY, "arm-1", self.lease.epoch, clock=self.clock)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def refused(bench: Bench, who: str, lease_id: str = "") -> dict[str, Any]:
+    with pytest.raises(NotHolderError) as refusal:
+        bench.lease.admit("moveTo", who, lease_id)
+    return refusal.value.envelope
+
+
+def test_holder_moves_and_another_is_refused_with_holder_and_seconds(bench: Bench) -> None:
+    held = bench.acquire(ttl_s=60.0)
+    bench.lease.admit("moveTo", "agent-a", held).close()
+    bench.clock.now += 20.0
+    answer = refused(bench, "agent-b")
+    assert (answer["code"], answer["holder"], answer["expires_in_s"]) == ("not_holder", "agent-a", 40.0)
+    assert "agent-a" in answer["content"][0]["text"]
+
+
+def test_name_of_the_holder_without_its_lease_id_is_refused(bench: Bench) -> None:
+    bench.acquire("agent-a")
+    assert refused(bench, "agent-a")["code"] == "not_holder"
+
+
+def test_each_motion_renews_the_lease(bench: Bench) -> None:
+    held = bench.acquire(ttl_s=60.0)
+    for _ in range(5):
+        bench.clock.now += 50.0
+        bench.lease.admit("moveTo", "agent-a", held).close()
+    assert bench.lease.facts()["expires_in_s"] == 60.0
+
+
+def test_silent_holder_is_halted_and_the_robot_is_free(bench: Bench) -> None:
+    bench.acquire(ttl_s=2.0)
+    bench.body.moves = True
+    bench.clock.now += 2.0
+    bench.lease.expire()
+    assert bench.body.halts == ["the control lease of agent-a is over"]
+    assert bench.lease.facts()["held"] is False
+    assert [each.event for each in bench.changes] == ["acquired", "expired"]
+
+
+def test_lease_that_is_over_admits_nothing(bench: Bench) -> None:
+    held = bench.acquire(ttl_s=2.0)
+    bench.clock.now += 3.0
+    assert refused(bench, "agent-a", held)["code"] == "lease_over"
+
+
+def test_released_robot_is_free_for_others(bench: Bench) -> None:
+    held = bench.acquire()
+    bench.lease.release(held)
+    assert bench.body.halts == []
+    bench.acquire("agent-b")
+
+
+def test_motion_on_a_free_robot_holds_it_until_it_has_ended(bench: Bench) -> None:
+    admission = bench.lease.admit("moveTo", "agent-a", "")
+    assert refused(bench, "agent-b")["expires_in_s"] is None
+    bench.body.moves = True
+    admission.close()
+    assert refused(bench, "agent-b")["holder"] == "agent-a"
+    bench.lease.admit("moveTo", "agent-a", "").close()
+    bench.body.moves = False
+    bench.lease.admit("moveTo", "agent-b", "").close()
+
+
+def test_motion_that_was_refused_leaves_the_robot_free(bench: Bench) -> None:
+    bench.lease.admit("moveTo", "agent-a", "").close()
+    bench.acquire("agent-b")
+
+
+def test_human_takes_control_and_the_motion_is_halted_before_the_answer(bench: Bench) -> None:
+    held = bench.acquire()
+    bench.body.moves = True
+    answer = bench.take()
+    assert answer["status"] == "success"
+    assert bench.body.halts == ["control taken by ann: because"]
+    displaced = refused(bench, "agent-a", held)
+    assert (displaced["code"], displaced["holder"]) == ("displaced", "ann")
+    bench.lease.admit("moveTo", "ann", answer["lease_id"]).close()
+    assert bench.changes[-1] == ControlChange("taken", "arm-1", "ann", "human", 2, "because")
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"robot": "arm-2"}, "something else than taking control of arm-1"),
+        ({"purpose": "resume"}, "something else"),
+        ({"v": 2}, "something else"),
+        ({"epoch": 7}, "names epoch 7, and the lease has epoch 1"),
+        ({"t": 0.0}, "not fresh"),
+        ({"t": True}, "not fresh"),
+        ({"t": 1e9}, "not fresh"),
+        ({"nonce": 3}, "used before"),
+    ],
+)
+def test_assertion_for_something_else_takes_nothing(bench: Bench, changed: dict[str, Any], why: str) -> None:
+    held = bench.acquire()
+    answer = bench.take(**changed)
+    assert answer["status"] == "error"
+    assert why in answer["content"][0]["text"]
+    bench.lease.admit("moveTo", "agent-a", held).close()
+    assert bench.body.halts == []
+
+
+@pytest.mark.parametrize("assertion", [None, {}, {"v": VERSION}, "x", {"sig": None, "purpose": PURPOSE}])
+def test_unsigned_takeover_is_refused(bench: Bench, assertion: object) -> None:
+    bench.acquire()
+    assert bench.lease.take("mallory", "because", "arm-1", assertion)["code"] == "not_proven"
+
+
+def test_assertion_of_another_key_is_refused(bench: Bench) -> None:
+    forged = sign_take(Ed25519PrivateKey.generate(), "arm-1", 0, clock=bench.clock)
+    assert bench.lease.take("mallory", "because", "arm-1", forged)["code"] == "not_proven"
+
+
+def test_assertion_is_good_once(bench: Bench) -> None:
+    bench.acquire()
+    signed = bench.assertion()
+    assert bench.lease.take("ann", "because", "arm-1", signed)["status"] == "success"
+    assert bench.lease.take("mallory", "because", "arm-1", signed)["status"] == "error"
+
+
+def test_hardware_without_a_key_cannot_be_taken_and_a_simulation_can() -> None:
+    real, simulated = Bench(keys=()), Bench(hardware=False, keys=())
+    assert real.lease.take("ann", "because", "arm-1", None)["status"] == "error"
+    assert simulated.lease.take("ann", "because", "arm-1", None)["status"] == "success"
+
+
+def test_lease_ends_in_time_without_a_call() -> None:
+    halted = threading.Event()
+    lease = ControlLease("arm-1", lambda reason: halted.set(), lambda: False)
+    lease.acquire("agent-a", "agent", 0.05)
+    assert halted.wait(10.0)
+    eventually(lambda: not any(each.name == "control-leases" for each in threading.enumerate()))
+
+
+@pytest.fixture
+def robot() -> Iterator[ToyRobot]:
+    toy = ToyRobot()
+    yield toy
+    toy.close()
+
+
+def pipeline(robot: Any, name: str = "arm-1") -> Pipeline:
+    return Pipeline.of(robot, lambda: name, hardware=False, authorize=lambda command, arguments: None)
+
+
+def served(line: Pipeline, caller: str, name: str, **arguments: Any) -> Result:
+    results: list[Result] = []
+    verbs = {**ARM_VERBS, **WORLD_VERBS} if isinstance(line.robot, ToyWorld) else ARM_VERBS
+    line.serve(Command(verbs[name], arguments, caller, line.pending.arrive()), results.append)
+    return results[0]
+
+
+def test_lease_holds_on_every_network_of_the_robot(robot: ToyRobot) -> None:
+    device, peer = pipeline(robot), pipeline(robot, "peer-1")
+    lease_id = served(device, "agent-a", "acquireControl").result["lease_id"]
+    result = served(peer, "agent-b", "execute", instruction="wave")
+    assert result.refusal is not None
+    assert result.refusal.why is RefusalReason.CONTROL
+    assert result.result["holder"] == "agent-a"
+    assert served(peer, "agent-a", "execute", instruction="wave", lease_id=lease_id).result["status"] == "success"
+
+
+def test_stop_and_reads_need_no_lease(robot: ToyRobot) -> None:
+    line = pipeline(robot)
+    served(line, "agent-a", "acquireControl")
+    for verb in ("getStatus", "getFeatures", "getControl"):
+        assert served(line, "agent-b", verb).result["status"] == "success"
+    assert not any(verb.leased for verb in ARM_VERBS.values() if verb.name in ("stop", "releaseTorque", "getState"))
+
+
+def test_take_control_stops_the_rollout_of_the_holder(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", ed25519.encode(PUBLIC))
+    line = pipeline(robot)
+    lease_id = served(line, "agent-a", "acquireControl").result["lease_id"]
+    served(line, "agent-a", "execute", instruction="wave", duration=300.0, lease_id=lease_id)
+    epoch = served(line, "ann", "getControl").result["epoch"]
+    answer = served(line, "ann", "takeControl", reason="wrong cup", assertion=sign_take(KEY, "arm-1", epoch)).result
+    assert answer["status"] == "success"
+    assert not robot.rollouts["toy"].running
+
+
+def test_robots_of_a_world_are_held_one_by_one() -> None:
+    world = ToyWorld()
+    try:
+        line = pipeline(world)
+        served(line, "agent-a", "acquireControl", robot_name="left")
+        refusal = served(line, "agent-b", "execute", instruction="wave", robot_name="left").refusal
+        assert refusal is not None
+        assert served(line, "agent-b", "execute", instruction="wave", robot_name="right").refusal is None
+        reset = served(line, "agent-b", "reset")
+        assert reset.refusal is not None
+    finally:
+        world.close()
+
+
+def test_leases_of_a_robot_that_is_gone_are_gone() -> None:
+    robot = ToyRobot()
+    leases = leases_of(robot, hardware=False)
+    assert leases_of(robot, hardware=False) is leases
+    robot.close()
+    assert leases_of(ToyRobot(), hardware=False) is not leases
+
+
+def test_every_verb_of_the_lease_says_what_it_returns() -> None:
+    assert all(verb.returns for verb in CONTROL_VERBS.values())
