@@ -5,7 +5,9 @@ from pathlib import Path
 
 from tests.cli.conftest import Run
 
-from strands_robots.audit import flush_audit, log_safety_event
+from strands_robots.audit import audit_head, flush_audit, log_safety_event
+from strands_robots.audit.journal import AuditEntry, Journal
+from strands_robots.audit.witness import WITNESS
 
 EPOCH = "0123456789abcdef0123456789abcdef"
 
@@ -53,3 +55,19 @@ def test_changed_record_fails_verification(run: Run, state_directory: Path) -> N
     result = run("audit", "verify", "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["broken"] == 1
+
+
+def test_audit_is_compared_with_the_files_of_other_machines(run: Run, tmp_path: Path) -> None:
+    record()
+    head = audit_head()
+    assert head is not None
+    files = []
+    for name, seen in (("same", head), ("later", {**head, "count": 9, "last": "c" * 64})):
+        other = Journal(tmp_path / name)
+        other.append([AuditEntry(0.0, WITNESS, "arm-1", {**seen, "witness": "safety-1", "signed": True})])
+        files.append(str(other.path))
+    assert run("audit", "verify", "--with", files[0]).exit_code == 0
+    result = run("audit", "verify", "--with", files[0], "--with", files[1])
+    assert result.exit_code == 1
+    assert "record 9" in result.output
+    assert run("audit", "verify", "--with", str(tmp_path / "absent")).exit_code == 1

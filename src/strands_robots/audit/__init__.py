@@ -16,13 +16,15 @@ import stat
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.audit.head import log_id
+from strands_robots.audit.head import Anchor, log_id
 from strands_robots.audit.journal import NAME, AuditEntry, Journal
 from strands_robots.audit.lasting import LastingRecords, identity, lasting_journal, rotated_out, verify_both
+from strands_robots.audit.witness import WITNESS, compare, stated_head, witnessed
 from strands_robots.safety.approval import state_dir
 from strands_robots.utils import shown
 
@@ -67,6 +69,28 @@ def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
     newer = list(main.records())
     records = [*rotated_out(kept.records(), newer), *newer]
     return [each for each in records if since is None or _time(each) >= since]
+
+
+def audit_head() -> dict[str, Any] | None:
+    """Return the last record that this process wrote, for a witness; never waits."""
+    return stated_head(_WRITER.last)
+
+
+def log_witness(witness: str, robot_id: str, head: object, *, signed: bool) -> None:
+    """Record the head of another machine's audit, from a verdict of ``robot_id``."""
+    known, own = witnessed(head), _WRITER.last
+    if known is not None and (own is None or known.log != own.log):
+        facts = {"log": known.log, "count": known.count, "last": known.last}
+        log_safety_event(WITNESS, robot_id, {**facts, "witness": witness, "signed": signed})
+
+
+def compare_with_witnesses(files: Sequence[Path]) -> tuple[int, list[dict[str, Any]]]:
+    """Compare the audit with those of other machines.
+
+    Returns the number of their records about it, and what it no longer has.
+    """
+    flush_audit(FLUSH_S)
+    return compare(_journals(_journal_key())[0], files)
 
 
 def verify_audit_integrity() -> dict[str, Any]:
@@ -116,7 +140,12 @@ class _Pending:
         self.entries: deque[AuditEntry] = deque()
         self.waiting: list[threading.Event] = []
         self.failing = False
+        self.last: Anchor | None = None
         self._reported = 0
+
+    def _last(self) -> Anchor | None:
+        head = self.journal.written
+        return None if head is None else Anchor(head.log, head.count, head.last)
 
     def write(self) -> None:
         """Put everything on the disk, or keep it and say so."""
@@ -126,6 +155,7 @@ class _Pending:
             if batch:
                 self._lasting.write(batch)
                 self.journal.append(batch)
+                self.last = self._last()
         except Exception as exc:  # noqa: BLE001 - whatever stops the record is reported, and the record is kept
             self._complain(exc)
             return
@@ -169,6 +199,7 @@ class _Writer:
         self._pending: dict[_Key, _Pending] = {}
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
+        self.last: Anchor | None = None
 
     def put(self, key: _Key, item: AuditEntry | threading.Event) -> None:
         """Hand over a record, or an event to set when all before it are on the disk."""
@@ -191,6 +222,7 @@ class _Writer:
             for pending in self._pending.values():
                 if pending.entries or pending.waiting:
                     pending.write()
+                    self.last = pending.last or self.last
 
     def _take(self) -> None:
         unwritten = any(pending.entries for pending in self._pending.values())

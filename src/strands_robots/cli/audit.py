@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 
-from strands_robots.audit import audit_directory, read_audit_log, verify_audit_integrity
+from strands_robots.audit import (
+    audit_directory,
+    compare_with_witnesses,
+    read_audit_log,
+    verify_audit_integrity,
+)
 from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Screen, plain, table
 from strands_robots.safety.lockout import utc
@@ -76,9 +82,19 @@ def show(
             screen.say(f"  {plain(name)}: {plain(value, 2000)}")
 
 
-def verify(screen: Screen) -> None:
+def verify(
+    screen: Screen,
+    *,
+    witnesses: Annotated[
+        list[Path] | None, typer.Option("--with", help="An audit file of another machine, such as a controller's.")
+    ] = None,
+) -> None:
     """Check the chain, the numbers and the signatures. Exits with 1 when the record was cut or changed."""
     found = _readable(verify_audit_integrity)
+    if witnesses:
+        seen, gone = _readable(lambda: compare_with_witnesses(witnesses))
+        found |= {"witnesses": seen, "breaks": [*found["breaks"], *gone], "ok": found["ok"] and not gone}
+        screen.say(f"{seen} records of other machines are about this audit.")
     counts = ("total", "signed", "verified", "bad", "missing", "gaps", "broken", "torn", "tampered")
     screen.say(str(audit_directory()))
     screen.show(table("", ("what", "count"), ((name, found[name]) for name in counts)))

@@ -16,12 +16,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from strands_robots.audit import log_witness
 from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
 from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, RenewableLink, StopLink, notification
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import REASON_MAX, new_epoch, signed_bytes
-from strands_robots.safety.statements import Purpose
+from strands_robots.safety.statements import Proof, Purpose
 from strands_robots.utils import ValidationError, device_id, number
 
 logger = logging.getLogger(__name__)
@@ -315,6 +316,11 @@ class SafetyController:
             logger.critical("NO ANSWER to emergency stop %s from: %s", run.estop_id, ", ".join(report.silent))
         if not report.link:
             logger.critical("Emergency stop %s never left: the link of %s is down.", run.estop_id, self.controller_id)
+        for name, each in answers.items():
+            signed = each.proof is Proof.SIGNED
+            # A flood in invented names must not fill the audit.
+            if signed or name in run.expected:
+                log_witness(self.controller_id, name, each.facts.get("audit"), signed=signed)
         return report
 
     def _receive(self, event: str, source: str, payload: bytes) -> None:

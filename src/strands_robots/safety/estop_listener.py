@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import audit_head, log_safety_event
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import RobotReport, StopOrder, StopRefused, StopRules, params_of
@@ -443,7 +443,7 @@ class EstopListener:
         halted_now = report.received_at is not None and not report.repeated
         payload = None if halted_now else self._repeated.get(same)
         if payload is None:
-            fields = {**report.fields(), "device_id": device_id}
+            fields = {**report.fields(), "device_id": device_id, "audit": audit_head()}
             payload = notification(VERDICT, signed(identity, Purpose.STOP_VERDICT, device_id, fields))
             if not halted_now:
                 self._repeated[same] = payload
