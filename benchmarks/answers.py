@@ -79,20 +79,20 @@ def _attacked(name: str, link: LinkConfig, folder: Path, stops: int, stranger: S
 
 
 def _cost(identity: SigningIdentity) -> Row:
-    """Time of signing one verdict and of checking it, as a stop does both once for each robot."""
+    """Computing time of signing one verdict and of checking it, once each for a robot in a stop."""
     fields = RobotReport("arm-1", new_epoch(), StopVerdict(halted=("policy",)), (new_epoch(),), 1.25).fields()
     signing, checking = list[float](), list[float]()
     for _ in range(SIGNATURES):
-        began = time.perf_counter()
+        began = time.thread_time()
         statement = signed(identity, Purpose.STOP_VERDICT, "arm-1", fields)
-        between = time.perf_counter()
+        between = time.thread_time()
         assert proof_of(Purpose.STOP_VERDICT, "arm-1", statement, identity.public) is Proof.SIGNED
         signing.append(between - began)
-        checking.append(time.perf_counter() - between)
+        checking.append(time.thread_time() - between)
     both = sorted(one + other for one, other in zip(signing, checking, strict=True))
     worst = both[int(0.99 * len(both))]
     text = (
         f"signing p50 {statistics.median(signing) * 1e3:.3f}, checking p50 {statistics.median(checking) * 1e3:.3f}, "
         f"both p99 {worst * 1e3:.3f} ms"
     )
-    return Row("a verdict signed and checked", text, "", None, "p99 ≤ 1 ms", worst <= 1e-3)
+    return Row("a verdict signed and checked, computing time", text, "", None, "p99 ≤ 1 ms", worst <= 1e-3)
