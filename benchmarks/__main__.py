@@ -28,6 +28,7 @@ PARTS = {
     "reach": "Arms that reach and grasp",
     "safety": "From the controller's call to the last write",
     "answers": "Strangers that answer for a robot",
+    "attacks": "Attacks on the way of a stop",
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",
     "recording": "Recording where robots are served",

@@ -1,0 +1,88 @@
+"""Attacks on the way of a stop: floods of forged and of fresh stops, and what the true one takes meanwhile."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.nats_server import NatsServer
+from fixtures.plane_process import planned
+from fixtures.stop_controller import controller
+from fixtures.waiting import eventually, free_port
+
+from benchmarks.safety import Figures, Fleet, Hiccups, row
+from benchmarks.table import Row
+from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.safety import ed25519
+
+STOPS, STOPS_QUICK = 500, 20
+FLOOD_S, FLOOD_QUICK_S = 60.0, 10.0
+EVERY_S = 0.5
+"""From one true stop to the next in a flood whose memory is watched."""
+
+OTHERS = [f"safety-{number}" for number in range(2, 2002)]
+ARMS = ["arm-1", "arm-2"]
+
+
+def run(quick: bool = False) -> list[Row]:
+    """Measure and give the rows of the table."""
+    stops, seconds = (STOPS_QUICK, FLOOD_QUICK_S) if quick else (STOPS, FLOOD_S)
+    rows: list[Row] = []
+    with Hiccups() as machine, NatsServer() as server:
+        for transport, url, name in (("zenoh", "", "Zenoh D2D"), ("nats", server.url, "NATS")):
+            rows.append(_forged(transport, url, f"{name}: forged signatures under 2,000 names", OTHERS, stops, 0.1))
+            rows.append(_forged(transport, url, f"{name}: those under the controller's name", ["safety-1"], stops, 0.5))
+            rows.append(_flooded(transport, url, name, seconds))
+    return [*rows, machine.row()]
+
+
+def _forged(transport: str, url: str, what: str, names: Sequence[str], stops: int, bound_s: float) -> Row:
+    key = Ed25519PrivateKey.generate()
+    settings = {
+        "DEVICE_CONNECT_ESTOP_ALLOW": "safety-*",
+        "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS": ed25519.encode(ed25519.public_half(key)),
+    }
+    with Fleet("ours", transport, url, 1, 1, settings, key.private_bytes_raw().hex()) as fleet:
+        due = [0.0]
+
+        def arrange() -> None:
+            if fleet.forger is not None and time.monotonic() >= due[0]:
+                fleet.forger.ask("forge", list(names), 10_000.0, 5.0)
+                due[0] = time.monotonic() + 4.9
+
+        figures = fleet.stops(stops, arrange)
+    return row(f"{what}, 10,000 a second, beside the signed one", figures, None, bound_s)
+
+
+def _flooded(transport: str, url: str, name: str, seconds: float) -> Row:
+    """True stops, and the memory of the robots' process, in a flood of unsigned stops with fresh ids."""
+    nats = LinkConfig(transport="nats", connect=(url,)) if transport == "nats" else None
+    link = nats or loopback_config(free_port())
+    with ExitStack() as stack:
+        state = stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-attacks-"))
+        Path(state).chmod(0o700)
+        robots = stack.enter_context(planned(ARMS, link, STRANDS_STATE_DIR=state))
+        hand, flooder = (stack.enter_context(controller(link, each)) for each in ("safety-1", "flooder"))
+        eventually(lambda: hand.ask("stop", ARMS, 5.0)["ok"], 30, "the first stop")
+        before = robots.ask("memory_mb")
+        flooder.ask("flood", 1, 4000.0, seconds)
+        took: list[float | None] = []
+        end = time.monotonic() + seconds
+        while (began := time.monotonic()) < end:
+            report = hand.ask("stop", ARMS, 5.0)
+            took.append(report["elapsed_ms"] / 1e3 if report["ok"] else None)
+            time.sleep(max(0.0, began + EVERY_S - time.monotonic()))
+        sent, after = flooder.ask("flooded"), robots.ask("memory_mb")
+    figures = Figures(took)
+    return Row(
+        f"{name}: {sent / seconds:.0f} stops a second with fresh ids for {seconds:.0f} s: the answers of two robots",
+        f"{figures.text()}; memory {before:.0f} to {after:.0f} MB",
+        "",
+        None,
+        "every true stop answered; memory + 20 % at most",
+        not figures.lost and after <= 1.2 * before,
+    )
