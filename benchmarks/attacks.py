@@ -12,11 +12,12 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.nats_server import NatsServer
 from fixtures.plane_process import planned
 from fixtures.stop_controller import controller
-from fixtures.waiting import eventually, free_port
+from fixtures.waiting import eventually
+from fixtures.zenoh_router import ZenohRouter
 
 from benchmarks.safety import Figures, Fleet, Hiccups, row
 from benchmarks.table import Row
-from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety import ed25519
 
 STOPS, STOPS_QUICK = 500, 20
@@ -33,7 +34,7 @@ def run(quick: bool = False) -> list[Row]:
     stops, seconds = (STOPS_QUICK, FLOOD_QUICK_S) if quick else (STOPS, FLOOD_S)
     rows: list[Row] = []
     with Hiccups() as machine, NatsServer() as server:
-        for transport, url, name in (("zenoh", "", "Zenoh D2D"), ("nats", server.url, "NATS")):
+        for transport, url, name in (("zenoh", "", "Zenoh"), ("nats", server.url, "NATS")):
             rows.append(_forged(transport, url, f"{name}: forged signatures under 2,000 names", OTHERS, stops, 0.1))
             rows.append(_forged(transport, url, f"{name}: those under the controller's name", ["safety-1"], stops, 0.5))
             rows.append(_flooded(transport, url, name, seconds))
@@ -60,9 +61,11 @@ def _forged(transport: str, url: str, what: str, names: Sequence[str], stops: in
 
 def _flooded(transport: str, url: str, name: str, seconds: float) -> Row:
     """True stops, and the memory of the robots' process, in a flood of unsigned stops with fresh ids."""
-    nats = LinkConfig(transport="nats", connect=(url,)) if transport == "nats" else None
-    link = nats or loopback_config(free_port())
     with ExitStack() as stack:
+        if transport == "nats":
+            link = LinkConfig(transport="nats", connect=(url,))
+        else:
+            link = LinkConfig(connect=(stack.enter_context(ZenohRouter()).endpoint,), mode="client")
         state = stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-attacks-"))
         Path(state).chmod(0o700)
         robots = stack.enter_context(planned(ARMS, link, STRANDS_STATE_DIR=state))

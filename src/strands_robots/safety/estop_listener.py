@@ -47,6 +47,9 @@ BUCKET_CAPACITY = 16
 VOUCHED_MAX = 16
 """Sources with a share of their own in the queue: the first that signed validly."""
 
+REFUSED_PAUSE_S = 0.0005
+"""Seconds that the listener rests after a refused stop of a source that has not signed validly."""
+
 LATCH_ANSWERS_PER_S = 200
 LATCH_ANSWERS_REMEMBERED = 4096
 
@@ -126,6 +129,10 @@ class FairQueue:
             bucket: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY)
             self._turns = (*self._turns, bucket)
             self._vouched[source] = bucket
+
+    def vouched_for(self, source: str) -> bool:
+        """Return True when this source has a bucket of its own."""
+        return source in self._vouched
 
     def put(self, event: str, source: str, payload: bytes, *, urgent: bool = True) -> None:
         """Add an event; one that is not urgent is served last or dropped."""
@@ -396,6 +403,9 @@ class EstopListener:
                 order = self._rules.order_of(received.source, received.payload, received.at)
                 if isinstance(order, StopRefused):
                     self._refusals.record(order, received.event)
+                    if not events.vouched_for(received.source):
+                        # In a flood the link's thread needs the interpreter to receive what comes behind it.
+                        time.sleep(REFUSED_PAUSE_S)
                 else:
                     self._plane.begin(order, self._answer)
                     if self._rules.signed:
