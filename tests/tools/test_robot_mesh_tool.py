@@ -178,13 +178,17 @@ class TimedMesh:
         self.now, self.arrivals, self.silent = 0.0, arrivals, silent
         self.peer_id, self.lockout_epoch, self.alive = "tool", "e" * 32, True
         self.stops: list[float] = []
+        self.ids: set[str] = set()
 
     @property
     def peers(self) -> list[dict[str, Any]]:
         return [{"peer_id": name, "reachable": True} for name, at in self.arrivals.items() if at <= self.now]
 
-    def emergency_stop(self) -> list[dict[str, Any]]:
+    def emergency_stop(self, signing_key: Any = None, *, estop_id: str = "") -> list[dict[str, Any]]:
         self.stops.append(self.now)
+        # One press is one stop, however often it is sent.
+        self.ids.add(estop_id)
+        assert len(self.ids) == 1
         answering = [row["peer_id"] for row in self.peers if row["peer_id"] not in self.silent]
         return [{"responder_id": name, "result": {"ok": True, "stopped": True}} for name in answering]
 
