@@ -1,4 +1,4 @@
-.PHONY: help demo test test-all lint bench serve api system venv clean real-arm dds-security models
+.PHONY: help demo test test-all lint bench serve api system venv clean real-arm real-arm-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -55,6 +55,10 @@ real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot
 models:  ## The models of four other projects in a world of ours, in .venv-models, and their test
 	@./scripts/models.sh
 	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
+
+real-arm-next:  ## The same on LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-lerobot-0.6.1
+	@./scripts/real-arm.sh 0.6.1
+	@.venv-lerobot-0.6.1/bin/python -m pytest tests/integration/hardware $(ARGS)
 
 lint: venv  ## ruff and mypy --strict
 	@$(BIN)/ruff check .

@@ -10,21 +10,19 @@ With Strands: ``Agent(tools=[robot_mesh])`` from ``strands_robots.tools`` does t
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 
-# The loopback port where local robots meet; on a network, name a server or a router instead.
-os.environ.setdefault("ZENOH_CONNECT", f"tcp/127.0.0.1:{os.environ.get('STRANDS_DC_PORT', '7447')}")
-os.environ.setdefault("DEVICE_CONNECT_DISCOVERY_MODE", "d2d")
+from device_connect_agent_tools import disconnect, discover, invoke, subscribe
 
-from device_connect_agent_tools import connect, disconnect, discover_devices, invoke_device, subscribe
+from strands_robots.device_connect import connect_agent
 
 
 def main() -> int:
-    connect(request_timeout=5.0)
+    # On this machine, unless the environment names a network: a NATS server or a Zenoh router.
+    connect_agent(request_timeout=5.0)
     try:
-        robots = [device for device in discover_devices() if "execute" in {f["name"] for f in device["functions"]}]
+        robots = discover("device(*).function(execute)")["results"]
         if not robots:
             print("No robot answers. Start one: strands-robots serve so100")
             return 1
@@ -32,10 +30,10 @@ def main() -> int:
         print(f"Driving {robot}.")
         with subscribe(f"device({robot}).event(streamStep)") as steps:
             wanted = {"instruction": "wave", "duration": 10.0}
-            print(invoke_device(robot, "execute", wanted)["result"]["content"][0]["text"])
+            print(invoke(f"device({robot}).function(execute)", wanted)["result"]["content"][0]["text"])
             time.sleep(1.5)
             print(f"Saw {len(steps.read())} steps.")
-        stopped = invoke_device(robot, "stop")["result"]
+        stopped = invoke(f"device({robot}).function(stop)")["result"]
         print(stopped["content"][0]["text"])
         return 0 if stopped["status"] == "success" else 1
     finally:

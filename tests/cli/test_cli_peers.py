@@ -75,3 +75,20 @@ def test_failed_call_prints_the_reason_and_its_exit_code(
 def test_malformed_call_is_exit_2_and_sends_nothing(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
     assert run("call", "arm-1", "execute", *arguments).exit_code == 2
     assert fleet.called == []
+
+
+def test_unknown_device_and_function_name_the_near_ones(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [arm(), arm("arm-2"), arm("rover")]
+    fleet.answer = NoSuchDeviceError("No device 'amr-1' in tenant 'default'.")
+    assert "Near it: arm-1, arm-2." in run("call", "amr-1", "execute").stderr
+    fleet.answer = CallRefusedError("Unknown method: exceute", -32601)
+    assert "Near it: execute." in run("call", "arm-1", "exceute").stderr
+    fleet.answer = CallRefusedError("Unknown method: zzz", -32601)
+    assert "There are: execute, stop." in run("call", "arm-1", "zzz").stderr
+
+
+def test_piped_table_is_not_broken_at_80_columns(run: Run, fleet: FakeFleet) -> None:
+    names = tuple({"name": f"functionNumber{n}"} for n in range(20))
+    fleet.found = [Peer("arm-1", "strands_sim", "so100", {"availability": "idle"}, names)]
+    [row] = [line for line in run("peers").stdout.splitlines() if "arm-1" in line]
+    assert "functionNumber0" in row and "functionNumber19" in row

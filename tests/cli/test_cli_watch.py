@@ -151,3 +151,10 @@ def test_joint_limits_are_read_from_simulation_and_robot() -> None:
 
 def test_progress_never_exceeds_its_total() -> None:
     assert "4.0 / 4.0 s" in drawn(motion_progress("wave", 9.0, 4.0))
+
+
+def test_device_without_joints_says_so() -> None:
+    view = DeviceView("rover", {})
+    assert "reports no joints" in drawn(view.draw())
+    view.take(event("observationUpdate", joints={"pan": 0.5}))
+    assert "reports no joints" not in drawn(view.draw())

@@ -325,3 +325,35 @@ def test_a_locked_robot_whose_cable_is_back_is_frozen_as_it_connects(robot: Hard
     robot.connect()
     assert len(robot.device.writes) == written + 1, "one write: hold where you are"
     assert robot.halt("again").stopped is True
+
+
+class BusyBus(RecordingDevice):
+    """Loses the answers to the next ``missed`` reads."""
+
+    missed = 0
+
+    def get_observation(self) -> dict[str, Any]:
+        if self.missed:
+            self.missed -= 1
+            raise ConnectionError("Failed to sync read 'Present_Position'")
+        return super().get_observation()
+
+
+def test_missed_observation_on_a_busy_bus_is_read_again() -> None:
+    device = BusyBus()
+    body = DeviceBody("arm", device)
+    device.missed = 2
+    assert body.get_observation()["pan.pos"] == 10.0
+    device.missed = 3
+    with pytest.raises(ConnectionError):
+        body.get_observation()
+
+
+def test_missed_observation_is_not_read_again_while_a_stop_waits() -> None:
+    device = BusyBus()
+    body = DeviceBody("arm", device)
+    with body.stopping():
+        device.missed = 2
+        with pytest.raises(ConnectionError):
+            body.get_observation()
+        assert device.missed == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.mesh import Mesh
+
+NO_METHOD = -32601
+"""JSON-RPC's code of an unknown function."""
 
 SOURCE = "strands-robots"
 """Caller's name that goes with the calls of the command line."""
@@ -164,10 +168,23 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
 
     try:
         return fleet.call(device, function, params, seconds)
-    except (NoSuchDeviceError, DeviceTimeoutError) as exc:
+    except NoSuchDeviceError as exc:
+        near = _near(device, [peer.id for peer in fleet.peers(1.0)])
+        raise CliError(plain(f"{exc.args[0]}{near}", 2000), Exit.SILENT) from exc
+    except DeviceTimeoutError as exc:
         raise CliError(plain(exc.args[0], 2000), Exit.SILENT) from exc
     except CallRefusedError as exc:
-        raise CliError(plain(str(exc), 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+        known = [peer.functions for peer in fleet.peers(1.0) if peer.id == device] if exc.code == NO_METHOD else []
+        near = _near(function, [str(each.get("name", "")) for functions in known for each in functions])
+        raise CliError(plain(f"{exc}{near}", 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+
+
+def _near(wanted: str, names: list[str]) -> str:
+    """Return a sentence with the names that resemble ``wanted``, else with all."""
+    alike = difflib.get_close_matches(wanted, names, n=3, cutoff=0.5)
+    if alike:
+        return f" Near it: {', '.join(alike)}."
+    return f" There {'is' if len(names) == 1 else 'are'}: {', '.join(sorted(names))}." if names else ""
 
 
 def temporary_mesh_id(name: str) -> str:

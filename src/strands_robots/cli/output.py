@@ -18,6 +18,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Console, RenderableType
+from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
@@ -25,6 +26,12 @@ from strands_robots.errors import StrandsRobotsError
 
 LENGTH_MAX = 400
 """Characters of one network text that are shown."""
+
+WIDE = 4096
+"""Columns of what is not a terminal."""
+
+PANEL_WIDTH = 100
+"""Columns of a panel there."""
 
 LOG_LINES = 5
 POLL_S = 0.05
@@ -77,7 +84,8 @@ class Screen:
 
     def __init__(self, machine: bool = False, console: Console | None = None) -> None:
         self.machine = machine
-        self.out = console or Console(file=sys.stdout, highlight=False)
+        # What is piped goes to a program or a file, which no terminal's width should break.
+        self.out = console or Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else WIDE)
         self.err = Console(file=sys.stderr, highlight=False)
 
     @property
@@ -97,7 +105,7 @@ class Screen:
     def show(self, thing: RenderableType) -> None:
         """Print a table or panel for people."""
         if not self.machine:
-            self.out.print(thing)
+            self.out.print(thing, width=PANEL_WIDTH if isinstance(thing, Panel) and not self.out.is_terminal else None)
 
     def data(self, value: Any) -> None:
         """Print one JSON value on its own line, for programs."""

@@ -15,6 +15,7 @@ from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, first_line, label, plain, table
 from strands_robots.envelope import is_error, text_of
+from strands_robots.tools.networks import NativeMesh
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
@@ -66,12 +67,17 @@ def call(
     arguments: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...")] = None,
     timeout: Timeout = 10.0,
     source: Annotated[str, typer.Option("--as", help="Name of the caller that goes with the call.")] = SOURCE,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Call a function of a device. A value is read as JSON where that is possible, else as text."""
     params = assignments(arguments or [])
     seconds = number("--timeout", timeout, above=0, high=3600)
-    with network.fleet(source) as fleet:
-        answer = call_device(fleet, device, function, params, seconds)
+    if on_mesh:
+        network.use_mesh()
+        answer = NativeMesh().call(device, function, params, seconds)
+    else:
+        with network.fleet(source) as fleet:
+            answer = call_device(fleet, device, function, params, seconds)
     if is_error(answer):
         raise CliError(plain(text_of(answer) or f"{device} refused {function}.", 2000), Exit.REFUSED, answer=answer)
     screen.data(answer)

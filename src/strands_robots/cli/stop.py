@@ -31,7 +31,9 @@ SLOW_MS = 100.0
 LATE_MS = 1000.0
 """A stop that left later than this after the press says so."""
 
-LOCKED = "They are locked until they are resumed: strands-robots resume."
+LOCKED = "They are locked until they are resumed:"
+LOCKED_HERE = "strands-robots resume --local"
+LOCKED_REMOTE = "strands-robots resume --key FILE, or resume --local at the machine of each"
 LOCKED_MESH = (
     "They are locked until they are resumed: strands-robots resume --mesh --key FILE, or resume --local where they run."
 )
@@ -148,6 +150,7 @@ def estop(
         raise CliError(plain(f"{answer['reason']}{where}", 2000), code, **facts)
     screen.data({"status": "success", **facts})
     screen.say(LOCKED)
+    screen.copyable(f"  {LOCKED_HERE if link.loopback_only else LOCKED_REMOTE}")
 
 
 class RunningStop:

@@ -44,6 +44,8 @@ NAME_WIDTH = 18
 JOINTS_MAX = 24
 """Joints that are drawn; the rest is counted."""
 
+NO_JOINTS = "It reports no joints: it has none, or sends them only while it moves."
+
 Frame = tuple[list["DeviceEvent"], float]
 Range = tuple[float, float]
 FULL_TURN: Range = (-math.pi, math.pi)
@@ -151,6 +153,8 @@ class DeviceView:
             label(f"{self.device}: {self.task}", "bold"),
             label(f"last heard {age_s:.1f} s ago", late),
         ]
+        if not self._joints:
+            parts.append(label(NO_JOINTS, "bright_black"))
         for robot, joints in self._joints.items():
             if len(self._joints) > 1:
                 parts.append(label(robot))

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from device_connect_edge import DeviceRuntime
 
+    from strands_robots.device_connect.agent import connect_agent
     from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
     from strands_robots.device_connect.bringup import (
         DuplicateDeviceError,
@@ -44,6 +45,7 @@ __all__ = [
     "RobotDeviceDriver",
     "SimulationDeviceDriver",
     "StopSignal",
+    "connect_agent",
     "init_device_connect",
     "init_device_connect_sync",
     "link_from_environment",
@@ -62,13 +64,14 @@ _HOMES = {
     "RobotDeviceDriver": f"{_HERE}.robot_driver",
     "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
     "StopSignal": f"{_HERE}.shutdown",
+    "connect_agent": f"{_HERE}.agent",
     "init_device_connect": f"{_HERE}.bringup",
     "init_device_connect_sync": f"{_HERE}.bringup",
     "link_from_environment": f"{_HERE}.backends",
     "loopback_config": f"{_HERE}.backends",
     "stop_device_connect": f"{_HERE}.bringup",
 }
-_FRAMEWORK = ("device_connect_edge", "zenoh", "nats", "pydantic")
+_FRAMEWORK = ("device_connect_edge", "device_connect_agent_tools", "zenoh", "nats", "pydantic")
 
 
 def __getattr__(name: str) -> Any:

@@ -127,11 +127,20 @@ class DeviceBody:
             return
 
     def get_observation(self) -> dict[str, Any]:
+        """Read joints and pictures; repeat as :meth:`get_joints` does."""
         with self.lock:
-            began = time.monotonic()
-            observation = dict(self.device.get_observation())
-            self._latest = (began, numbers(observation))
-            return observation
+            for left in reversed(range(READ_TRIES)):
+                began = time.monotonic()
+                forget_input(self.device)
+                try:
+                    observation = dict(self.device.get_observation())
+                except ConnectionError:
+                    if not left or self._stops:
+                        raise
+                    continue
+                self._latest = (began, numbers(observation))
+                return observation
+            raise AssertionError  # the last try returns or raises
 
     def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
         """Read the joints; repeat after a lost answer unless a stop waits for the bus.

@@ -124,6 +124,10 @@ class NativeMesh:
             target, action="start", instruction=instruction, policy_provider=policy_provider, duration=duration
         )
 
+    def call(self, target: str, action: str, arguments: Mapping[str, Any], seconds: float = ANSWER_S) -> Envelope:
+        """Send the peer any action with its arguments."""
+        return self._request(target, seconds, **{**arguments, "action": action})
+
     def status(self, target: str) -> Envelope:
         """Ask the peer for its ``status``."""
         return self._request(target, action="status")
@@ -156,9 +160,9 @@ class NativeMesh:
 
         return _on_mesh(stopped, stopped=None)
 
-    def _request(self, target: str, **command: Any) -> Envelope:
+    def _request(self, target: str, seconds: float = ANSWER_S, **command: Any) -> Envelope:
         def requested(mesh: Mesh) -> Envelope:
-            reply = _reply(mesh, target, command, ANSWER_S)
+            reply = _reply(mesh, target, command, seconds)
             if reply.get("status") == "timeout":
                 return error(f"{target} did not answer.")
             if reply.get("type") != "response":

@@ -84,6 +84,16 @@ def test_unknown_key_frees_no_robot(site: Site, arms: tuple[str, str]) -> None:
     assert site.signed()[0] == 0
 
 
+def test_command_that_estop_prints_frees_the_robots_as_printed(site: Site, arms: tuple[str, str]) -> None:
+    said = site.run("estop", *arms, *PATIENT)
+    printed = said.stdout.strip().splitlines()[-1].split()
+    assert printed == ["strands-robots", "resume", "--local"]
+    freed = site.run(*printed[1:])
+    assert (freed.returncode, "arm-1" in freed.stdout) == (0, True)
+    assert site.wave("arm-1")[0] == 0
+    assert site.json("stop", "arm-1")[0] == 0
+
+
 def test_estop_on_a_terminal_is_a_table_that_ends_with_counts(site: Site, arms: tuple[str, str]) -> None:
     with on_a_terminal([*COMMAND, "estop", *arms, "arm-9", "--deadline", "5"], site.environment) as terminal:
         assert terminal.process.wait(WITHIN_S) == 3

@@ -49,6 +49,12 @@ def test_served_arm_is_stopped_locked_and_cleared_from_another_terminal(tmp_path
         assert lockouts(store) == {"arm-1": False}
 
 
+def test_served_arm_is_called_by_any_action_of_the_mesh(machine: Machine) -> None:
+    with machine.serving("arm-1", "--mesh"):
+        code, answer = machine.json("call", "--mesh", "arm-1", "status")
+        assert (code, answer["status"]) == (0, "success")
+
+
 def test_unanswered_stop_is_no_success(machine: Machine) -> None:
     code, answer = machine.json("estop", "--mesh")
     assert (code, answer["stopped"]) == (3, None)
