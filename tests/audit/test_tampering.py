@@ -185,6 +185,20 @@ def test_log_and_head_rolled_back_together_are_older_than_the_anchor(journal: Jo
     assert not check(journal)["ok"]
 
 
+def test_head_of_before_a_rotation_with_the_size_of_the_current_file_is_older(tmp_path: Path) -> None:
+    journal = signed_journal(tmp_path, max_bytes=900)
+    journal.append([entry(0)])
+    older = head_file(journal).read_bytes()
+    size = journal.path.stat().st_size
+    number = 0
+    while number < 4 or journal.path.stat().st_size != size:
+        number = (number + 1) % 10
+        journal.append([entry(number)])
+    head_file(journal).write_bytes(older)
+    found = check(journal)
+    assert (found["head"], found["ok"]) == ("older", False)
+
+
 def test_running_writer_remembers_what_was_rolled_back_with_its_anchor(journal: Journal, tmp_path: Path) -> None:
     older = copy_files(journal, anchor=True)
     journal.append([entry(10)])
