@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 from strands_robots.contract import RUNNING
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.policies.rollout import Body, Rollout
-from strands_robots.safety.gate import answered
-from strands_robots.utils import ValidationError, choice, identifier, number, shown
+from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
+from strands_robots.safety.gate import Permit, answered
+from strands_robots.utils import ValidationError, choice, identifier, missing_extra, number, shown
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm
@@ -22,8 +23,13 @@ if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.motion import Motion
     from strands_robots.kinematics.moves import Start
 
+P = ParamSpec("P")
+
 WAIT_S = 25.0
 """Longest time for which an answer waits for the end of a motion; the networks wait for 30 s."""
+
+FRESH_S = 0.02
+"""Greatest age of joints that are not read again, so that a pose takes no turn on the bus from a running motion."""
 
 HOME = "home"
 """Place that every arm has: the home pose of its model."""
@@ -41,6 +47,37 @@ class ArmTask:
     task_id: str
     rollout: Rollout
     motion: Motion
+
+
+def motion_rollout(body: Body, motion: Motion, permit: Permit, hz: float, observers: RolloutObservers) -> Rollout:
+    """Return the rollout that plays a motion; what it grips in the end it keeps."""
+    return Rollout(
+        body,
+        motion,
+        permit=permit,
+        instruction=motion.instruction,
+        policy_name=MOTION,
+        duration=motion.duration,
+        hz=hz,
+        observers=observers,
+        ends_at_rest=True,
+    )
+
+
+def planned(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
+    """Answer refusals, and a missing MuJoCo, with their envelope."""
+    answering = answered(verb)
+
+    @functools.wraps(verb)
+    def asked(*args: P.args, **kwargs: P.kwargs) -> Envelope:
+        try:
+            return answering(*args, **kwargs)
+        except ModuleNotFoundError as exc:
+            if exc.name not in ("mujoco", "numpy"):
+                raise
+            return error(str(missing_extra("Planning the motion of an arm", "sim")))
+
+    return asked
 
 
 class ArmMixin:
@@ -74,7 +111,7 @@ class ArmMixin:
     def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
         """Plan with the control rate (Hz) and start, once the body is found free."""
 
-    @answered
+    @planned
     def arm_pose(self, robot_name: str = "") -> Envelope:
         """Return the pose of the tip, the joints (degrees) and the gripper's opening.
 
@@ -83,7 +120,8 @@ class ArmMixin:
         import numpy as np  # noqa: PLC0415 - loaded with the first motion
 
         arm, body = self.arm(robot_name), self.body(robot_name)
-        state = arm.state(body.get_joints())
+        age_s, observed = _observed(body)
+        state = arm.state(observed)
         pose = arm.chain.forward(state.joints)
         x, y, z = (round(float(v), 5) for v in pose.position)
         joints = {
@@ -101,9 +139,10 @@ class ArmMixin:
             gripper=None if state.opening is None else round(min(max(state.opening, 0.0), 1.0), 4),
             holding=self._holding(body.name, arm),
             frame="base",
+            age_s=round(age_s, 4),
         )
 
-    @answered
+    @planned
     def move_joints(
         self, joints: Mapping[str, float], speed: float = 0.5, wait: bool = True, robot_name: str = ""
     ) -> Envelope:
@@ -112,7 +151,7 @@ class ArmMixin:
 
         return self._move("moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name)
 
-    @answered
+    @planned
     def move_to(
         self,
         x: float,
@@ -130,7 +169,7 @@ class ArmMixin:
         plan = partial(moves.move_to, position=_vector(x, y, z), approach=approach)
         return self._move("moveTo", plan, speed, wait, robot_name)
 
-    @answered
+    @planned
     def move_by(
         self,
         dx: float = 0.0,
@@ -155,14 +194,14 @@ class ArmMixin:
             raise ValidationError("moveBy needs dx, dy or dz, or a direction.")
         return self._move("moveBy", partial(moves.move_by, offset=offset), speed, wait, robot_name)
 
-    @answered
+    @planned
     def set_gripper(self, opening: float, wait: bool = True, robot_name: str = "") -> Envelope:
         """Move the gripper; ``holding`` says whether something is between the jaws."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
         return self._move("setGripper", partial(moves.set_gripper, opening=opening), 1.0, wait, robot_name)
 
-    @answered
+    @planned
     def get_objects(self, robot_name: str = "") -> Envelope:
         """Return the objects by name: centre, extents (m) and yaw (degrees)."""
         import numpy as np  # noqa: PLC0415 - loaded with the first motion
@@ -178,7 +217,7 @@ class ArmMixin:
         }
         return success(f"{len(rows)} objects: {', '.join(rows) or 'none'}.", objects=rows, frame="base")
 
-    @answered
+    @planned
     def pick(
         self,
         object: str = "",  # noqa: A002 - the verb's parameter is called so
@@ -214,7 +253,7 @@ class ArmMixin:
             "pick", plan, speed, wait, robot_name, started=lambda: self._held.update({body.name: held[-1]})
         )
 
-    @answered
+    @planned
     def place(
         self,
         x: float | None = None,
@@ -249,7 +288,7 @@ class ArmMixin:
         plan = partial(grasp.place, position=position, approach=approach, held=held)
         return self._move("place", plan, speed, wait, robot_name)
 
-    @answered
+    @planned
     def go_to(self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "") -> Envelope:
         """Move to the joints of a saved place, or to ``home``."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
@@ -262,15 +301,15 @@ class ArmMixin:
             raise ValidationError(f"place must be one of {', '.join(places)}, not {shown(name)}.")
         return self._move("goTo", partial(moves.go_to, place=name, degrees=places[name]), speed, wait, robot_name)
 
-    @answered
+    @planned
     def save_place(self, place: str, robot_name: str = "") -> Envelope:
         """Save the present joints as a place of :meth:`go_to` in this process."""
         name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name)
-        joints = _degrees(arm, arm.state(body.get_joints()).joints)
+        joints = _degrees(arm, arm.state(_observed(body)[1]).joints)
         self._places.setdefault(body.name, {})[name] = joints
         return success(f"Saved {name}.", place=name, joints=joints, places=[HOME, *self._places[body.name]])
 
-    @answered
+    @planned
     def wait_for(self, task_id: str = "", seconds: float = WAIT_S, robot_name: str = "") -> Envelope:
         """Wait for the end of a motion, the last one by default, and return its result."""
         name = self.body(robot_name).name
@@ -330,7 +369,7 @@ class ArmMixin:
         planned: list[Motion] = []
 
         def planned_at(hz: float) -> Motion:
-            state = arm.state(body.get_joints()).told(arm.told(self.targets(body.name)))
+            state = arm.state(_observed(body)[1]).told(arm.told(self.targets(body.name)))
             motion = plan(Start(arm, state, hz, speed))
             motion.clock = getattr(body, "clock", motion.clock)
             planned.append(motion)
@@ -399,11 +438,22 @@ class ArmMixin:
         told = self.targets(name).get(arm.jaw.commanded)
         if told is None or not arm.jaw.says(told, task.motion.told):
             return None
-        return arm.holding(arm.state(self.body(name).get_joints()), task.motion.told)
+        return arm.holding(arm.state(_observed(self.body(name))[1]), task.motion.told)
 
     @staticmethod
     def _gripped(task: ArmTask, name: str) -> bool:
         return task.rollout.robot == name and task.motion.told is not None
+
+
+def _observed(body: Body) -> tuple[float, Mapping[str, float]]:
+    """Return the age (s) and the joints of a body, read anew unless fresh."""
+    latest: tuple[float, dict[str, float]] | None = getattr(body, "latest_joints", None)
+    if latest is not None and latest[0] <= FRESH_S:
+        return latest
+    try:
+        return 0.0, body.get_joints()
+    except OSError as exc:
+        raise ValidationError(f"the joints of {body.name} could not be read: {exc}") from exc
 
 
 def _vector(x: float, y: float, z: float) -> Any:

@@ -69,6 +69,8 @@ class DeviceBody:
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         self._latest: tuple[float, dict[str, float]] | None = None
+        self.targets: dict[str, float] = {}
+        """What it was told last by an action, by key; empty once it was frozen or let go."""
         self._lost = False
         self._stops: list[object] = []
         self.driven = False
@@ -158,7 +160,9 @@ class DeviceBody:
                 self._stiffen()
             self.driven = True
             sent = self.device.send_action(dict(action))
-            return sent if isinstance(sent, Mapping) else dict(action)
+            told = sent if isinstance(sent, Mapping) else dict(action)
+            self.targets |= numbers(told)
+            return told
 
     def hold(self, permit: Permit | None = None) -> None:
         with self.lock:
@@ -263,6 +267,7 @@ class DeviceBody:
         Args:
             urgent: do not give the bus up to a stop that waits, for this is the stop.
         """
+        self.targets = {}
         own = getattr(self.device, "hold", None)
         if callable(own):
             own()

@@ -10,9 +10,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from strands_robots import settings
+from strands_robots.arm_mixin import ArmMixin, motion_rollout
 from strands_robots.audit import log_safety_event
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
@@ -44,6 +45,10 @@ from strands_robots.safety.stopping import stop_level as configured_level
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
 
+if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
+    from strands_robots.kinematics.arm import Arm
+    from strands_robots.kinematics.motion import Motion
+
 logger = logging.getLogger(__name__)
 
 WIND_DOWN_S = 5.0
@@ -56,7 +61,7 @@ IDLE_WAIT_S = 1.0
 """Seconds that a read of the state waits for the bus while nothing drives the robot."""
 
 
-class HardwareRobot(TeleopMixin):
+class HardwareRobot(ArmMixin, TeleopMixin):
     """Device with LeRobot's robot interface, driven by tasks, leaders or actions.
 
     Args:
@@ -70,6 +75,7 @@ class HardwareRobot(TeleopMixin):
             ``release``) or ``settle`` (frozen, then to ``rest_pose`` at bounded speed, then limp); by default as
             ``STRANDS_ESTOP_TORQUE`` says.
         rest_pose: where a robot that settles goes: a target for every action key that is a position.
+        model: of the arm for motions to a point: so100, so101 or an MJCF file; that of the device's type by default.
 
     Raises:
         ValidationError: an argument outside its domain, or a device that lacks a part of the interface.
@@ -87,6 +93,7 @@ class HardwareRobot(TeleopMixin):
         joint_ranges: Mapping[str, tuple[float, float]] | None = None,
         stop_level: StopLevel | Literal["release"] | None = None,
         rest_pose: Mapping[str, float] | None = None,
+        model: str | None = None,
     ) -> None:
         name = text("tool_name", tool_name, longest=128)
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
@@ -100,6 +107,8 @@ class HardwareRobot(TeleopMixin):
         self.observers = RolloutObservers()
         self._body = DeviceBody(name, device, joint_ranges, level)
         self._settling = self._made_to_settle(level, rest_pose)
+        self._arm: Arm | None = None
+        self._model = None if model is None else text("model", model)
         self._task: Rollout | None = None
         self._waiting = Waiting()
         self._sends: set[Permit] = set()
@@ -243,6 +252,19 @@ class HardwareRobot(TeleopMixin):
             raise ValidationError(f"robot_name must be {self.tool_name_str}, not {robot_name!r}.")
         return self._body
 
+    def arm(self, robot_name: str = "") -> Arm:
+        """Return the arm. Raises :class:`ValidationError` where no model of it fits."""
+        from strands_robots.hardware.arm import arm_of  # noqa: PLC0415 - numpy and MuJoCo, with the first motion
+
+        body = self.body(robot_name)
+        if self._arm is None:
+            self._arm = arm_of(self.device, body.bounds, self._model)
+        return self._arm
+
+    def targets(self, robot_name: str = "") -> Mapping[str, float]:
+        """Return the last action; empty once the arm was frozen or let go."""
+        return self.body(robot_name).targets
+
     def subscribe(self, observer: Observer) -> Unsubscribe:
         """Tell ``observer`` of every task event until the returned callable is called."""
         return self.observers.subscribe(observer)
@@ -266,7 +288,10 @@ class HardwareRobot(TeleopMixin):
                 and ``n_steps`` (actions after which it ends).
         """
         try:
-            task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+            task = self._start(
+                "start_task",
+                self._task_of(instruction, policy_provider, duration, {"policy_port": policy_port, **policy}),
+            )
         except REFUSALS as refused:
             return refusal_envelope("start_task", refused)
         problem = task.not_begun()
@@ -291,7 +316,10 @@ class HardwareRobot(TeleopMixin):
         **policy: Any,
     ) -> Envelope:
         """Run a task to its end; an error when the policy failed or ran too long."""
-        task = self._start(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+        task = self._start(
+            "start_task",
+            self._task_of(instruction, policy_provider, duration, {"policy_port": policy_port, **policy}),
+        )
         if not task.join((task.duration or 0.0) + WIND_DOWN_S):
             task.request_stop()
             return error(f"The task was still running {WIND_DOWN_S:g} s after its time.", **self._task_fields())
@@ -487,14 +515,39 @@ class HardwareRobot(TeleopMixin):
             ends["task"] = partial(task.ended_by, deadline)
         return ends | self.teleop_stops(deadline)
 
-    def _start(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> Rollout:
+    def _task_of(
+        self, instruction: str, provider: str, duration: float, options: dict[str, Any]
+    ) -> Callable[[Permit], Rollout]:
+        """Check a task, and return the callable that makes its rollout."""
         name = resolve_provider(provider)
         profile = profiles().get(name)
         if profile is not None:
             options = profile.loop_options(options, self.control_hz)
         chosen = rollout_options(instruction, duration, options, self.control_hz)
+
+        def made(permit: Permit) -> Rollout:
+            policy = create_policy(name, **options)
+            if isinstance(policy, ProfiledPolicy):
+                policy.fit(self.policy_facts())
+            permit.check()
+            return Rollout(self._body, policy, permit=permit, policy_name=name, observers=self.observers, **chosen)
+
+        return made
+
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
+        """Plan and start a motion of the arm."""
+        self.body(robot_name)
+
+        def made(permit: Permit) -> Rollout:
+            motion = plan(self.control_hz)
+            permit.check()
+            return motion_rollout(self._body, motion, permit, self.control_hz, self.observers)
+
+        return self._start(verb, made)
+
+    def _start(self, verb: str, made: Callable[[Permit], Rollout]) -> Rollout:
         # Before the wait for the robot: a stop that comes while this waits, connects or loads is newer.
-        permit = self.gate.permit("start_task")
+        permit = self.gate.permit(verb)
         with self._waiting.until_begun(permit), self.starting:
             permit.check()
             self._stand_by()
@@ -502,13 +555,7 @@ class HardwareRobot(TeleopMixin):
             self._reconnect()
             if not self._body.is_connected:
                 raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
-            policy = create_policy(name, **options)
-            if isinstance(policy, ProfiledPolicy):
-                policy.fit(self.policy_facts())
-            permit.check()
-            task = self._task = Rollout(
-                self._body, policy, permit=permit, policy_name=name, observers=self.observers, **chosen
-            )
+            task = self._task = made(permit)
             task.start()
             return task
 

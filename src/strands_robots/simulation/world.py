@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from strands_robots import settings
-from strands_robots.arm_mixin import MOTION, ArmMixin
+from strands_robots.arm_mixin import ArmMixin, motion_rollout
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm import Arm
@@ -551,17 +551,7 @@ class Simulation(ArmMixin, TeleopMixin):
             body = self._free_body(robot_name)
             motion = plan(hz)
             permit.check()
-            rollout = Rollout(
-                body,
-                motion,
-                permit=permit,
-                instruction=motion.instruction,
-                policy_name=MOTION,
-                duration=motion.duration,
-                hz=hz,
-                observers=self.observers,
-                ends_at_rest=True,
-            )
+            rollout = motion_rollout(body, motion, permit, hz, self.observers)
             self._rollouts[body.name] = rollout
             rollout.start()
             return rollout

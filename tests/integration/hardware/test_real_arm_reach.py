@@ -1,0 +1,65 @@
+"""LeRobot's driver on emulated servos: the tip goes to a point, by the bytes on the bus."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from fixtures.feetech_bus import FeetechBus, arm_calibration
+from fixtures.waiting import eventually
+
+from strands_robots.kinematics.arm import SPEED_RAD_S
+from strands_robots.kinematics.chain import built_in
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+
+
+def written(bus: FeetechBus) -> dict[str, list[tuple[float, float]]]:
+    """Goals that reached each servo, as monotonic seconds and radians of the model."""
+    goals: dict[str, list[tuple[float, float]]] = {joint: [] for joint in JOINTS}
+    entries = arm_calibration()
+    for write in bus.writes:
+        if write.is_for("goal_position") and write.servo <= len(JOINTS):
+            joint = JOINTS[write.servo - 1]
+            middle = (entries[joint]["range_min"] + entries[joint]["range_max"]) / 2
+            counts = int.from_bytes(write.data[:2], "little")
+            goals[joint].append((write.at, math.radians((counts - middle) * 360 / 4095)))
+    return goals
+
+
+@pytest.mark.parametrize("use_degrees", [True, False])
+def test_tip_goes_to_the_point_by_the_goals_on_the_bus(arm: Any, bus: FeetechBus, use_degrees: bool) -> None:
+    robot = arm(use_degrees=use_degrees)
+    answer = robot.move_to(0.25, 0.1, 0.08, speed=1.0)
+    assert answer["status"] == "success", answer
+    goals = written(bus)
+    chain = built_in("so101")
+    tip = chain.forward(np.array([goals[joint][-1][1] for joint in JOINTS])).position
+    assert np.linalg.norm(tip - np.array([0.25, 0.1, 0.08])) <= 2e-3
+    assert answer["error_mm"] < 5.0
+    step = 1 / robot.control_hz
+    for joint in JOINTS:
+        angles = [angle for _, angle in goals[joint]]
+        # A goal is a whole count, which is 0.0015 rad.
+        assert all(abs(b - a) <= SPEED_RAD_S * step + 0.0032 for a, b in itertools.pairwise(angles)), joint
+
+
+def test_pose_and_gripper_are_told_and_the_jaws_close(arm: Any) -> None:
+    robot = arm()
+    pose = robot.arm_pose()
+    assert pose["status"] == "success", pose
+    assert pose["joints"]["shoulder_pan"] == pytest.approx(0.0, abs=1.0)
+    assert robot.set_gripper(1.0)["reached"]["gripper"] == pytest.approx(1.0, abs=0.05)
+    assert robot.set_gripper(0.0)["holding"] is False
+
+
+def test_stop_ends_a_motion_of_a_real_arm_in_its_middle(arm: Any) -> None:
+    robot = arm()
+    started = robot.move_to(0.2, 0.15, 0.1, speed=0.2, wait=False)
+    assert started["task_status"] == "running", started
+    eventually(lambda: robot.get_task_status()["step_count"] > 3)
+    assert robot.stop_task()["stopped"]
+    assert robot.wait_for(started["task_id"])["why"] == "it was stopped"
