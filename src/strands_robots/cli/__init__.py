@@ -18,7 +18,7 @@ def main() -> None:
     from strands_robots.cli.app import build  # noqa: PLC0415 - importing the package loads no command
 
     try:
-        build()()
+        build(sys.argv[1] if len(sys.argv) > 1 else "")()
     except SystemExit as exit_:
         _leave(exit_.code)
 
