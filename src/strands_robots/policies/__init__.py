@@ -24,6 +24,7 @@ ALIASES = {"lerobot": "lerobot_local"}
 _BUILT_IN = {
     "mock": ("strands_robots.policies.mock", "MockPolicy"),
     "remote": ("strands_robots.policies.remote", "RemotePolicy"),
+    "openpi": ("strands_robots.policies.openpi", "OpenPiPolicy"),
     "lerobot_local": ("strands_robots.policies.lerobot_local", "LeRobotPolicy"),
 }
 

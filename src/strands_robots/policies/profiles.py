@@ -17,6 +17,7 @@ from strands_robots import settings
 from strands_robots.utils import ValidationError, choice, identifier, mapping, number, shown, text, whole
 
 UNITS = ("degrees", "radians", "normalized", "percent", "metres")
+LAYOUTS = ("libero", "droid", "aloha")
 FLIPS = ("none", "180", "horizontal", "vertical")
 CONFIRMABLE = ("units", "rate", "image size")
 """Facts that a profile may declare to be right although nothing states them."""
@@ -58,6 +59,7 @@ class Profile:
         units: unit of the policy's numbers by key; the entry ``""`` is that of all others.
         rate: control steps a second at which the data was recorded; None where nothing states it.
         horizon: actions that are played of each answer; None for all.
+        layout: of an openpi server's observation: libero, droid or aloha.
         task: the text that the policy was trained with; empty takes the caller's instruction.
         first_deadline_s, deadline_s: longest time until the policy is ready, and of each later answer.
         max_speed: whole ranges that a joint may cross in a second; None for no bound.
@@ -78,6 +80,7 @@ class Profile:
     rate: float | None = None
     chunk: int | None = None
     horizon: int | None = None
+    layout: str = "libero"
     task: str = ""
     device: str = ""
     first_deadline_s: float = 120.0
@@ -267,6 +270,7 @@ _ENTRIES: dict[str, Callable[[str, object], Any]] = {
     "rate": lambda name, value: number(name, value, low=0.1, high=RATE_MAX),
     "chunk": lambda name, value: whole(name, value, low=1, high=10_000),
     "horizon": lambda name, value: whole(name, value, low=1, high=10_000),
+    "layout": lambda name, value: choice(name, value, LAYOUTS),
     "task": _text(2000),
     "device": _text(64),
     "first_deadline_s": _seconds,
