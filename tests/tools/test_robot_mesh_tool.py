@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import base64
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -70,6 +72,10 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
         ({"action": "tell", "target": "arm-1", "instruction": "wave", "duration": 1e9}, "duration"),
         ({"action": "tell", "target": "arm-1", "instruction": "wave", "policy_provider": ""}, "policy_provider"),
         ({"action": "status"}, "target"),
+        ({"action": "move", "arguments": {"x": 1}}, "target"),
+        ({"action": "call", "target": "arm-1"}, "verb"),
+        ({"action": "call", "target": "arm-1", "verb": "a/b"}, "verb"),
+        ({"action": "move", "target": "arm-1", "arguments": [1]}, "arguments"),
         ({"action": "release_torque"}, "target"),
         ({"action": "stop", "target": "arm 1"}, "target"),
     ],
@@ -81,6 +87,29 @@ def test_argument_out_of_its_domain_is_refused_by_name(
     assert answer["status"] == "error"
     assert named in answer["reason"]
     assert fake.calls == []
+
+
+def test_verbs_are_called_with_their_arguments(fake: FakeNetwork) -> None:
+    robot_mesh(action="move", target="arm-1", arguments={"x": 0.2, "y": 0.0, "z": 0.1})
+    robot_mesh(action="move", target="arm-1", verb="pick", arguments={"object": "cube"})
+    robot_mesh(action="call", target="base-1", verb="drive", arguments={"linear": 0.1})
+    robot_mesh(action="wait", target="arm-1")
+    assert [call[:4] for call in fake.calls] == [
+        ("call", "arm-1", "moveTo", {"x": 0.2, "y": 0.0, "z": 0.1}),
+        ("call", "arm-1", "pick", {"object": "cube"}),
+        ("call", "base-1", "drive", {"linear": 0.1}),
+        ("call", "arm-1", "wait", {}),
+    ]
+
+
+def test_picture_is_an_image_block(fake: FakeNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = success("front, 2 x 2 pixels.", camera="front") | {"jpeg": base64.b64encode(b"\xff\xd8x").decode()}
+    monkeypatch.setattr(networks, "network", lambda: SimpleNamespace(call=lambda *_: answer))
+    shown = robot_mesh(action="picture", target="arm-1", arguments={"camera": "front"})
+    assert shown["content"][-1] == {"image": {"format": "jpeg", "source": {"bytes": b"\xff\xd8x"}}}
+    assert "jpeg" not in shown
+    answer["jpeg"] = "no base64!"
+    assert "could not be decoded" in robot_mesh(action="picture", target="arm-1")["reason"]
 
 
 def test_one_silent_robot_makes_a_stop_an_error_that_names_it() -> None:

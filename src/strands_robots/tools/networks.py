@@ -278,6 +278,10 @@ class DeviceConnect:
         params = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
         return _on_fleet(lambda fleet: fleet.call(target, "execute", params, ANSWER_S))
 
+    def call(self, target: str, action: str, arguments: Mapping[str, Any], seconds: float = ANSWER_S) -> Envelope:
+        """Call any verb of the device."""
+        return _on_fleet(lambda fleet: fleet.call(target, action, dict(arguments), seconds))
+
     def status(self, target: str) -> Envelope:
         """Call the device's ``getStatus``."""
         return _on_fleet(lambda fleet: fleet.call(target, "getStatus", {}, ANSWER_S))

@@ -10,16 +10,24 @@
 
 from __future__ import annotations
 
+import base64
 from typing import Any
 
 from strands_robots.agent_tool import tool
+from strands_robots.arm_mixin import WAIT_S
 from strands_robots.envelope import error
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.tools import networks
-from strands_robots.utils import ValidationError, choice, device_id, text
+from strands_robots.utils import ValidationError, choice, device_id, identifier, mapping, text
 
-ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop", "release_torque")
-NEEDS_TARGET = ("tell", "status", "release_torque")
+CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
+"""Verb of each action that calls one where none is named."""
+
+ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop", "release_torque", "call", *CALLED)
+NEEDS_TARGET = ("tell", "status", "release_torque", "call", *CALLED)
+
+CALL_S = networks.ANSWER_S + WAIT_S
+"""Longest wait for the answer to a verb, which may wait for the end of a motion."""
 
 
 @tool
@@ -29,6 +37,9 @@ def robot_mesh(
     instruction: str = "",
     policy_provider: str = "mock",
     duration: float = 30.0,
+    *,
+    verb: str = "",
+    arguments: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Find robots, give them instructions, ask for their status, and stop them.
 
@@ -37,26 +48,49 @@ def robot_mesh(
     Args:
         action: peers lists the robots; tell gives one an instruction and returns once the motion has started; status
             returns what one is doing; stop stops one, or all without a target; emergency_stop stops and locks all;
-            release_torque stops one and switches its motors off, so that it falls, once its operator approved that.
-        target: The robot's id, as peers lists it. Needed by tell, status and release_torque.
+            release_torque stops one and switches its motors off, so that it falls, once its operator approved that;
+            move moves an arm (moveTo, or another verb) and returns what it reached; picture returns a camera's
+            picture (getPicture); wait waits for the end of a motion; call calls any verb that peers lists.
+        target: The robot's id, as peers lists it. Needed by all but peers, stop and emergency_stop.
         instruction: What to do, in plain language, 1 to 2000 characters. For emergency_stop: the reason.
         policy_provider: Policy that decides the actions, such as remote or lerobot_local; mock moves by itself and
             follows no instruction.
         duration: Longest time the motion may take, in seconds, above 0 and at most 3600.
+        verb: For call: the verb, such as getObjects, pick, drive or look. For move: moveTo (x, y, z in metres in the
+            base frame, x forward), moveBy (dx, dy, dz, or direction and distance), moveJoints (joints in degrees),
+            setGripper (opening 0 closed to 1 open), goTo (place), pick (object) or place (x, y, or on).
+        arguments: The verb's arguments by name, such as {"x": 0.25, "y": 0.0, "z": 0.1} or {"camera": "table"}.
     """
     try:
-        verb = choice("action", action, ACTIONS)
-        robot = device_id("target", target) if target or verb in NEEDS_TARGET else ""
-        if verb == "tell":
+        asked = choice("action", action, ACTIONS)
+        robot = device_id("target", target) if target or asked in NEEDS_TARGET else ""
+        if asked in CALLED or asked == "call":
+            name = identifier("verb", verb or CALLED.get(asked, ""))
+            given = mapping("arguments", {} if arguments is None else arguments)
+            return _with_image(networks.network().call(robot, name, given, CALL_S))
+        if asked == "tell":
             given = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
             task = ARM_VERBS["execute"].checked(given)
             return networks.network().tell(robot, task["instruction"], task["policy_provider"], task["duration"])
-        if verb == "emergency_stop":
+        if asked == "emergency_stop":
             return networks.network().emergency_stop(text("instruction", instruction, empty=True))
     except ValidationError as refused:
         return error(str(refused))
-    if verb == "stop":
+    if asked == "stop":
         return networks.network().stop(robot)
-    if verb == "release_torque":
+    if asked == "release_torque":
         return networks.network().release_torque(robot)
-    return networks.network().status(robot) if verb == "status" else networks.network().peers()
+    return networks.network().status(robot) if asked == "status" else networks.network().peers()
+
+
+def _with_image(answer: dict[str, Any]) -> dict[str, Any]:
+    """Return an answer whose picture is an image block, as models take it."""
+    encoded = answer.get("jpeg")
+    if not isinstance(encoded, str):
+        return answer
+    try:
+        image = base64.b64decode(encoded, validate=True)
+    except ValueError:
+        return error("The robot's picture could not be decoded.")
+    content = [*answer.get("content", []), {"image": {"format": "jpeg", "source": {"bytes": image}}}]
+    return {**{name: value for name, value in answer.items() if name != "jpeg"}, "content": content}
