@@ -38,3 +38,9 @@ def test_passphrase_is_asked_for_on_a_terminal_only(run: Run, tmp_path: Path) ->
     result = run("keys", "resume", str(tmp_path / "key.pem"))
     assert result.exit_code == 2
     assert "--passphrase-file" in result.stderr
+
+
+def test_console_key_is_made_once_and_printed_for_robots_elsewhere(run: Run) -> None:
+    first, again = (json.loads(run("keys", "console", "--json").stdout) for _ in range(2))
+    assert len(first["STRANDS_MESH_CONSOLE_PUBLIC_KEYS"]) == 44
+    assert first == again

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from strands_robots.mesh.console_keys import INPUT, ConsoleSigner
 from strands_robots.mesh.core import Mesh, Parts
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
@@ -113,6 +114,11 @@ def received(peers: Fleet, key: str) -> list[Message]:
     messages: list[Message] = []
     peers.stranger().declare_subscriber(key, lambda sample: messages.append(json.loads(sample.payload)))
     return messages
+
+
+def signed(peers: Fleet, frame: Message) -> Message:
+    """An input frame with the signature of this user's console."""
+    return ConsoleSigner(peers.clock).sign(frame, INPUT)
 
 
 class ScriptedPeer:

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh import keys, topics, wire
+from strands_robots.mesh import keys, registry, topics, wire
 from strands_robots.mesh.input import InputReceiver
 from strands_robots.mesh.security import ValidationError, validate_command, validate_input_frame
 from strands_robots.mesh.transport.bridge import SeenCommands
@@ -253,9 +253,9 @@ def test_invented_peers_do_not_fill_the_registry_beyond_its_bound(
     stranger = peers.stranger()
     for number in range(1500):
         stranger.put(f"strands/p{number}/presence", {"robot_id": f"p{number}", "timestamp": peers.clock()})
-    assert len(console.peers) <= 1024
-    assert console.get_peer("p1499") is not None
-    assert console.get_peer("p0") is None
+    assert len(console.peers) == registry.SESSION_PEERS_MAX
+    assert console.get_peer("p0") is not None
+    assert console.get_peer("p1499") is None
 
 
 @pytest.mark.parametrize(

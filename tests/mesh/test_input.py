@@ -14,7 +14,7 @@ from fixtures.devices import RecordingDevice
 from fixtures.leaders import ScriptedLeader
 from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
-from tests.mesh.peers import Fleet
+from tests.mesh.peers import Fleet, signed
 
 from strands_robots.envelope import success
 from strands_robots.hardware import HardwareRobot
@@ -50,7 +50,8 @@ class Stream:
     def frame(self, **fields: Any) -> dict[str, Any]:
         self.sequence += 1
         body = {"peer_id": "lead", "device": "leader", "method": "arm", "t": self.peers.clock(), "seq": self.sequence}
-        return {**body, "action": {"shoulder.pos": 1.0}, "events": None, **fields}
+        frame = {**body, "action": {"shoulder.pos": 1.0}, "events": None, **fields}
+        return signed(self.peers, frame)
 
     def send(self, **fields: Any) -> None:
         time.sleep(0.011)  # the cap is 100 a second

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
-from tests.mesh.peers import Fleet
+from tests.mesh.peers import Fleet, signed
 
 from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh.input import InputReceiver
@@ -66,7 +66,10 @@ def test_the_first_frame_of_a_simulation_is_bounded_from_where_its_robot_stands(
     try:
         for sequence, ahead in enumerate((1.0, 0.05)):
             action = {joint: joints[joint] + ahead}
-            leader.put("strands/lead/input/leader", {**frame, "t": peers.clock(), "seq": sequence, "action": action})
+            leader.put(
+                "strands/lead/input/leader",
+                signed(peers, {**frame, "t": peers.clock(), "seq": sequence, "action": action}),
+            )
         eventually(lambda: receiver.stats["frames_received"] == 1)
     finally:
         receiver.stop()
@@ -80,9 +83,15 @@ def test_a_value_beyond_its_joints_scale_moves_nothing(arm: HardwareRobot, peers
     receiver.start()
     frame: dict[str, Any] = {"peer_id": "lead", "device": "leader", "method": "arm", "events": None}
     try:
-        leader.put("strands/lead/input/leader", {**frame, "t": peers.clock(), "seq": 1, "action": {"pan.pos": 250.0}})
+        leader.put(
+            "strands/lead/input/leader",
+            signed(peers, {**frame, "t": peers.clock(), "seq": 1, "action": {"pan.pos": 250.0}}),
+        )
         eventually(lambda: receiver.stats["rejected_invalid"] == 1)
-        leader.put("strands/lead/input/leader", {**frame, "t": peers.clock(), "seq": 2, "action": {"pan.pos": 15.0}})
+        leader.put(
+            "strands/lead/input/leader",
+            signed(peers, {**frame, "t": peers.clock(), "seq": 2, "action": {"pan.pos": 15.0}}),
+        )
         eventually(lambda: receiver.stats["frames_received"] == 1)
     finally:
         receiver.stop()

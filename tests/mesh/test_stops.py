@@ -43,7 +43,9 @@ def test_a_stop_does_not_wait_for_a_stream_whose_frame_hangs(peers: Fleet, monke
     opened = console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=20)
     assert opened["result"]["status"] == "success"
     frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1}
-    leader.publish("strands/lead/input/leader", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+    leader.publish(
+        "strands/lead/input/leader", leader.sign_input({**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+    )
     assert arm.inside.wait(20)
     answers: list[Any] = []
     asking = threading.Thread(target=lambda: answers.append(console.send("arm-1", {"action": "stop"}, timeout=20)))
@@ -73,7 +75,10 @@ def test_a_stop_is_answered_while_the_frames_of_every_stream_hang(
         receive = {"action": "teleop_receive", "source_peer_id": "lead", "device_name": device}
         assert console.send("arm-1", receive, timeout=20)["result"]["status"] == "success"
         frame = {"peer_id": "lead", "device": device, "method": "arm", "t": peers.clock(), "seq": 1}
-        leader.publish(f"strands/lead/input/{device}", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+        leader.publish(
+            f"strands/lead/input/{device}",
+            leader.sign_input({**frame, "action": {"shoulder.pos": 1.0}, "events": None}),
+        )
         assert arm.inside.wait(20)
         arm.inside.clear()
     assert console.send("arm-1", {"action": "stop"}, timeout=20)["result"]["ok"] is True
@@ -229,7 +234,9 @@ def test_a_frame_that_waits_for_the_bus_is_refused_after_a_stop(peers: Fleet, mo
     console, leader = peers.join(None, "console"), peers.join(None, "lead")
     console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=20)
     frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1}
-    leader.publish("strands/lead/input/leader", {**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+    leader.publish(
+        "strands/lead/input/leader", leader.sign_input({**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+    )
     assert arm.inside.wait(20)
     asking = threading.Thread(target=lambda: console.send("arm-1", {"action": "stop"}, timeout=20))
     asking.start()

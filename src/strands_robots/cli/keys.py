@@ -30,6 +30,7 @@ def register(app: typer.Typer) -> None:
     keys = typer.Typer(no_args_is_help=True, help="Keys that free robots and sign their stops.")
     command(keys, "resume")(resume)
     command(keys, "estop")(estop)
+    command(keys, "console")(console)
     app.add_typer(keys, name="keys")
     mesh = typer.Typer(no_args_is_help=True, help="The native mesh: certificates and access rules.")
     mesh_keys = typer.Typer(no_args_is_help=True, help="Certificates for a mesh that leaves this machine.")
@@ -48,6 +49,16 @@ def resume(screen: Screen, *, file: KeyFile, passphrase_file: PassphraseFile = N
 def estop(screen: Screen, *, file: KeyFile, passphrase_file: PassphraseFile = None) -> None:
     """Make a safety controller's signing key, and print the setting that robots need for it."""
     _make_key(screen, file, passphrase_file, "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS")
+
+
+def console(screen: Screen) -> None:
+    """Print the public key of this user's consoles, for robots on other machines."""
+    from strands_robots.mesh.console_keys import console_key  # noqa: PLC0415 - loaded when it is used
+
+    public = _refusable(lambda: console_key().load_or_make()).public_text
+    screen.data({"status": "success", "STRANDS_MESH_CONSOLE_PUBLIC_KEYS": public})
+    screen.say("Robots of this user on this machine know it. On each robot's machine set:", "green")
+    screen.copyable(f"export STRANDS_MESH_CONSOLE_PUBLIC_KEYS={public}")
 
 
 def init(screen: Screen, folder: Folder = DEFAULT_FOLDER) -> None:

@@ -11,11 +11,10 @@ from typing import Any
 from strands_robots.contract import Haltable, Robot, WorldRobot
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
+from strands_robots.mesh.console_keys import MOTION
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
-from strands_robots.safety.approval import Approval
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.robot_verbs import PEER_VERBS, RobotStop, peer_stop_answer, run_to_end, stop_within
@@ -32,8 +31,9 @@ REPLAYED = "replay rejected"
 LOCKED = "command rejected"
 DISPATCH = "dispatch error"
 BUSY = "busy"
+NO_ROOTS = "this peer has no roots to check signatures against"
 PING = {"action": "ping"}
-"""The command of a bare ping: nothing in it needs checking, and its answer is nothing."""
+"""The command of a bare ping: nothing in it needs checking."""
 
 HALT = "stop over the mesh"
 LOG_EVERY_S = 1.0
@@ -58,7 +58,7 @@ class SenderCheck:
 
     def __call__(self, command: Command, arguments: Arguments) -> None:
         """Raise :class:`Refused` where the sender may not."""
-        request, sample = command.proof
+        request: wire.Request = command.proof
         # What only takes energy away is done twice, and whatever the sender's clock says: refusing one as a replay
         # could only leave a robot moving.
         if command.verb.kind in (Kind.MOTION, Kind.RESUME):
@@ -67,17 +67,27 @@ class SenderCheck:
             if not self._replays.first((request.sender_id, request.turn_id)):
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the turn was carried out before")
         if self._hardware and command.verb.kind is Kind.MOTION:
-            why = self._unattributed(request, sample)
+            why = self._unproven(request)
             if why is not None:
-                text = Approval.refusal(command.verb.name, self._context.peer_id)
-                raise Refused(RefusalReason.APPROVAL, text, reason=why)
+                text = (
+                    f"{command.verb.name} moves real hardware, and its sender cannot be attributed: {why}. A console "
+                    f"on another machine is enrolled at this one, besides operator approval."
+                )
+                raise Refused(RefusalReason.APPROVAL, text, reason=f"the sender is not attributed: {why}")
 
-    def _unattributed(self, request: wire.Request, sample: Sample) -> str | None:
+    def _unproven(self, request: wire.Request) -> str | None:
+        """Return the reason why nothing proves the sender, or None.
+
+        The session on a sample is no proof: its publisher chooses it.
+        """
         context = self._context
-        if context.identity.required:
-            return context.identity.refusal(request.body, request.sender_id)
-        found = attribute(context.registry.session_of(request.sender_id), sample)
-        return None if found.proven else f"the sender is not attributed: {found.value}"
+        certified = context.identity.refusal(request.body, request.sender_id) if context.identity.checks else NO_ROOTS
+        if context.identity.required or certified is None:
+            return certified or self._elsewhere(request)
+        return context.consoles.refusal(request.body, MOTION) or self._elsewhere(request)
+
+    def _elsewhere(self, request: wire.Request) -> str | None:
+        return None if request.is_for(self._context.peer_id) else "it was signed for another peer"
 
 
 def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
@@ -97,6 +107,11 @@ def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
 def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lambda: False) -> Own:
     """Make the ``execute`` of a peer: a policy runs to its end."""
     return lambda arguments: run_to_end(robot, arguments, lambda: closed() or not context.running())
+
+
+def pong(context: Context) -> dict[str, Any]:
+    """Return the answer to a ping; peers in the field take one without ``pong`` for none."""
+    return {"pong": True, "peer_id": context.peer_id, "t": context.clock()}
 
 
 class CommandReceiver:
@@ -137,7 +152,7 @@ class CommandReceiver:
             context.audit("command_rejected", reason=str(exc))
             return
         if request.command == PING:
-            self._reply(request.sender_id, request.turn_id, result={})
+            self._reply(request.sender_id, request.turn_id, result=pong(context))
             return
         verb = self._verb_of(request)
         if verb is None:
@@ -147,7 +162,7 @@ class CommandReceiver:
             return
         named = request.command.get("robot_name")
         asked = self._pipeline.pending.arrive(named if isinstance(named, str) else "")
-        command = Command(verb, request.command, request.sender_id, asked, (request, sample))
+        command = Command(verb, request.command, request.sender_id, asked, request)
         answered = partial(self._answer, request, verb)
         if verb.name == "ping":
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from strands_robots.mesh.console_keys import ConsoleSigner, ConsoleTrust
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Transport, TransportError
@@ -25,6 +26,7 @@ class Context:
         monotonic: seconds, for ages.
         audit: records refusals; ``audit.always`` records what may never be left out.
         transport: None while the peer is not on the mesh.
+        console: signs what moves real hardware; ``consoles`` checks such signatures.
     """
 
     peer_id: str
@@ -34,6 +36,8 @@ class Context:
     clock: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic
     transport: Transport | None = field(default=None)
+    console: ConsoleSigner = field(default_factory=ConsoleSigner)
+    consoles: ConsoleTrust = field(default_factory=ConsoleTrust)
 
     def running(self) -> bool:
         return self.transport is not None and self.transport.is_alive()

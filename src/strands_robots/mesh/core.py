@@ -7,7 +7,7 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
@@ -15,9 +15,10 @@ from typing import Any
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.contract import WorldRobot, body_of
-from strands_robots.mesh import session, topics
+from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.children import Children
-from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on
+from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on, pong
+from strands_robots.mesh.console_keys import INPUT, ConsoleSigner, ConsoleTrust
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.hearing import Hearing
@@ -108,6 +109,7 @@ class Mesh(SensorLoopsMixin):
         self._parts = parts or Parts()
         self._lifecycle_lock = threading.Lock()
         self._frames: dict[str, count[int]] = {}
+        self._newest_input: dict[tuple[str, str], tuple[float, float]] = {}
         key = _safety_key(self.robot, self.peer_id, keep=self._parts.keep)
         # A locked robot that leaves the mesh stays on the safety plane: to leave and join again must not unlock it.
         self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane)
@@ -120,6 +122,8 @@ class Mesh(SensorLoopsMixin):
         self._context = context = Context(
             peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
         )
+        context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
+        self._hardware = hardware
         self._handles: list[Declaration] = []
         self._inputs: dict[str, dict[str, Any]] = {}
         self._scheduler = Scheduler(f"mesh-{peer}")
@@ -137,7 +141,7 @@ class Mesh(SensorLoopsMixin):
             "teleop_status": self._teleop.status,
             "teleop_receive": self._teleop.receive,
             "teleop_stop": self._teleop.stop,
-            "ping": lambda arguments: {},
+            "ping": lambda arguments: pong(context),
             "resume": lambda arguments: self._safety.on_resume_command(arguments.get("assertion")),
         }
         if robot is not None:
@@ -446,6 +450,30 @@ class Mesh(SensorLoopsMixin):
         """The number of the next frame of an input stream. It rises for as long as this peer lives, so that a follower
         does not take a leader that began again for one of its own earlier frames."""
         return next(self._frames.setdefault(device, count()))
+
+    def sign_input(self, frame: dict[str, Any]) -> dict[str, Any]:
+        """Return an input frame signed by our certificate, else by this user's console."""
+        identity = self._context.identity
+        return identity.sign(frame) if identity.signs else self._context.console.sign(frame, INPUT)
+
+    def input_refusal(self, frame: Mapping[str, Any]) -> str | None:
+        """Return the reason why a frame may not move this peer's robot, or None.
+
+        Only real hardware asks for a signature, and takes each signed frame once, also on a stream that was reopened.
+        """
+        if not self._hardware:
+            return None
+        identity, source = self._context.identity, str(frame.get("peer_id"))
+        certified = identity.refusal(frame, source) if identity.checks else "no certificate is checked here"
+        why = certified and (certified if identity.required else self._context.consoles.refusal(frame, INPUT))
+        if why is not None:
+            return why
+        stream, sequence = (source, str(frame.get("device"))), wire.finite(frame.get("seq")) or 0.0
+        newest = (wire.finite(frame.get("t")) or 0.0, sequence)
+        if newest <= self._newest_input.get(stream, (0.0, -1.0)):
+            return "it is no newer than the last one"
+        self._newest_input[stream] = newest
+        return None
 
     def record(self, event: str, about: str, **payload: Any) -> None:
         """Record an event about a peer in the audit log."""

@@ -51,7 +51,7 @@ class MeshInputSink:
             "action": dict(action),
             "events": None if events is None else {str(key): bool(value) for key, value in events.items()},
         }
-        self._mesh.publish(topics.input_stream(self._mesh.peer_id, device), frame)
+        self._mesh.publish(topics.input_stream(self._mesh.peer_id, device), self._mesh.sign_input(frame))
 
 
 class InputPublisher:

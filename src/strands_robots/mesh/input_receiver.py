@@ -57,6 +57,9 @@ class FollowerMesh(Protocol):
     def now(self) -> float:
         """Return wall-clock seconds."""
 
+    def input_refusal(self, frame: Mapping[str, Any]) -> str | None:
+        """Return the reason why a frame may not move the peer's robot, or None."""
+
 
 class InputReceiver:
     """Applies a remote peer's actions to ``robot``.
@@ -237,6 +240,12 @@ class InputReceiver:
             return None
         if sequence <= self._sequence:
             self._counts["out_of_order"] += 1
+            return None
+        why = self._mesh.input_refusal(frame)
+        if why is not None or frame.get("peer_id") != self._source or frame.get("device") != self._device:
+            self._counts["source"] += 1
+            if self._counts["source"] <= LOGGED_ERRORS:
+                logger.warning("%s: not applied: %s", self.topic, why or "the topic and the body disagree")
             return None
         self._sequence = sequence
         now = time.monotonic()

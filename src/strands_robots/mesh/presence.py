@@ -26,6 +26,7 @@ RETURN_S = 2.0
 """Seconds after our own link is back, within which the tokens of living peers are back as well."""
 
 LEAVING_MAX = 4096
+SKEWED_MAX = 64
 
 
 class PresencePublisher:
@@ -48,6 +49,7 @@ class PresencePublisher:
         self._type = peer_type
         self._describe = describe
         self._safety = safety
+        self._skewed: set[str] = set()
         self._facts: dict[str, Any] = {}
         self._troubles = TroubleLog(logger)
         self.described = threading.Event()
@@ -117,8 +119,10 @@ class PresencePublisher:
         if peer == context.peer_id:
             self._audit_impostor(sample)
             return
+        ahead = presence.timestamp - context.clock()
         if not wire.fresh(presence.timestamp, context.clock()):
             context.audit("presence_rejected", peer, reason="the timestamp is not fresh")
+            self._name_skew(peer, ahead)
             return
         if sample.sessionless and not _owns_topic(sample.key, peer):
             context.audit("presence_rejected", peer, reason="the topic and the body disagree")
@@ -137,11 +141,25 @@ class PresencePublisher:
         if bound is not None:
             context.audit("presence_identity_conflict", peer, held=bound, offered=session)
             return
+        if context.registry.full_for(peer, session):
+            context.audit("presence_left_out", reason="the table of peers is full, or its session announced too many")
+            return
         facts = presence.facts()
         if context.registry.update(
             peer, presence.robot_type, presence.hostname, facts, session=session, certificate=certificate
         ):
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
+
+    def _name_skew(self, peer: str, ahead: float) -> None:
+        """Log once a peer that is left out for its clock, for a bounded number."""
+        if len(self._skewed) < SKEWED_MAX and peer not in self._skewed:
+            self._skewed.add(peer)
+            logger.warning(
+                "%s is left out: its clock is %.0f s %s of ours, and a heartbeat may be 5 s ahead and 60 s behind.",
+                peer,
+                abs(ahead),
+                "ahead" if ahead > 0 else "behind",
+            )
 
     def on_token(self, key: str, alive: bool) -> None:
         """Note a token that came or went, for :meth:`judge_tokens`."""

@@ -19,6 +19,8 @@ PEER_TIMEOUT = 10.0
 """Seconds of silence after which a peer is out of reach."""
 
 PAST_MAX = 1024
+SESSION_PEERS_MAX = 256
+"""Peers that one session may announce: a process with several worlds, and no flood of invented names."""
 
 
 class Attribution(Enum):
@@ -52,7 +54,7 @@ def attribute(bound: str | None, sample: Sample) -> Attribution:
 
 @dataclass(frozen=True, slots=True)
 class PeerInfo:
-    """One row; ``seen`` is monotonic, ``gone`` means that its session ended."""
+    """One row; ``since`` and ``seen`` time its first and last heartbeat."""
 
     peer_id: str
     peer_type: str
@@ -62,6 +64,11 @@ class PeerInfo:
     session: str | None = None
     certificate: tuple[str, str] | None = None
     gone: bool = False
+    since: float = 0.0
+
+    def living(self, now: float) -> bool:
+        """True while the peer counts as there."""
+        return not self.gone and now - self.seen <= PEER_TIMEOUT
 
     def to_dict(self, now: float) -> dict[str, Any]:
         """Return the presence fields, and over them those that are decided here."""
@@ -72,7 +79,7 @@ class PeerInfo:
             "type": self.peer_type,
             "hostname": self.hostname,
             "age": round(age, 3),
-            "reachable": age <= PEER_TIMEOUT and not self.gone,
+            "reachable": self.living(now),
         }
 
 
@@ -81,7 +88,8 @@ class PeerRegistry:
 
     Args:
         clock: monotonic seconds.
-        most: returns the bound on rows; the longest silent one is dropped first.
+        most: returns the bound on rows. A silent row makes place, the longest silent first; a living one never does,
+            so a newcomer to a full table is left out.
         retention: returns the seconds for which a silent peer stays listed as out of reach.
     """
 
@@ -96,7 +104,7 @@ class PeerRegistry:
         self._retention = retention
         self._lock = threading.Lock()
         self._rows: dict[str, PeerInfo] = {}
-        self._past: dict[str, float] = {}
+        self._past: dict[str, tuple[float, float]] = {}
 
     def update(
         self,
@@ -108,23 +116,52 @@ class PeerRegistry:
         session: str | None = None,
         certificate: tuple[str, str] | None = None,
     ) -> bool:
-        """Insert or refresh a row; True when the peer is new.
+        """Insert or refresh a row; True when the peer is new and has a row now.
 
         A living peer that states no session or no certificate keeps the one that it is bound to.
         """
         now = self._clock()
         with self._lock:
+            known = self._rows.get(peer_id)
+            if known is None and not self._has_place(session, now):
+                return False
             # Taken out and put in again, so that the rows are in the order of their last heartbeat.
-            known = self._rows.pop(peer_id, None)
-            if known is not None and not known.gone and now - known.seen <= PEER_TIMEOUT:
-                session = session if session is not None else known.session
-                certificate = certificate if certificate is not None else known.certificate
-            row = PeerInfo(peer_id, peer_type, hostname, now, dict(caps), session, certificate)
-            self._past.pop(peer_id, None)
+            self._rows.pop(peer_id, None)
+            since = self._past.pop(peer_id, (now, now))[1]
+            if known is not None:
+                since = known.since
+                if known.living(now):
+                    session = session if session is not None else known.session
+                    certificate = certificate if certificate is not None else known.certificate
+            row = PeerInfo(peer_id, peer_type, hostname, now, dict(caps), session, certificate, since=since)
             self._rows[peer_id] = row
-            while len(self._rows) > max(1, self._most()):
-                del self._rows[next(iter(self._rows))]
         return known is None
+
+    def full_for(self, peer_id: str, session: str | None) -> bool:
+        """True when a heartbeat of this newcomer would be left out."""
+        with self._lock:
+            return peer_id not in self._rows and not self._has_place(session, self._clock(), make=False)
+
+    def _has_place(self, session: str | None, now: float, *, make: bool = True) -> bool:
+        """True when a newcomer of ``session`` fits; silent rows may be dropped for it."""
+        of_session = sum(row.session == session for row in self._rows.values()) if session is not None else 0
+        if of_session >= SESSION_PEERS_MAX:
+            return False
+        over = len(self._rows) + 1 - max(1, self._most())
+        if over <= 0:
+            return True
+        silent = [peer for peer, row in self._rows.items() if not row.living(now)][:over]
+        if len(silent) < over:
+            return False
+        for peer in silent if make else ():
+            self._remember(peer, self._rows.pop(peer))
+        return True
+
+    def _remember(self, peer_id: str, row: PeerInfo) -> None:
+        """Note a peer whose row is dropped; the shortest stay is forgotten first."""
+        self._past[peer_id] = (row.seen, row.since)
+        if len(self._past) > PAST_MAX:
+            del self._past[min(self._past, key=lambda each: self._past[each][0] - self._past[each][1])]
 
     def conflicts(self, peer_id: str, session: str | None, *, certified: bool = False) -> str | None:
         """Return the binding that rules out a heartbeat from ``session``, else None.
@@ -133,7 +170,7 @@ class PeerRegistry:
         itself with when the heartbeat is not ``certified`` for the peer.
         """
         row = self._row(peer_id)
-        if row is None or row.gone or self._clock() - row.seen > PEER_TIMEOUT:
+        if row is None or not row.living(self._clock()):
             return None
         if row.session is not None and row.session != session:
             return row.session
@@ -178,16 +215,15 @@ class PeerRegistry:
         with self._lock:
             gone = [peer for peer, row in self._rows.items() if now - row.seen > limit]
             for peer in gone:
-                self._past[peer] = self._rows.pop(peer).seen
-            while len(self._past) > PAST_MAX:
-                del self._past[next(iter(self._past))]
+                self._remember(peer, self._rows.pop(peer))
         return gone
 
     def seen_within(self, seconds: float) -> set[str]:
         """Ids of peers seen in the last ``seconds``, dropped ones included."""
         now = self._clock()
         with self._lock:
-            seen = {**self._past, **{peer: row.seen for peer, row in self._rows.items()}}
+            past = {peer: seen for peer, (seen, _) in self._past.items()}
+            seen = {**past, **{peer: row.seen for peer, row in self._rows.items()}}
         return {peer for peer, at in seen.items() if now - at <= seconds}
 
     def _row(self, peer_id: str) -> PeerInfo | None:

@@ -12,12 +12,14 @@ from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from strands_robots.mesh import topics, wire
+from strands_robots.mesh import console_keys, topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.security import validate_command
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.stopping import Outcome, grade
+from strands_robots.serving.robot_verbs import PEER_VERBS
+from strands_robots.serving.verbs import Kind
 from strands_robots.utils import ValidationError, number, shown
 
 logger = logging.getLogger(__name__)
@@ -233,9 +235,13 @@ class Requester:
 
     def _publish(self, key: str, command: dict[str, Any], turn: Turn, seconds: float | None = None) -> str | None:
         context = self._context
-        request = wire.Request(context.peer_id, self._open(turn), command, context.clock())
+        target = wire.BROADCAST_TARGET if key == topics.broadcast() else key.split("/")[1]
+        request = wire.Request(context.peer_id, self._open(turn), command, context.clock(), target_id=target)
+        body = request.to_wire()
+        if PEER_VERBS[command["action"]].kind is Kind.MOTION:
+            body = context.console.sign(body, console_keys.MOTION)
         try:
-            body = context.identity.sign(request.to_wire())
+            body = context.identity.sign(body)
             transport = context.transport
             if seconds is not None and transport is not None and transport.confirms:
                 turn.via = "direct"

@@ -19,6 +19,9 @@ from strands_robots.utils import ValidationError, identifier, shown
 FRESH_S = 60.0
 AHEAD_S = 5.0
 
+BROADCAST_TARGET = "<broadcast>\x00"
+"""The target of a command to all; the NUL keeps it apart from every peer id."""
+
 
 class WireError(StrandsRobotsError, ValueError):
     """Bytes that are no message of this wire; the message says why."""
@@ -141,6 +144,7 @@ class Request:
     command: Any
     timestamp: float | None
     body: Mapping[str, Any] = field(default_factory=dict)
+    target_id: str = ""
 
     def to_wire(self) -> dict[str, Any]:
         return {
@@ -148,7 +152,12 @@ class Request:
             "turn_id": self.turn_id,
             "command": self.command,
             "timestamp": self.timestamp,
+            "target_id": self.target_id,
         }
+
+    def is_for(self, peer_id: str) -> bool:
+        """True where the stated target is the peer, or all of them."""
+        return self.body.get("target_id") in (peer_id, BROADCAST_TARGET)
 
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Request:

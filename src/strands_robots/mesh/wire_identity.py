@@ -200,6 +200,11 @@ class Identity:
         return None
 
     @property
+    def signs(self) -> bool:
+        """True when this peer holds a certificate."""
+        return self._signer is not None
+
+    @property
     def checks(self) -> bool:
         """True when there are roots to check a signature against."""
         return self._verifier is not None

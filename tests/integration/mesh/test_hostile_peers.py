@@ -232,6 +232,7 @@ def floods(attacker: Attacker) -> dict[str, Callable[[int], tuple[str, object]]]
         "hand": lambda n: ("strands/m/hand/left/state", {"peer_id": "m", "t": now}),
         "resume": lambda n: ("strands/safety/resume",
                              {"peer_id": "m", "t": now, "assertion": assertion, "source_zid": zid}),
+        "checkin": lambda n: ("strands/m/checkin", {"peer_id": "m", "t": now, "n": n}),
         "other": lambda n: ("strands/m/anything/else", b"{" * 100),
     }  # fmt: skip
     for name, leaf in sensors.items():

@@ -86,9 +86,11 @@ def test_peers_command_each_other_and_report_the_delivery(join: Join) -> None:
 
 
 @pytest.mark.system
-def test_real_hardware_cannot_be_moved_by_a_sender_that_no_session_proves(join: Join) -> None:
+def test_real_hardware_cannot_be_moved_by_a_sender_that_no_session_proves(join: Join, tmp_path: Path) -> None:
     join("arm-1", "arm", BYPASS_TOOL_CONSENT="true")
     console = join("console", "none")
+    # Another user's console: it makes a key that the arm does not know.
+    (tmp_path / "console" / "keys" / "consoles" / "console.key").unlink()
     console.sees("arm-1")
     start = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
     assert "operator approval" in console.ask("send", "arm-1", start, 20)["error"]

@@ -137,7 +137,7 @@ def test_a_leader_in_another_process_moves_the_follower_until_it_is_stopped(join
     def lead(first: int, count: int) -> None:
         for number in range(first, first + count):
             frame = {"peer_id": "leader-1", "device": "leader", "method": "arm", "t": time.time(), "seq": number}
-            leader.ask("publish", "strands/leader-1/input/leader", {**frame, "action": {"j": number / 10}})
+            leader.ask("frame", "strands/leader-1/input/leader", {**frame, "action": {"j": number / 10}})
             time.sleep(0.02)
 
     # One after another: delayed frames that arrive together may be dropped.

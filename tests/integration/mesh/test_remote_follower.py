@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from fixtures.command_line import COMMAND
 from fixtures.leaders import write_csv
-from fixtures.mesh_peer import MeshPeer
+from fixtures.mesh_peer import MeshPeer, share_console_key
 from fixtures.waiting import eventually
 
 Join = Callable[..., MeshPeer]
@@ -30,6 +30,7 @@ def wave(tmp_path: Path) -> Path:
 def replay(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("STRANDS_MESH_PORT", str(port))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
+    share_console_key(tmp_path)
 
     def start(*arguments: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
