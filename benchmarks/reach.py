@@ -99,7 +99,8 @@ def grasping(arm: str, count: int, error_m: float, must: float) -> Row:
     share = 100 * good / count
     known = f", the pose known to {1000 * error_m:.0f} mm" if error_m else ""
     return Row(
-        f"pick and place on the {arm.upper()}, {count} cubes of 2 to 3 cm, random yaw{known}: lifted, then upright "
+        f"pick and place, physics stepped by hand, on the {arm.upper()}, {count} cubes of 2 to 3 cm, random "
+        f"yaw{known}: lifted, then upright "
         f"within {1000 * NEAR_M:.0f} mm of the goal",
         f"{share:.0f} %, median miss {1000 * np.median(misses):.1f} mm",
         "",

@@ -11,15 +11,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
+from strands_robots.arm_mixin import WAIT_S
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, first_line, label, plain, table
 from strands_robots.envelope import is_error, text_of
+from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.tools.networks import NativeMesh
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.discovery import Peer
+
+
+CALL_S = 10.0
+MOTION_S = CALL_S + WAIT_S
+"""Seconds to wait for a verb that may wait for the end of a motion."""
 
 
 def register(app: typer.Typer) -> None:
@@ -65,13 +72,17 @@ def call(
     device: Annotated[str, typer.Argument(help="The device's id.")],
     function: Annotated[str, typer.Argument(help="Such as getStatus.")],
     arguments: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...")] = None,
-    timeout: Timeout = 10.0,
+    timeout: Annotated[
+        float | None,
+        typer.Option("--timeout", help=f"Seconds to wait for an answer: {CALL_S:g}, or {MOTION_S:g} for a motion."),
+    ] = None,
     source: Annotated[str, typer.Option("--as", help="Name of the caller that goes with the call.")] = SOURCE,
     on_mesh: OnMesh = False,
 ) -> None:
     """Call a function of a device. A value is read as JSON where that is possible, else as text."""
     params = assignments(arguments or [])
-    seconds = number("--timeout", timeout, above=0, high=3600)
+    usual = MOTION_S if function in ARM_MOTION_VERBS and ARM_MOTION_VERBS[function].lasts else CALL_S
+    seconds = number("--timeout", usual if timeout is None else timeout, above=0, high=3600)
     if on_mesh:
         network.use_mesh()
         answer = NativeMesh().call(device, function, params, seconds)
