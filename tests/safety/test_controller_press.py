@@ -21,10 +21,10 @@ class PatchyLink:
     def __init__(self, lost: int = 0) -> None:
         self.up, self._lost = True, lost
         self.sent: list[bytes] = []
-        self._hear: Callable[[str, str, bytes], None] = lambda event, source, payload: None
+        self.hear: Callable[[str, str, bytes], None] = lambda event, source, payload: None
 
     def open(self, events: object, hear: Callable[[str, str, bytes], None], on_state: object) -> None:
-        self._hear = hear
+        self.hear = hear
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
         if event != ESTOP:
@@ -33,7 +33,7 @@ class PatchyLink:
         if len(self.sent) <= self._lost:
             return False
         answer = {"device_id": "arm-1", "estop_id": self.params[-1]["estop_id"], "stopped": True}
-        self._hear(VERDICT, "arm-1", notification(VERDICT, answer))
+        self.hear(VERDICT, "arm-1", notification(VERDICT, answer))
         return True
 
     @property
@@ -86,3 +86,11 @@ def test_presses_are_remembered_in_bounds() -> None:
     for number in range(1, PRESSES_MAX + 2):
         controller.press(f"{number:032x}")
     assert controller.press("0" * 32) != first
+
+
+def test_a_signed_stop_is_repeated_often_in_its_first_half_second() -> None:
+    bare, signed = PatchyLink(lost=10**6), PatchyLink(lost=10**6)
+    SafetyController("safety-1", lambda: bare).stop(["arm-1"], deadline_s=0.5)
+    key = Ed25519PrivateKey.generate()
+    SafetyController("safety-1", lambda: signed, signing_key=key).stop(["arm-1"], deadline_s=0.5)
+    assert len(bare.sent) <= 10 < len(signed.sent)
