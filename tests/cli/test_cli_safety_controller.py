@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import threading
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from rich.console import Console
 from strands_robots.cli import safety_controller
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.safety_controller import FleetScreen, StopButton
+from strands_robots.cli.stop import style_of
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
@@ -33,6 +35,8 @@ class FakeController:
         self.links: list[bool] = []
         self.refused: dict[str, Answer] = {}
         self.silent: list[tuple[str, ...]] = []
+        self.stopped: dict[str, Answer] = {}
+        self.late: dict[str, Answer] = {}
 
     def press(self, estop_id: str) -> None:
         self.presses.append(estop_id)
@@ -42,7 +46,12 @@ class FakeController:
         self.expected.append(expected)
         assert self.answer.wait(60.0)
         link = self.links.pop(0) if self.links else True
-        return StopReport(estop_id, {}, {}, self.refused, self.silent.pop(0) if self.silent else (), link, 1.0)
+        on_progress(Progress(estop_id, self.stopped, (), link, 1.0))
+        silent = self.silent.pop(0) if self.silent else ()
+        return StopReport(estop_id, self.stopped, {}, self.refused, silent, link, 1.0)
+
+    def review(self, report: StopReport) -> StopReport:
+        return replace(report, stopped={}, not_stopped=self.late) if self.late else report
 
 
 @pytest.fixture
@@ -127,6 +136,22 @@ def test_screen_says_how_long_ago_a_stop_was_pressed(controller: FakeController)
     eventually(lambda: not button.running)
     button.progress = Progress("e" * 32, {"arm-1": Answer("arm-1", True, 11_021.0, "")}, (), True, 11_021.0, 11_000.0)
     assert "stopped 11.0 s after the press" in drawn(fleet, button)
+
+
+def test_screen_turns_red_when_a_robot_says_later_that_it_did_not_stop(controller: FakeController) -> None:
+    fleet, button = FleetScreen(controller, loopback_config(), None), made(controller)  # type: ignore[arg-type]
+    fleet.update([LockoutReport("arm-1")])
+    controller.stopped = {"arm-1": Answer("arm-1", True, 8.0, "")}
+    button.press()
+    eventually(lambda: button.report is not None and not button.running)
+    button.review()
+    assert "stopped in 8.0 ms" in drawn(fleet, button)
+    controller.late = {"arm-1": Answer("arm-1", False, 4000.0, "arm-1: it moved")}
+    button.review()
+    assert button.report is not None
+    assert style_of(button.report) == "bold red"
+    assert "1 DID NOT STOP" in drawn(fleet, button)
+    assert "stopped in 8.0 ms" not in drawn(fleet, button)
 
 
 def drawn(fleet: FleetScreen, button: StopButton) -> str:

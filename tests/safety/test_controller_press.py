@@ -94,3 +94,29 @@ def test_a_signed_stop_is_repeated_often_in_its_first_half_second() -> None:
     key = Ed25519PrivateKey.generate()
     SafetyController("safety-1", lambda: signed, signing_key=key).stop(["arm-1"], deadline_s=0.5)
     assert len(bare.sent) <= 10 < len(signed.sent)
+
+
+def test_an_answer_that_arrives_after_the_controller_returned_is_in_its_review() -> None:
+    link = PatchyLink()
+    controller = SafetyController("safety-1", lambda: link)
+    report = controller.stop(["arm-1"], deadline_s=20)
+    assert report.ok
+    assert controller.review(report) is report
+    late = {"device_id": "arm-1", "estop_id": report.estop_id, "stopped": False, "not_stopped": {"arm-1": "it moved"}}
+    link.hear(VERDICT, "stranger", notification(VERDICT, {**late, "device_id": "stranger"}))
+    link.hear(VERDICT, "arm-1", notification(VERDICT, late))
+    reviewed = controller.review(report)
+    assert not reviewed.ok
+    assert reviewed.not_stopped.keys() == {"arm-1"}
+    assert reviewed.not_stopped["arm-1"].why == "arm-1: it moved"
+    assert reviewed.elapsed_ms == report.elapsed_ms
+    assert controller.review(reviewed) is reviewed
+
+
+def test_only_the_latest_stop_is_reviewed() -> None:
+    link = PatchyLink()
+    controller = SafetyController("safety-1", lambda: link)
+    first = controller.stop(["arm-1"], deadline_s=20)
+    controller.stop(["arm-1"], deadline_s=20)
+    link.hear(VERDICT, "arm-1", notification(VERDICT, {"estop_id": first.estop_id, "stopped": False}))
+    assert controller.review(first) is first

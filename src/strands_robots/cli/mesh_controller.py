@@ -84,6 +84,10 @@ class MeshController:
             (time.monotonic() - pressed.at) * 1000,
         )
 
+    def review(self, report: StopReport) -> StopReport:
+        """Return the report as it is: a peer answers a stop once."""
+        return report
+
     def reports(self, known: Collection[str], seconds: float) -> list[LockoutReport]:
         """Ask the robots in reach and those known for their lockouts."""
         return ask_peers(self._mesh, sorted({*lockable_peers(self._mesh), *known}), seconds)

@@ -11,6 +11,7 @@ import time
 import tty
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -116,6 +117,7 @@ def _run(screen: Screen, controller: SafetyController | MeshController, fleet: F
         try:
             with Live(fleet.draw(button, lines), console=screen.out, screen=True, auto_refresh=False) as live:
                 while not done.wait(DRAW_S):
+                    button.review()
                     live.update(fleet.draw(button, lines), refresh=True)
         finally:
             button.close()
@@ -187,6 +189,19 @@ class StopButton:
                 self._controller.press(self._id)
             self._running = True
             threading.Thread(target=self._stop, args=(self._id,), name="space bar", daemon=True).start()
+
+    def review(self) -> None:
+        """Take what robots have said since the stop ended."""
+        with self._guard:
+            report, progress = self.report, self.progress
+            if report is None or self._running:
+                return
+        later = self._controller.review(report)
+        with self._guard:
+            if later is not report and report is self.report and not self._running:
+                self.report = later
+                if progress is not None:
+                    self.progress = replace(progress, answered=later.answered)
 
     def close(self) -> None:
         """Give up a stop that waits for the link."""

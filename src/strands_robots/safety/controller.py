@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.audit import log_witness
@@ -80,6 +80,11 @@ class StopReport:
     alarms: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def answered(self) -> Mapping[str, Answer]:
+        """The answer of each robot that gave one."""
+        return {**self.stopped, **self.not_stopped, **self.refused, **self.claimed}
+
+    @property
     def alarmed(self) -> tuple[str, ...]:
         """The robots with an alarm, and without an answer of their own."""
         return tuple(sorted(self.alarms.keys() - self.stopped.keys() - self.not_stopped.keys() - self.refused.keys()))
@@ -142,6 +147,7 @@ class SafetyController:
         self._on_link = on_link
         self._changed = threading.Condition()
         self._stops: dict[str, _Running] = {}
+        self._ended: _Running | None = None
         self._presses: dict[str, Press] = {}
         self._closing = threading.Event()
         self._check_in: threading.Thread | None = None
@@ -198,7 +204,22 @@ class SafetyController:
         finally:
             with self._changed:
                 del self._stops[run.estop_id]
+                self._ended = run
         return self._report(run)
+
+    def review(self, report: StopReport) -> StopReport:
+        """Return ``report`` of the latest stop with the answers since, else as it is.
+
+        A robot corrects its answer when it finds later that it did not stop.
+        """
+        with self._changed:
+            run = self._ended
+            if run is None or run.estop_id != report.estop_id or not run.inbox:
+                return report
+            inbox, run.inbox = run.inbox, {}
+        known = run.changes
+        run.grade(inbox)
+        return report if run.changes == known else replace(self._report(run), elapsed_ms=report.elapsed_ms)
 
     def press(self, estop_id: str) -> Press:
         """Record the press of a stop, once; every later call gives the same moment.
@@ -336,7 +357,9 @@ class SafetyController:
             logger.warning("An answer of %s is not to be read; it counts as none.", source)
             return
         with self._changed:
-            run = self._stops.get(estop_id) if isinstance(estop_id, str) else None
+            run, ended = self._stops.get(estop_id) if isinstance(estop_id, str) else None, self._ended
+            if run is None and ended is not None and ended.estop_id == estop_id and ended.knows(source):
+                run = ended
             if run is not None:
                 run.receive(source, Received(params, run.since_press_ms(at), wall))
                 self._changed.notify_all()
@@ -376,11 +399,14 @@ class _Running:
         if source in self.inbox or len(self.inbox) < ANSWERS_MAX:
             self.inbox.setdefault(source, deque(maxlen=INBOX_PER_ROBOT)).append(received)
 
+    def knows(self, source: str) -> bool:
+        """Return True for a robot that is expected or has answered."""
+        return source in self.expected or source in self.graded.by_robot
+
     def grade(self, inbox: Mapping[str, Iterable[Received]]) -> None:
         """Grade what was received, on the thread of the stop."""
         for source, received in inbox.items():
-            known = source in self.graded.by_robot or source in self.expected
-            if known or len(self.graded.by_robot) < ANSWERS_MAX:
+            if self.knows(source) or len(self.graded.by_robot) < ANSWERS_MAX:
                 self.changes += sum(self.graded.take(source, each) for each in received)
 
     @property
