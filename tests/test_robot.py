@@ -49,6 +49,27 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[_Config]]:
     return configs
 
 
+def test_scene_puts_its_objects_before_the_robot() -> None:
+    robot = Robot("so100", scene="tabletop")
+    try:
+        objects = robot.get_objects()["objects"]
+        assert list(objects) == ["table", "plate", "red_cube"]
+        robot.step(500)
+        # They stand where they were put.
+        after = robot.get_objects()["objects"]
+        for name in objects:
+            for axis in "xyz":
+                assert after[name][axis] == pytest.approx(objects[name][axis], abs=0.001), name
+    finally:
+        robot.cleanup()
+
+
+@pytest.mark.parametrize("scene", ["kitchen", 3, ["tabletop"]])
+def test_unknown_scene_is_refused_by_name(scene: object) -> None:
+    with pytest.raises(ValidationError, match="scene must be one of tabletop"):
+        Robot("so100", scene=scene)
+
+
 def test_name_makes_a_running_simulation_with_that_robot() -> None:
     robot = Robot("so100", peer_id="bench-1")
     try:

@@ -64,7 +64,8 @@ def Robot(  # the factory reads as the class it stands for
         tool_name: its name on a network; the robot's name by default.
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
-        options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``). ``real``:
+        options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), and ``scene``
+            (``tabletop``: a table with a red cube and a plate). ``real``:
             ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``, and every other one goes to the
             LeRobot configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
             dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
@@ -151,13 +152,20 @@ def _print_to_terminal(text: str) -> None:
 
 def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
     from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
+    from strands_robots.simulation.tabletop import furnish  # noqa: PLC0415 - simulation only
 
-    label = _label(name)
+    label, scene = _label(name), options.pop("scene", None)
     simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)
     answer = simulation.add_robot(label, model=name)
     if is_error(answer):
         simulation.cleanup()
         raise ValidationError(str(answer["reason"]), NO_SUCH_MODEL)
+    if scene is not None:
+        try:
+            furnish(simulation, scene)
+        except ValidationError:
+            simulation.cleanup()
+            raise
     return simulation
 
 

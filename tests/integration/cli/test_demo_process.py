@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 from contextlib import suppress
@@ -49,14 +50,21 @@ def test_demo_runs_every_step_and_writes_its_pictures(tmp_path: Path) -> None:
     report = json.loads(output)
     assert report["status"] == "success"
     steps = {step["step"]: step for step in report["steps"]}
-    safety = ["emergency stop", "refusal", "resume", "execute again"]
-    assert list(steps) == ["serve", "discover", "execute", "stop", *safety, "leave", "pictures"]
+    safety = ["emergency stop", "refusal", "resume", "place"]
+    assert list(steps) == ["serve", "discover", "look", "stop", "pick", *safety, "leave", "pictures"]
     assert all(step["ok"] for step in steps.values())
     assert {"execute", "stop", "getStatus", "getFeatures"} <= set(steps["discover"]["functions"])
-    assert steps["execute"]["steps"] > 0
+    assert steps["pick"]["holding"] is True
     assert steps["stop"]["drift_rad"] <= 0.005
     assert steps["emergency stop"]["estop_id"] in steps["refusal"]["reason"]
-    assert steps["execute again"]["steps"] > 0
+    assert steps["place"]["still_held"] is True
+    # The cube is 25 mm wide and the plate 100 mm, and the simulation is asked where they are.
+    cube, plate = (steps["place"]["objects"][name] for name in ("red_cube", "plate"))
+    assert math.hypot(cube["x"] - plate["x"], cube["y"] - plate["y"]) < 0.033
+    assert cube["z"] - plate["z"] == pytest.approx(0.0125 + 0.004, abs=0.004)
+    assert steps["look"]["objects"]["red_cube"]["y"] > 0.05
+    assert steps["look"]["picture"].items() >= {"width": 640, "height": 480, "file": "demo-output/table.jpg"}.items()
+    assert (tmp_path / "demo-output" / "table.jpg").read_bytes().startswith(b"\xff\xd8")
     assert not (tmp_path / "state").exists(), "the demo's lockout and audit are its own"
     assert (tmp_path / "demo-output" / "arm-path.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "demo-output" / "demo.gif").read_bytes().startswith(b"GIF89a")
@@ -68,9 +76,9 @@ def test_refused_motion_fails_the_demo(tmp_path: Path) -> None:
     run = start(tmp_path, DEVICE_CONNECT_RPC_ALLOW="other-caller")
     output, complaints = run.communicate(timeout=WITHIN_S)
     assert run.returncode == 1
-    assert "execute was refused" in complaints
+    assert "pick was refused" in complaints
     assert "What the agent can call" in output
-    assert not (tmp_path / "demo-output").exists()
+    assert [file.name for file in (tmp_path / "demo-output").iterdir()] == ["table.jpg"], "nothing moved to draw"
 
 
 def test_dead_robot_process_fails_the_demo(tmp_path: Path) -> None:

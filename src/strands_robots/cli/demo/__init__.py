@@ -1,4 +1,4 @@
-"""``demo``: an agent finds, drives and stops an arm, and a stop locks it."""
+"""``demo``: an agent puts a cube on a plate; stops halt the arm, and one locks it."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def demo(
     output: Annotated[Path, typer.Option("--output", help="Folder for the pictures.")] = Path("demo-output"),
     record: Annotated[Path | None, typer.Option("--record", help="Write the terminal output as SVG.")] = None,
 ) -> None:
-    """A simulated arm, found, driven and stopped by an agent in another process, then locked by an emergency stop
-    until an operator's key frees it; nothing leaves this machine.
+    """An agent in another process looks at a table and has a simulated arm put the red cube on the plate. A stop halts
+    it; an emergency stop locks it until an operator's key frees it. Nothing leaves this machine.
 
-    Exits with 1 when any step did not happen.
+    Exits with 1 when any step did not happen, or the cube is not on the plate.
     """
     from strands_robots.cli.demo.output import DemoScreen  # noqa: PLC0415 - loaded by the demo only
     from strands_robots.cli.demo.steps import DemoReport  # noqa: PLC0415 - as above
@@ -61,35 +61,38 @@ def demo(
 
 
 def _run(screen: DemoScreen, report: DemoReport, output: Path) -> None:
-    from strands_robots.cli.demo.output import draw_path  # noqa: PLC0415 - as above
+    from strands_robots.cli.demo.output import draw_motion  # noqa: PLC0415 - as above
     from strands_robots.cli.demo.processes import TENANT, connected_agent, served_robot  # noqa: PLC0415
     from strands_robots.cli.demo.steps import CONTROLLER, DriveSteps, SafetySteps, demo_operator  # noqa: PLC0415
     from strands_robots.device_connect.backends import loopback_config  # noqa: PLC0415
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415
+    from strands_robots.simulation.tabletop import TABLETOP  # noqa: PLC0415
 
     port = _free_port()
-    screen.head(f"Another process serves a simulated {ROBOT}; this one is the agent")
+    screen.head(f"Another process serves a simulated {ROBOT} at a table; this one is the agent, by a script")
     with ExitStack() as stack:
         key = stack.enter_context(demo_operator())
         with report.step("serve"):
-            robot = stack.enter_context(served_robot(ROBOT, PEER, port, TENANT))
+            robot = stack.enter_context(served_robot(ROBOT, TABLETOP, PEER, port, TENANT))
         screen.done(f"{PEER} is on the network at 127.0.0.1:{port}, in process {robot.process.pid}")
         controller = stack.enter_context(closing(safety_controller(CONTROLLER, loopback_config(port, TENANT))))
         with connected_agent(port) as agent:
             drive = DriveSteps(screen, agent, robot, PEER, report)
             safety = SafetySteps(screen, agent, drive, peer_id=PEER, controller=controller, key=key)
-            for step in (drive.discover, drive.drive, drive.stop, *safety.steps):
+            drive.discover()
+            drive.look(output)
+            for step in (drive.stop, drive.pick, *safety.steps):
                 step()
         screen.head("The robot leaves")
         with report.step("leave"):
             robot.leave()
         screen.done("its process stopped it, left the network and ended")
-    screen.head("What the agent saw")
+    screen.head("The motion in pictures")
     with report.step("pictures") as row:
-        files, row["how"] = draw_path(ROBOT, report.path, output)
-        report.files = [str(file) for file in files]
+        files, row["how"] = draw_motion(ROBOT, TABLETOP, report.setpoints, output)
+        report.files = [str(output / "table.jpg"), *(str(file) for file in files)]
     how = "rendered with OpenGL" if row["how"] == "opengl" else "projected without OpenGL"
-    screen.done(f"the arm's path and an animation, {how}: {', '.join(report.files)}")
+    screen.done(f"the gripper's path and an animation, replayed and {how}: {', '.join(map(str, files))}")
 
 
 def _free_port() -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -18,14 +19,19 @@ from strands_robots.utils import ValidationError
 RECORDING_WIDTH = 96
 """Columns of the recording."""
 
-POSES_A_SECOND = 32.0
-POSES_A_FRAME = 4
-FRAMES_MAX = 40
-SIZE = (360, 270)
+FRAMES_MAX = 60
+FRAMES_A_SECOND = 12.0
+SIZE = (400, 300)
 """Pixels of the animation; it stays below a megabyte."""
 
+PAUSE_S = 0.4
+"""Longest pause between two setpoints that is replayed."""
+
+BUNCHED_S = 0.016
+"""Shortest time between two setpoints; a busy machine delivers several at once."""
+
+_CAMERA = "front"
 _TIMESTEP_S = 0.002
-_SETTLE_S = 1.0
 _FONT_FACES = re.compile(r"@font-face\s*\{[^}]*\}\s*")
 
 
@@ -98,12 +104,15 @@ class DemoScreen:
         path.write_text(_FONT_FACES.sub("", drawing), encoding="utf-8")
 
 
-def draw_path(robot: str, path: Sequence[tuple[float, dict[str, float]]], folder: Path) -> tuple[list[Path], str]:
-    """Replay a path on a simulated arm and write ``arm-path.png``, ``demo.gif``.
+def draw_motion(
+    robot: str, scene: str, setpoints: Sequence[tuple[float, dict[str, float]]], folder: Path
+) -> tuple[list[Path], str]:
+    """Replay setpoints on a simulated arm and write ``arm-path.png``, ``demo.gif``.
 
     Args:
         robot: the model that the agent drove.
-        path: arrival (s) and joints by name (rad) of the events.
+        scene: what it had before it.
+        setpoints: arrival (s) and setpoints by joint (rad) of the events.
         folder: created where it is missing.
 
     Raises:
@@ -111,31 +120,31 @@ def draw_path(robot: str, path: Sequence[tuple[float, dict[str, float]]], folder
     """
     from strands_robots.simulation import Simulation  # noqa: PLC0415 - MuJoCo is loaded after the live part
     from strands_robots.simulation.scene import Recording  # noqa: PLC0415 - as above
+    from strands_robots.simulation.tabletop import furnish  # noqa: PLC0415 - as above
 
-    poses = sample_poses(path, POSES_A_SECOND, FRAMES_MAX * POSES_A_FRAME)
-    if len(poses) < 2:
+    moves = replayed(setpoints)
+    if len(moves) < 2:
         raise CliError("The agent saw too little of the motion to draw it.")
+    frame_s = max(sum(seconds for _, seconds in moves) / FRAMES_MAX, 1 / FRAMES_A_SECOND)
     twin = Simulation("twin", timestep=_TIMESTEP_S, realtime=False)
     try:
         twin.add_robot(robot)
-        actuators = set(twin.body().action_features)
-        recording = Recording(twin, width=SIZE[0], height=SIZE[1])
-
-        def follow(joints: dict[str, float], seconds: float) -> None:
-            twin.send_action({name: value for name, value in joints.items() if name in actuators})
+        furnish(twin, scene)
+        recording = Recording(twin, camera=_CAMERA, width=SIZE[0], height=SIZE[1])
+        since = frame_s
+        for told, seconds in moves:
+            twin.send_action(told)
             twin.step(round(seconds / _TIMESTEP_S))
-
-        follow(poses[0], _SETTLE_S)
-        for number, joints in enumerate(poses):
-            follow(joints, 1 / POSES_A_SECOND)
-            if number % POSES_A_FRAME:
+            since += seconds
+            if since < frame_s:
                 recording.trace()
             else:
                 recording.capture()
+                since -= frame_s
         folder.mkdir(parents=True, exist_ok=True)
         files = [
             recording.save_picture(folder / "arm-path.png"),
-            recording.save_animation(folder / "demo.gif", POSES_A_SECOND / POSES_A_FRAME),
+            recording.save_animation(folder / "demo.gif", FRAMES_A_SECOND),
         ]
     except (OSError, ValidationError) as exc:
         raise CliError(f"The pictures could not be written to {folder}: {exc}") from exc
@@ -147,13 +156,11 @@ def draw_path(robot: str, path: Sequence[tuple[float, dict[str, float]]], folder
     return files, recording.how
 
 
-def sample_poses(path: Sequence[tuple[float, dict[str, float]]], hz: float, most: int) -> list[dict[str, float]]:
-    """Return at most ``most`` poses, one for each 1/``hz`` s with an event."""
-    chosen: list[dict[str, float]] = []
-    slot = -1
-    for at, joints in path:
-        now = int((at - path[0][0]) * hz)
-        if now != slot:
-            chosen.append(joints)
-            slot = now
-    return chosen[:most]
+def replayed(setpoints: Sequence[tuple[float, dict[str, float]]]) -> list[tuple[dict[str, float], float]]:
+    """Return each setpoint with the seconds until the next: pauses shortened, bunches spread."""
+    arrivals = [at for at, _ in setpoints]
+    until_next = [after - at for at, after in itertools.pairwise(arrivals)] + [PAUSE_S]
+    return [
+        (told, min(max(seconds, BUNCHED_S), PAUSE_S))
+        for (_, told), seconds in zip(setpoints, until_next[: len(setpoints)], strict=True)
+    ]

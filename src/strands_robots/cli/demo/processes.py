@@ -60,13 +60,13 @@ class RobotProcess:
 
 
 @contextmanager
-def served_robot(robot: str, peer_id: str, port: int, tenant: str) -> Iterator[RobotProcess]:
-    """Serve ``robot`` on 127.0.0.1 at ``port`` while the block runs.
+def served_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -> Iterator[RobotProcess]:
+    """Serve ``robot`` in a scene on 127.0.0.1 at ``port`` while the block runs.
 
     Raises:
         CliError: it is not on the network within :data:`READY_S` seconds.
     """
-    where = ("--peer-id", peer_id, "--port", str(port), "--tenant", tenant)
+    where = ("--set", f"scene={scene}", "--peer-id", peer_id, "--port", str(port), "--tenant", tenant)
     process = subprocess.Popen(
         [sys.executable, "-m", "strands_robots.cli", "serve", robot, *where, "--json", "--until-stdin-closes"],
         stdin=subprocess.PIPE,

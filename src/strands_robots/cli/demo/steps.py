@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import math
 import secrets
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,21 +19,31 @@ from strands_robots.audit import verify_audit_integrity
 from strands_robots.cli.demo.output import DemoScreen
 from strands_robots.cli.demo.processes import Agent, AgentEvent, EventStream, RobotProcess
 from strands_robots.cli.output import CliError, first_line, label, plain, table
-from strands_robots.cli.watch import joint_limits, joints_table, motion_progress
+from strands_robots.cli.watch import joint_limits, joints_table
 from strands_robots.device_connect.telemetry import numbers
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.ed25519 import keygen, load_signing_key
 from strands_robots.safety.resume import sign
+from strands_robots.simulation.tabletop import CUBE, PLATE
 
-NEEDED = ("execute", "stop", "getStatus", "getFeatures")
+NEEDED = ("getObjects", "getPicture", "pick", "place", "setGripper", "wait", "stop", "getStatus", "getFeatures")
 CONTROLLER = "demo-safety"
 
-MOTION_S = 4.0
-MOTION_AGAIN_S = 2.0
-"""Seconds of the two motions that run to their end."""
+MOTION_MAX_S = 25.0
+"""Longest motion that runs to its end; a pick takes 6 s."""
+
+START_MAX_S = 6.0
+MIDWAY_RAD = 0.35
+"""A motion is stopped once a joint of the arm has travelled so far, which it must within so many seconds."""
 
 MOVED_RAD = 0.05
 """Travel of a joint that counts as a motion."""
+
+GRIPPER = "gripper"
+"""Joint whose travel alone is no motion of the arm."""
+
+LIFT_M = 0.004
+"""How far a cube may be from standing on the plate, up or down."""
 
 BRAKE_S, BRAKE_RAD = 0.2, 0.1
 """Time and travel in which a stopped arm has to come to rest: it has mass."""
@@ -48,7 +61,9 @@ class DemoReport:
     """Steps and results of one demo, for ``--json``."""
 
     steps: list[dict[str, Any]] = field(default_factory=list)
-    path: list[tuple[float, Joints]] = field(default_factory=list)
+    path: list[Joints] = field(default_factory=list)
+    setpoints: list[tuple[float, Joints]] = field(default_factory=list)
+    """What the joints were told, and when (s): the pictures replay it."""
     stop_ms: float = 0.0
     files: list[str] = field(default_factory=list)
 
@@ -87,7 +102,7 @@ def demo_operator() -> Iterator[Any]:
 
 
 class DriveSteps:
-    """First steps: discovery, a motion, a stop in mid-motion.
+    """First steps: discovery, a look, a motion that is stopped, a pick.
 
     Args:
         screen: where it is printed.
@@ -108,7 +123,7 @@ class DriveSteps:
         self._limits: dict[str, tuple[float, float]] = {}
 
     def discover(self) -> None:
-        """Find the robot and read its functions."""
+        """List the robots and read the functions of the arm."""
         self._screen.head("The agent looks for robots")
         with self.report.step("discover") as row:
             started = time.monotonic()
@@ -120,25 +135,33 @@ class DriveSteps:
                 raise CliError(f"{self._peer} was found, but without {', '.join(missing)}.")
             row["functions"] = sorted(functions)
         self._screen.done(f"Found {self._peer} ({device.get('device_type', '')}) at {self._agent.endpoint}")
-        rows = ((name, first_line(each.get("description"))) for name, each in functions.items())
+        rows = [(name, first_line(functions[name].get("description"))) for name in NEEDED]
+        rows.append((f"and {len(functions) - len(NEEDED)} more", ""))
         self._screen.panel(table("What the agent can call", ("function", "description"), rows))
 
-    def drive(self) -> None:
-        """Start a motion and follow its events until it ends."""
-        self._screen.head("It starts a motion and follows it by events")
-        with self.report.step("execute") as row, self._agent.events(self._peer) as stream:
-            self._limits = joint_limits(self._agent.call(self._peer, "getFeatures"))
-            row["steps"], row["travelled_rad"] = self.run_motion(stream, "wave hello", MOTION_S)
-        travelled = row["travelled_rad"]
+    def look(self, folder: Path) -> None:
+        """Read the objects and save a picture of the table."""
+        self._screen.head("It looks at the table")
+        with self.report.step("look") as row:
+            objects = self.read_objects()
+            if on_plate(objects) is not None:
+                raise CliError("The cube is on the plate before anything has moved it.")
+            answer = self._agent.call(self._peer, "getPicture", camera="front")
+            row["objects"], row["picture"] = objects, save_jpeg(answer, folder / "table.jpg")
+        rows = [(name, _metres(each, "xyz"), _extents(each)) for name, each in objects.items()]
+        self._screen.panel(table("", ("object", "x, y, z (m)", "size (mm)"), rows))
+        picture = row["picture"]
         self._screen.done(
-            f"execute ran to its end: {row['steps']} steps, the joints travelled up to {travelled:.2f} rad"
+            f"a picture of camera front, {picture['width']} x {picture['height']} pixels, "
+            f"{picture['bytes'] / 1000:.0f} kB: {picture['file']}"
         )
 
     def stop(self) -> None:
-        """Stop a motion; measure the latency and check that the arm stands still."""
-        self._screen.head("It starts another one and stops it in mid-motion")
+        """Stop a motion midway; measure the latency and check that the arm stands still."""
+        self._screen.head("It reaches for the red cube, and stops the arm in mid-motion")
         with self.report.step("stop") as row, self._agent.events(self._peer) as stream:
-            self.start_motion(stream, "keep waving", 2.0)
+            self._limits = joint_limits(self._agent.call(self._peer, "getFeatures"))
+            self.start_motion(stream, "pick", object=CUBE)
             started = time.perf_counter()
             verdict = self._agent.call(self._peer, "stop")
             self.report.stop_ms = row["latency_ms"] = round((time.perf_counter() - started) * 1000, 2)
@@ -151,54 +174,82 @@ class DriveSteps:
             f"{row['braking_rad']:.3f} rad and then stood still: {row['drift_rad']:.4f} rad in {WATCH_S:g} s"
         )
 
-    def run_motion(self, stream: EventStream, title: str, seconds: float) -> tuple[int, float]:
-        """Run a motion to its end; return its steps and largest joint travel (rad).
+    def pick(self) -> None:
+        """Pick up the red cube."""
+        self._screen.head("It picks up the red cube")
+        with self.report.step("pick") as row, self._agent.events(self._peer) as stream:
+            outcome = self.run_motion(stream, "pick", object=CUBE)
+            row |= {name: outcome.get(name) for name in ("holding", "error_mm", "duration")}
+            if outcome.get("holding") is not True:
+                raise CliError(f"pick ended, but the jaws hold nothing: {outcome}")
+        self._screen.done(
+            f"the jaws hold the cube after {row['duration']:.1f} s, {row['error_mm']:.1f} mm from the planned place"
+        )
+
+    def read_objects(self) -> dict[str, Any]:
+        """Return the objects on the table, as the simulation tells them.
+
+        Raises:
+            CliError: cube or plate is not among them.
+        """
+        objects = self._agent.call(self._peer, "getObjects").get("objects")
+        if not isinstance(objects, dict) or not {CUBE, PLATE} <= objects.keys():
+            raise CliError(f"There are no {CUBE} and {PLATE} on the table: {objects}")
+        return objects
+
+    def run_motion(self, stream: EventStream, verb: str, **params: Any) -> dict[str, Any]:
+        """Run a motion to its end and return its outcome.
 
         Raises:
             CliError: it was refused, did not end, ended otherwise, or nothing moved.
         """
         before = len(self.report.path)
-        self._agent.call(self._peer, "execute", instruction=title, policy_provider="mock", duration=seconds)
-        until = seconds + 6.0
-        ended = self._follow(stream, title, until, lambda event: event.name == "policyComplete", total=seconds)
-        if ended is None:
-            raise CliError("The motion did not report its end.")
-        state = ended.payload.get("state")
-        if state != "completed":
-            raise CliError(f"The motion ended as {state}: {ended.payload.get('error', '')}")
-        return int(ended.payload.get("steps") or 0), self._travelled(self.report.path[before:])
+        task = self._agent.call(self._peer, verb, wait=False, **params).get("task_id")
+        if self._follow(stream, verb, MOTION_MAX_S, lambda event: event.name == "policyComplete") is None:
+            raise CliError(f"{verb} did not report its end.")
+        outcome = self._agent.ask(self._peer, "wait", task_id=task, seconds=5.0)
+        if outcome.get("task_status") != "completed":
+            raise CliError(f"{verb} ended as {outcome.get('task_status')}: {outcome.get('why', '')}")
+        if verb != "setGripper":
+            self._require_travel(before)
+        return outcome
 
-    def start_motion(self, stream: EventStream, title: str, seconds: float) -> None:
-        """Start a motion of a minute and return after ``seconds`` of movement."""
+    def start_motion(self, stream: EventStream, verb: str, **params: Any) -> None:
+        """Start a motion and return when it is midway."""
         before = len(self.report.path)
-        self._agent.call(self._peer, "execute", instruction=title, policy_provider="mock", duration=60.0)
-        self._follow(stream, title, seconds, lambda event: False, total=60.0)
-        self._travelled(self.report.path[before:])
+        self._agent.call(self._peer, verb, wait=False, **params)
+        self._follow(stream, verb, START_MAX_S, lambda event: self._travel(before) >= MIDWAY_RAD)
+        self._require_travel(before)
 
     def _follow(
-        self, stream: EventStream, title: str, within: float, until: Callable[[AgentEvent], bool], total: float
+        self, stream: EventStream, title: str, within: float, until: Callable[[AgentEvent], bool]
     ) -> AgentEvent | None:
-        """Draw events until ``until`` or for ``within`` s; add joints to the path."""
+        """Draw events until ``until`` or for ``within`` s; add them to the report."""
         started = time.monotonic()
         with self._screen.live() as frame:
             for event in stream.follow(within):
+                told = numbers(event.payload.get("action")) if event.name == "streamStep" else {}
+                if told:
+                    self.report.setpoints.append((event.at, told))
                 joints = _joints(event)
                 if joints:
-                    self.report.path.append((event.at, joints))
-                    frame(motion_progress(title, event.at - started, total), joints_table(joints, self._limits))
+                    self.report.path.append(joints)
+                    frame(label(f"{title}, {event.at - started:.1f} s", "bold"), joints_table(joints, self._limits))
                 if until(event):
                     return event
                 self._process.check()
         return None
 
-    def _travelled(self, path: list[tuple[float, Joints]]) -> float:
-        """Return the largest joint travel (rad); raise :class:`CliError` for none."""
-        names = {name for _, joints in path for name in joints}
-        spans = [_span([joints[name] for _, joints in path if name in joints]) for name in names]
-        most = max(spans, default=0.0)
+    def _travel(self, before: int) -> float:
+        """Return the largest travel (rad) of an arm joint since an index of the path."""
+        path = self.report.path[before:]
+        names = {name for joints in path for name in joints} - {GRIPPER}
+        return max((_span([joints[name] for joints in path if name in joints]) for name in names), default=0.0)
+
+    def _require_travel(self, before: int) -> None:
+        most = self._travel(before)
         if most < MOVED_RAD:
             raise CliError(f"The arm did not move: its busiest joint travelled {most:.3f} rad.")
-        return round(most, 4)
 
     def measure_rest(self, stream: EventStream) -> tuple[float, float]:
         """Return the travel while braking and after it, in rad of the busiest joint.
@@ -228,7 +279,7 @@ class DriveSteps:
 
 
 class SafetySteps:
-    """Last steps: an emergency stop, a refusal, a signed resume, a motion again.
+    """Last steps: an emergency stop, a refusal, a signed resume, the cube on the plate.
 
     Args:
         screen: where it is printed.
@@ -257,13 +308,13 @@ class SafetySteps:
     @property
     def steps(self) -> tuple[Callable[[], None], ...]:
         """Return the steps in order."""
-        return self.emergency_stop, self.refuse, self.resume, self.move_again
+        return self.emergency_stop, self.refuse, self.resume, self.place
 
     def emergency_stop(self) -> None:
         """Stop the arm in mid-motion by a safety controller."""
-        self._screen.head("It moves once more, and a safety controller stops everything")
+        self._screen.head("It carries the cube to the plate, and a safety controller stops everything")
         with self._report.step("emergency stop") as row, self._agent.events(self._peer) as stream:
-            self._motions.start_motion(stream, "wave on", 1.2)
+            self._motions.start_motion(stream, "place", on=PLATE)
             report = self._controller.stop([self._peer], "demonstration", deadline_s=ESTOP_DEADLINE_S)
             if not report.ok:
                 raise CliError(f"{self._peer} did not answer the emergency stop with a stop: {report}")
@@ -280,7 +331,7 @@ class SafetySteps:
         """Check that the next motion is refused, naming the stop and the resume."""
         self._screen.head("The agent tries to go on")
         with self._report.step("refusal") as row:
-            answer = self._agent.ask(self._peer, "execute", instruction="go on", policy_provider="mock", duration=1.0)
+            answer = self._agent.ask(self._peer, "place", on=PLATE)
             row["reason"] = str(answer.get("reason", ""))
             if answer.get("status") != "error" or self._estop_id not in row["reason"]:
                 raise CliError(f"A locked arm did not refuse a motion with the id of its stop: {answer}")
@@ -303,18 +354,70 @@ class SafetySteps:
             row["epochs"] = answer.get("epochs")
         self._screen.done(f"the key made for this demo freed {self._peer}; nothing moves by it")
 
-    def move_again(self) -> None:
-        """Run a motion to its end and verify the safety audit."""
-        self._screen.head("And the agent drives again")
-        with self._report.step("execute again") as row, self._agent.events(self._peer) as stream:
-            row["steps"], row["travelled_rad"] = self._motions.run_motion(stream, "wave goodbye", MOTION_AGAIN_S)
+    def place(self) -> None:
+        """Put the cube on the plate, check that it stands there, and verify the audit."""
+        self._screen.head("And the agent finishes")
+        with self._report.step("place") as row, self._agent.events(self._peer) as stream:
+            # What a stopped gripper holds is not known until it closes once more.
+            row["still_held"] = self._motions.run_motion(stream, "setGripper", opening=0.0).get("holding")
+            if row["still_held"] is not True:
+                raise CliError("The cube was lost while the arm was locked.")
+            row["error_mm"] = self._motions.run_motion(stream, "place", on=PLATE).get("error_mm")
+            row["objects"] = self._motions.read_objects()
+            away = on_plate(row["objects"])
+            if away is None:
+                raise CliError(f"The cube is not on the plate: {row['objects']}")
+            row["from_centre_mm"] = round(1000 * away, 1)
             audit = verify_audit_integrity()
             row["audit_records"] = audit["total"]
             if not audit["ok"] or audit["total"] < 2:
                 raise CliError(f"The safety audit does not record what happened: {audit}")
         self._screen.done(
-            f"execute ran to its end: {row['steps']} steps; the safety audit is intact: {row['audit_records']} records"
+            f"the simulation says: the cube stands on the plate, {row['from_centre_mm']:.0f} mm from its centre; "
+            f"the safety audit is intact: {row['audit_records']} records"
         )
+
+
+def on_plate(objects: Mapping[str, Any]) -> float | None:
+    """Return the distance of the cube on the plate from its centre (m), None elsewhere.
+
+    The whole cube must be over the plate, and its bottom at the plate's top.
+    """
+    cube, plate = objects[CUBE], objects[PLATE]
+    away = math.hypot(cube["x"] - plate["x"], cube["y"] - plate["y"])
+    lifted = (cube["z"] - cube["size"][2] / 2) - (plate["z"] + plate["size"][2] / 2)
+    over = away + math.hypot(cube["size"][0], cube["size"][1]) / 2 <= plate["size"][0] / 2
+    return away if over and abs(lifted) <= LIFT_M else None
+
+
+def save_jpeg(answer: Mapping[str, Any], file: Path) -> dict[str, Any]:
+    """Write the picture of an answer to getPicture; return its file, size and bytes.
+
+    Raises:
+        CliError: there is no picture in it, or the file cannot be written.
+    """
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - loaded when the demo runs
+
+    try:
+        content = base64.b64decode(str(answer.get("jpeg", "")), validate=True)
+        with Image.open(io.BytesIO(content), formats=["JPEG"]) as picture:
+            width, height = picture.size
+    except (ValueError, UnidentifiedImageError):
+        raise CliError("getPicture was answered without a picture.") from None
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content)
+    except OSError as exc:
+        raise CliError(f"The picture could not be written to {file}: {exc}") from exc
+    return {"file": str(file), "width": width, "height": height, "bytes": len(content)}
+
+
+def _metres(each: Mapping[str, Any], axes: str) -> str:
+    return ", ".join(f"{each[axis]:.3f}" for axis in axes)
+
+
+def _extents(each: Mapping[str, Any]) -> str:
+    return " x ".join(f"{1000 * value:.0f}" for value in each["size"])
 
 
 def _joints(event: AgentEvent) -> Joints:
