@@ -17,7 +17,7 @@ help:  ## Show these targets
 venv:  ## What tests, examples and every extra but lerobot need, in .venv
 	@./scripts/venv.sh $(VENV) requirements/dev.lock
 
-demo:  ## One arm in simulation: found, driven and stopped, by an agent in another process
+demo:  ## An agent in another process has a simulated arm put a cube on a plate, and is stopped
 	@[ -f $(VENV)/.installed-dev.lock ] || ./scripts/venv.sh $(VENV) requirements/demo.lock
 	@$(BIN)/strands-robots demo $(ARGS)
 
