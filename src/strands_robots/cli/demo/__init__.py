@@ -1,4 +1,4 @@
-"""``demo``: an agent puts a cube on a plate; stops halt the arm, and one locks it."""
+"""``demo``: an agent puts a cube on a plate, through a stop and a lockout."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ def draw_motion(
 
 
 def replayed(setpoints: Sequence[tuple[float, dict[str, float]]]) -> list[tuple[dict[str, float], float]]:
-    """Return each setpoint with the seconds until the next: pauses shortened, bunches spread."""
+    """Return setpoints with seconds until the next: shorter pauses, no bunches."""
     arrivals = [at for at, _ in setpoints]
     until_next = [after - at for at, after in itertools.pairwise(arrivals)] + [PAUSE_S]
     return [

@@ -279,7 +279,7 @@ class DriveSteps:
 
 
 class SafetySteps:
-    """Last steps: an emergency stop, a refusal, a signed resume, the cube on the plate.
+    """Last steps: an emergency stop, a refusal, a signed resume, a place.
 
     Args:
         screen: where it is printed.
@@ -379,7 +379,7 @@ class SafetySteps:
 
 
 def on_plate(objects: Mapping[str, Any]) -> float | None:
-    """Return the distance of the cube on the plate from its centre (m), None elsewhere.
+    """Return the cube's distance (m) from the plate's centre, None if not on it.
 
     The whole cube must be over the plate, and its bottom at the plate's top.
     """
