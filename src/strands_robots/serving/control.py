@@ -514,7 +514,9 @@ class ControlLeases:
         robot = self._robot()
         if isinstance(robot, WorldRobot):
             return any(row.get("robot") == name for row in robot.list_policies_running())
-        return robot is not None and str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
+        # A robot whose motions are gestures has no task; its motion ends the lease with the call that began it.
+        status = getattr(robot, "get_task_status", None)
+        return callable(status) and str(status().get("task_status", "")).lower() in RUNNING
 
     def _halt(self, name: str, reason: str) -> None:
         robot = self._robot()

@@ -122,7 +122,7 @@ class Verb:
         missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
         if not unknown and not missing:
             return None
-        takes = ", ".join(self.by_name) or "no parameters"
+        takes = ", ".join(name for name in self.by_name if name != LEASE_ID) or "no parameters"
         problem = f"it has no {', '.join(unknown)}" if unknown else f"{', '.join(missing)} is missing"
         return f"{self.name} takes {takes}: {problem}."
 

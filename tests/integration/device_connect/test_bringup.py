@@ -83,9 +83,7 @@ def test_simulation_is_found_called_and_departs(link: LinkConfig, world: ToyWorl
     with FleetClient(link, "tester") as fleet:
         (peer,) = fleet.peers(20)
         assert (peer.id, peer.type, peer.model) == ("arm-1", "strands_sim", "toy_sim")
-        assert {f["name"] for f in peer.functions} == {
-            *("execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset"),
-        }
+        assert {f["name"] for f in peer.functions} == set(SimulationDeviceDriver.verbs)
         assert fleet.call("arm-1", "getStatus")["status"] == "success"
         stop_device_connect(runtime)
         assert fleet.peers(0.6) == []

@@ -18,7 +18,7 @@ from strands_robots.recording.file import RecordedEvent, RecordedJoints, Recorde
 
 pytest.importorskip("mcap")
 
-CAMERAS = {"overview", "front", "side", "top", "so100.wrist"}
+CAMERAS = {"overview", "front", "side", "top", "table", "so100.wrist"}
 
 
 @pytest.fixture
