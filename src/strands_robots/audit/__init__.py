@@ -147,8 +147,8 @@ class _Pending:
         head = self.journal.written
         return None if head is None else Anchor(head.log, head.count, head.last)
 
-    def write(self) -> None:
-        """Put everything on the disk, or keep it and say so."""
+    def write(self) -> bool:
+        """Put everything on the disk, or keep it and say so; False when it is kept."""
         self._shed()
         batch = list(self.entries)
         try:
@@ -158,16 +158,20 @@ class _Pending:
                 self.last = self._last()
         except Exception as exc:  # noqa: BLE001 - whatever stops the record is reported, and the record is kept
             self._complain(exc)
-            return
+            return False
         if self.failing:
             logger.warning("The safety audit in %s is written again.", self.directory)
         self.failing, self._reported = False, 0
         self.entries.clear()
+        if batch:
+            _warn_of_readers(self.directory)
+        return True
+
+    def acknowledge(self) -> None:
+        """Let the flushes go on whose records are on the disk."""
         for done in self.waiting:
             done.set()
         self.waiting.clear()
-        if batch:
-            _warn_of_readers(self.directory)
 
     def _complain(self, exc: Exception) -> None:
         if not self.failing:
@@ -221,8 +225,10 @@ class _Writer:
             self._take()
             for pending in self._pending.values():
                 if pending.entries or pending.waiting:
-                    pending.write()
+                    written = pending.write()
                     self.last = pending.last or self.last
+                    if written:
+                        pending.acknowledge()
 
     def _take(self) -> None:
         unwritten = any(pending.entries for pending in self._pending.values())
