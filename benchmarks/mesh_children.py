@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.mesh_children echo PORT`` answers what it hears on ``strands/bench/ask`` and tells when
 each input frame arrived; ``fleet PREFIX COUNT`` joins that many peers, ``follow LEADER`` follows one, ``crowd COUNT``
-pretends to be that many, and ``listen`` hears them.
+pretends to be that many, ``listen`` hears them, and ``parse`` hears them without a peer.
 """
 
 from __future__ import annotations
@@ -135,5 +135,23 @@ def listen() -> None:
     mesh.close()
 
 
+def parse() -> None:
+    """Report the same of a bare session that parses the JSON of each heartbeat."""
+    import zenoh  # noqa: PLC0415 - only this role needs it
+
+    endpoint, seen = f"tcp/127.0.0.1:{os.environ['STRANDS_MESH_PORT']}", set()
+    with zenoh.open(zenoh.Config.from_json5(raw_config(endpoint, listen=True))) as session:
+
+        def parsed(sample: Any) -> None:
+            seen.add(json.loads(sample.payload.to_bytes())["robot_id"])
+
+        session.declare_subscriber("strands/*/presence", zenoh.handlers.Callback(parsed, indirect=False))
+        print(json.dumps({"ready": True}), flush=True)
+        for _ in sys.stdin:
+            print(json.dumps([time.process_time(), len(seen)]), flush=True)
+
+
+ROLES = {"echo": echo, "fleet": fleet, "follow": follow, "crowd": crowd, "listen": listen, "parse": parse}
+
 if __name__ == "__main__":
-    {"echo": echo, "fleet": fleet, "follow": follow, "crowd": crowd, "listen": listen}[sys.argv[1]](*sys.argv[2:])
+    ROLES[sys.argv[1]](*sys.argv[2:])

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.mesh.console_keys import ConsoleSigner, ConsoleTrust
+from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Transport, TransportError
@@ -27,6 +28,7 @@ class Context:
         audit: records refusals; ``audit.always`` records what may never be left out.
         transport: None while the peer is not on the mesh.
         console: signs what moves real hardware; ``consoles`` checks such signatures.
+        pacer: keeps messages apart while a peer of a 0.5 release is known.
     """
 
     peer_id: str
@@ -38,6 +40,7 @@ class Context:
     transport: Transport | None = field(default=None)
     console: ConsoleSigner = field(default_factory=ConsoleSigner)
     consoles: ConsoleTrust = field(default_factory=ConsoleTrust)
+    pacer: Pacer = field(default_factory=Pacer)
 
     def running(self) -> bool:
         return self.transport is not None and self.transport.is_alive()

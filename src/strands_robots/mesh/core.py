@@ -23,6 +23,7 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.hearing import Hearing
 from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Requester
@@ -75,6 +76,7 @@ class Parts:
     acquire: Callable[[], Transport | None] = session.acquire
     release: Callable[[], None] = session.release_session
     registry: PeerRegistry = field(default_factory=session.registry)
+    pacer: Pacer = field(default_factory=session.pacer)
     clock: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic
     identity: Callable[[Transport], Identity] | None = None
@@ -122,6 +124,7 @@ class Mesh(SensorLoopsMixin):
         self._context = context = Context(
             peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
         )
+        context.pacer = parts.pacer
         context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
         self._hardware = hardware
         self._handles: list[Declaration] = []
@@ -279,6 +282,7 @@ class Mesh(SensorLoopsMixin):
 
         streams = self._teleop.close()
         alive = self._scheduler.stop(left()) + self._sensors.stop(left()) + self._steps.stop(left())
+        self._safety.close(left())
         self._requester.close()
         dropped = self._subscriptions.clear()
         if dropped:

@@ -54,6 +54,7 @@ class PresencePublisher:
         self._troubles = TroubleLog(logger)
         self.described = threading.Event()
         self._leaving: dict[tuple[str, str], float] = {}
+        self._tokens: dict[tuple[str, str], None] = {}
         self._judged_later = self._token_declared = False
         self._anchored_at: float | None = None
         self._declared: list[Declaration] = []
@@ -145,8 +146,9 @@ class PresencePublisher:
             context.audit("presence_left_out", reason="the table of peers is full, or its session announced too many")
             return
         facts = presence.facts()
+        older = not sample.sessionless and (peer, sample.session) not in self._tokens
         if context.registry.update(
-            peer, presence.robot_type, presence.hostname, facts, session=session, certificate=certificate
+            peer, presence.robot_type, presence.hostname, facts, session=session, certificate=certificate, older=older
         ):
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
 
@@ -169,6 +171,10 @@ class PresencePublisher:
         mark = (parts[1], parts[3])
         if alive:
             self._leaving.pop(mark, None)
+            # Kept when it goes: peers of ours whose hub died are not of a 0.5 release for that.
+            self._tokens[mark] = None
+            if len(self._tokens) > LEAVING_MAX:
+                del self._tokens[next(iter(self._tokens))]
         elif len(self._leaving) < LEAVING_MAX:
             self._leaving[mark] = time.monotonic()
             if not self._judged_later:

@@ -105,6 +105,7 @@ class PeerRegistry:
         self._lock = threading.Lock()
         self._rows: dict[str, PeerInfo] = {}
         self._past: dict[str, tuple[float, float]] = {}
+        self._older: set[str] = set()
 
     def update(
         self,
@@ -115,10 +116,12 @@ class PeerRegistry:
         *,
         session: str | None = None,
         certificate: tuple[str, str] | None = None,
+        older: bool = False,
     ) -> bool:
         """Insert or refresh a row; True when the peer is new and has a row now.
 
-        A living peer that states no session or no certificate keeps the one that it is bound to.
+        A living peer that states no session or no certificate keeps the one that it is bound to. ``older`` is a peer of
+        a 0.5 release, towards which messages are paced.
         """
         now = self._clock()
         with self._lock:
@@ -135,6 +138,10 @@ class PeerRegistry:
                     certificate = certificate if certificate is not None else known.certificate
             row = PeerInfo(peer_id, peer_type, hostname, now, dict(caps), session, certificate, since=since)
             self._rows[peer_id] = row
+            if older:
+                self._older.add(peer_id)
+            elif self._older:
+                self._older.discard(peer_id)
         return known is None
 
     def full_for(self, peer_id: str, session: str | None) -> bool:
@@ -159,6 +166,7 @@ class PeerRegistry:
 
     def _remember(self, peer_id: str, row: PeerInfo) -> None:
         """Note a peer whose row is dropped; the shortest stay is forgotten first."""
+        self._older.discard(peer_id)
         self._past[peer_id] = (row.seen, row.since)
         if len(self._past) > PAST_MAX:
             del self._past[min(self._past, key=lambda each: self._past[each][0] - self._past[each][1])]
@@ -175,6 +183,14 @@ class PeerRegistry:
         if row.session is not None and row.session != session:
             return row.session
         return row.certificate[0] if row.certificate is not None and not certified else None
+
+    def older(self) -> list[str]:
+        """Return the living peers of 0.5 releases."""
+        if not self._older:
+            return []
+        now = self._clock()
+        with self._lock:
+            return sorted(peer for peer in self._older if self._rows[peer].living(now))
 
     def session_of(self, peer_id: str) -> str | None:
         row = self._row(peer_id)
@@ -208,6 +224,7 @@ class PeerRegistry:
         with self._lock:
             self._rows.clear()
             self._past.clear()
+            self._older.clear()
 
     def prune(self, timeout: float = PEER_TIMEOUT) -> list[str]:
         """Drop rows silent for longer than ``timeout`` and the retention; return ids."""

@@ -14,6 +14,7 @@ from typing import Any
 
 from strands_robots.mesh import console_keys, topics, wire
 from strands_robots.mesh.context import Context
+from strands_robots.mesh.older_peers import ASK_AGAIN_S, COMMANDS_S
 from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.security import validate_command
 from strands_robots.mesh.transport import Sample, TransportError
@@ -85,12 +86,26 @@ class Requester:
             problem = self._publish(topics.command(peer), clean, turn, seconds)
             if problem is not None:
                 return refused(problem) | (turn.delivery() if problem == OFFLINE else {})
-            reply = turn.next(seconds)
+            reply = self._answer(turn, clean, seconds)
             return (reply or refused("the mesh was stopped while the reply was awaited.")) | turn.delivery()
         except Empty:
             return {"status": "timeout", "target": peer, "turn_id": turn.ids[0], **turn.delivery()}
         finally:
             self._close(turn)
+
+    def _answer(self, turn: Turn, command: dict[str, Any], seconds: float) -> dict[str, Any] | None:
+        """Wait for the reply; towards a 0.5 peer ask for a stop or a read again."""
+        deadline = time.monotonic() + seconds
+        repeats = PEER_VERBS[command["action"]].kind in (Kind.STOP, Kind.READ)
+        while True:
+            left = max(0.0, deadline - time.monotonic())
+            pause = ASK_AGAIN_S if repeats and self._context.registry.older() else left
+            try:
+                return turn.next(min(left, pause))
+            except Empty:
+                if left <= pause:
+                    raise
+                self._publish(topics.command(turn.expected), command, turn)
 
     def ping(self, target: object, timeout: object) -> dict[str, Any]:
         """Ping a peer and return status, round trip in milliseconds and delivery."""
@@ -147,7 +162,9 @@ class Requester:
 
         now = time.monotonic()
         deadline = now + seconds
-        again = now + REPEAT_S if missing is not None else deadline
+        older = self._context.registry.older()
+        pause = ASK_AGAIN_S if older else REPEAT_S
+        again = now + pause if missing is not None else deadline
         while now < deadline and (missing is None or absent()):
             with contextlib.suppress(Empty):  # no answer in this interval
                 reply = turn.next(min(deadline, again) - now)
@@ -158,9 +175,12 @@ class Requester:
                     replies[peer] = reply
             now = time.monotonic()
             if missing is not None and now >= again:
-                again = now + REPEAT_S
-                for peer in absent():
-                    self._publish(topics.command(peer), command, turn)
+                left = absent()
+                # Towards a peer of a 0.5 release each of them would wait for the one before it.
+                keys = [topics.broadcast()] if older and len(left) > 1 else [topics.command(peer) for peer in left]
+                for key in keys:
+                    self._publish(key, command, turn)
+                again = time.monotonic() + pause
         return list(replies.values())
 
     def on_response(self, sample: Sample) -> None:
@@ -248,10 +268,22 @@ class Requester:
                 taken = transport.put_confirmed(key, body, seconds)
                 turn.confirmed = taken is True
                 return None if taken is not False else OFFLINE
-            context.put(key, body)
+            self._put(key, target, body, stop=PEER_VERBS[command["action"]].kind is Kind.STOP)
         except (wire.WireError, TransportError) as exc:
             return str(exc)
         return None
+
+    def _put(self, key: str, target: str, body: dict[str, Any], *, stop: bool) -> None:
+        """Publish a command, paced where a peer of a 0.5 release may be on its way."""
+        context, kind = self._context, key.rpartition("/")[2]
+        older = context.registry.older()
+        if not older or (stop and target not in (*older, wire.BROADCAST_TARGET)):
+            # The stop of a peer of ours waits for nobody; one that such a hub drops is repeated.
+            context.put(key, body)
+            context.pacer.note(kind)
+            return
+        with context.pacer.turn(kind, COMMANDS_S, first=stop):
+            context.put(key, body)
 
     def _open(self, turn: Turn) -> str:
         turn_id = uuid.uuid4().hex

@@ -23,6 +23,7 @@ from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
+from strands_robots.mesh.older_peers import SAFETY, SAFETY_S, Closings
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
@@ -44,7 +45,7 @@ logger = logging.getLogger(__name__)
 COLLECT_S = 3.0
 """Seconds in which the answers to an e-stop are collected."""
 
-SPACING_S = 0.55
+SPACING_S = SAFETY_S
 """Between two messages on a safety topic: peers in the field let two a second through."""
 
 REPORT_S = 2.0
@@ -282,6 +283,10 @@ class FleetSafety:
         self._resumes = resumes
         self._robot = robot
         self._retry = EstopRetry(context, requester)
+        self._closings = Closings(
+            f"mesh-{context.peer_id}-closing",
+            lambda peer: requester.send(peer, {"action": "status"}, RETRY_ANSWER_S).get("result"),
+        )
         self.late = LatePeers(context, adapter.epochs)
         self._recent: deque[str] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
@@ -336,14 +341,13 @@ class FleetSafety:
             "peers_not_stopped": len(not_stopped),
             "peers_silent": len(silent),
         }
-        self._publish_estop(order, counts, signing_key)
-        self._publish_event("emergency_stop", order.epoch)
+        self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
         unreached = (roster | context.registry.seen_within(KNOWN_S)) - stopped - {context.peer_id}
         self._retry.begin(
             order.epoch,
             unreached,
             lambda: order.epoch in self._adapter.epochs(),
-            lambda: self._publish_estop(order, counts, signing_key),
+            lambda: self._publish_estop(order, counts, signing_key, paced=True),
         )
         context.audit.always(
             "emergency_stop",
@@ -355,6 +359,23 @@ class FleetSafety:
         )
         return responses
 
+    def _close_stop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any, answered: set[str]) -> None:
+        """Publish the stop with its counts, later where a 0.5 peer would drop it."""
+        older = self._context.registry.older()
+
+        def publish() -> None:
+            self._publish_estop(order, counts, signing_key, paced=bool(older))
+            self._publish_event("emergency_stop", order.epoch)
+
+        if older:
+            self._closings.begin(publish, sorted(answered & {*older}))
+        else:
+            publish()
+
+    def close(self, timeout: float) -> None:
+        """Publish what is due before this peer leaves, within ``timeout`` seconds."""
+        self._closings.close(timeout)
+
     def _local_reply(self, order: StopOrder, verdict: StopVerdict | None) -> list[dict[str, Any]]:
         """The reply of the local robot in a peer's form; none without a robot."""
         if not self._robot:
@@ -363,7 +384,18 @@ class FleetSafety:
         result = peer_stop_answer(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
         return [wire.Reply("response", context.peer_id, order.epoch, result, timestamp=context.clock()).to_wire()]
 
-    def _publish_estop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> None:
+    def _publish_estop(
+        self, order: StopOrder, counts: dict[str, Any], signing_key: Any, *, paced: bool = False
+    ) -> None:
+        context = self._context
+        if paced and context.registry.older():
+            with context.pacer.turn(SAFETY, SAFETY_S):
+                self._put_estop(order, counts, signing_key)
+        else:
+            self._put_estop(order, counts, signing_key)
+            context.pacer.note(SAFETY)
+
+    def _put_estop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> None:
         # The time is that of the sending, because peers in the field refuse what is older than a minute.
         context = self._context
         counts = {**counts, "lockout_engaged": True}

@@ -14,6 +14,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
+from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.registry import PEER_TIMEOUT, PeerRegistry
 from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.transport.factory import make_transport
@@ -28,6 +29,7 @@ __all__ = [
     "get_peer",
     "get_peers",
     "get_session",
+    "pacer",
     "prune_peers",
     "put",
     "registry",
@@ -43,6 +45,7 @@ _registry = PeerRegistry(
     most=lambda: settings.integer("STRANDS_MESH_MAX_PEERS"),
     retention=lambda: settings.number("STRANDS_MESH_PEER_RETENTION_S"),
 )
+_pacer = Pacer()
 
 
 class _Shared:
@@ -142,6 +145,11 @@ def zenoh_error_types() -> tuple[type[BaseException], ...]:
 def registry() -> PeerRegistry:
     """Return the registry that every mesh of this process shares."""
     return _registry
+
+
+def pacer() -> Pacer:
+    """Return the pacer that every mesh of this process shares, as it shares the link."""
+    return _pacer
 
 
 def get_peers() -> list[dict[str, Any]]:

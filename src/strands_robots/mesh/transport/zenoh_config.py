@@ -153,10 +153,14 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def hub(posture: Posture, session: str | None = None) -> dict[str, Any]:
-    """Configure a session that listens as the loopback hub, or fails."""
+    """Configure a session that listens as the loopback hub, or fails.
+
+    Hubs that multicast finds on other machines connect to a port of their own; each relays for its machine.
+    """
     config = _base(posture, session)
     config["mode"] = "peer"
-    config["listen"] = {"endpoints": [posture.hub], "exit_on_failure": True}
+    outside = [f"{'tls' if posture.credentials else 'tcp'}/0.0.0.0:0"] if posture.multicast else []
+    config["listen"] = {"endpoints": [posture.hub, *outside], "exit_on_failure": True}
     return config
 
 
