@@ -21,6 +21,7 @@ from strands_robots import settings
 from strands_robots.cli.command import OnMesh, assignments, command, parse_ports
 from strands_robots.cli.network import Network, describe, mesh_peer
 from strands_robots.cli.output import CliError, Screen, first_line, label, plain, table
+from strands_robots.cli.readiness import shortcomings
 from strands_robots.cli.record import record_robot
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import text_of
@@ -193,6 +194,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
     functions = {each.name: str(each.description).strip() for each in driver.capabilities.functions}
     identity = getattr(getattr(driver, "registration", None), "identity", None)
     key = identity.fingerprint if identity is not None else ""
+    lacking = shortcomings(driver, link)
     screen.data(
         {
             "event": "serving",
@@ -202,12 +204,14 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
             "pid": os.getpid(),
             "functions": functions,
             "fingerprint": key,
+            "not_ready": lacking,
         }
     )
     if screen.machine:
         return
     flags = _network_flags(link, network)
     lines: list[Any] = [
+        *(label(f"NOT READY. {each}", "bold red") for each in lacking),
         label(describe(link)),
         *([label(f"Tenant {link.tenant}.")] if link.tenant != "default" else []),
         table("", ("function", "what it does"), ((name, first_line(text)) for name, text in functions.items())),
@@ -220,7 +224,11 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
         label(""),
         label("Ctrl-C stops the robot, then takes it off the network."),
     ]
-    screen.show(Panel(Group(*lines), title=label(peer_id, "bold"), title_align="left", border_style="green"))
+    screen.show(
+        Panel(
+            Group(*lines), title=label(peer_id, "bold"), title_align="left", border_style="red" if lacking else "green"
+        )
+    )
 
 
 def _network_flags(link: LinkConfig, network: Network) -> str:

@@ -176,7 +176,7 @@ class ClearanceInbox:
 
 def _orders() -> Iterator[tuple[Path, dict[str, Any]]]:
     directory = clearances()
-    with contextlib.suppress(FileNotFoundError):  # there was no order yet
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):  # there was no order yet
         directory.lstat()
         try:
             require_private(directory, state_dir())

@@ -458,8 +458,8 @@ class SafetyPlane:
     def _kept(self, entries: Iterable[Registered]) -> bool:
         try:
             self._keep(entries)
-        except OSError:
-            logger.critical("The lockout file was not written: until it is, a restart forgets this.", exc_info=True)
+        except OSError as exc:
+            logger.critical("The lockout file was not written (%s): until it is, a restart forgets this.", exc)
             return False
         return True
 

@@ -229,6 +229,9 @@ class Reporter:
                 return
             try:
                 run.keep()
+            except OSError as exc:
+                logger.critical("The lockout file was not written: %s.", exc)
+                self._inbox.put(_Kept(run, ok=False))
             except Exception:
                 logger.critical("The lockout file was not written.", exc_info=True)
                 self._inbox.put(_Kept(run, ok=False))

@@ -80,6 +80,16 @@ def open_links() -> tuple[LinkConfig, ...]:
         return tuple(_sessions)
 
 
+def meets(link: LinkConfig) -> str:
+    """Return the kind of process on a link's meeting port.
+
+    It is ``peer``, also for this process, ``router``, or ``stranger`` where it speaks no Zenoh.
+    """
+    with _lock:
+        shared = next((each for each in _sessions.values() if each.link.meeting_point == link.meeting_point), None)
+    return "peer" if shared is None else shared.meets
+
+
 def direct(sink: Sink, drop: Callable[[], None] | None = None) -> Any:
     """Return a handler that calls ``sink`` on Zenoh's receiving thread."""
     return zenoh.handlers.Callback(sink, drop, indirect=False)
@@ -176,6 +186,12 @@ class SharedSession:
         opened = self._linked_session
         return opened is not None and (self.link.is_peer or bool(opened.remotes))
 
+    @property
+    def meets(self) -> str:
+        """Kind of process on the meeting port, as :func:`meets` returns it."""
+        with self._lock:
+            return "peer" if self._meeting is None else self._meeting.kind
+
     def watch(self, watcher: Callable[[bool], None]) -> None:
         """Have ``watcher(linked)`` called on Zenoh's thread at each change."""
         with self._lock:
@@ -266,6 +282,14 @@ class MeetingPort:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="strands-meeting", daemon=True)
         self._thread.start()
+
+    @property
+    def kind(self) -> str:
+        """Kind of process on the port; ``stranger`` while nothing there has linked."""
+        remotes = {str(link.zid) for link in self._session.info.links() if str(link.dst) == self._link.meeting_point}
+        if remotes & {str(each) for each in self._session.info.routers_zid()}:
+            return "router"
+        return "peer" if remotes or self._host is not None else "stranger"
 
     def close(self) -> None:
         """Stop watching and give the port back."""

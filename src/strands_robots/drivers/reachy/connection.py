@@ -399,9 +399,10 @@ class Connection:
             link.close()
 
     def _unavailable(self, reason: str) -> None:
+        reason = reason.rstrip(".")
         if reason != self._reason and not self._stopping.is_set():
-            logger.warning("Reachy Mini at %s:%d is unavailable: %s.", self.host, self.port, reason.rstrip("."))
-            self._reason = reason.rstrip(".")
+            logger.warning("Reachy Mini at %s:%d is unavailable: %s.", self.host, self.port, reason)
+            self._reason = reason
 
 
 def running_moves(answer: Any) -> frozenset[str]:

@@ -1,0 +1,121 @@
+"""Readiness of a served robot: its link, meeting port and state directory."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING
+
+from strands_robots.safety.approval import state_dir
+
+if TYPE_CHECKING:
+    from device_connect_edge.drivers import DeviceDriver
+
+    from strands_robots.device_connect.backends import LinkConfig
+
+MEET_S = 1.0
+"""Seconds in which the process that has the meeting port links with this one."""
+
+_LISTEN = "0A"
+"""State of a listening socket in ``/proc/net/tcp``."""
+
+
+def shortcomings(driver: DeviceDriver, link: LinkConfig) -> list[str]:
+    """Return one sentence for each reason why a served robot is not ready."""
+    found = [driver_problem(driver), meeting_problem(link), state_problem()]
+    return [each for each in found if each]
+
+
+def driver_problem(driver: DeviceDriver) -> str:
+    """Return why the robot itself cannot be used, or empty."""
+    status = driver.status
+    if status.availability != "unavailable":
+        return ""
+    return f"The robot is unavailable: {(status.error_state or 'no reason is known').rstrip('.')}. It is tried again."
+
+
+def state_problem() -> str:
+    """Return why the state directory cannot be written, or empty."""
+    folder = state_dir()
+    try:
+        probe = next(each for each in (folder, *folder.parents) if each.exists())
+        with TemporaryFile(dir=probe):
+            return ""
+    except OSError as exc:
+        return (
+            f"The state directory {folder} cannot be written ({exc.strerror}): a restart forgets a lockout, answers "
+            "are not signed, and nothing is audited. Set STRANDS_STATE_DIR to a directory that this user can write."
+        )
+
+
+def meeting_problem(link: LinkConfig) -> str:
+    """Return who else has the meeting port; empty for a robot process of this user."""
+    if link.meet_port is None:
+        return ""
+    from strands_robots.device_connect.backends.zenoh_session import meets  # noqa: PLC0415 - loaded when it is used
+
+    kind, until = meets(link), time.monotonic() + MEET_S
+    while kind == "stranger" and time.monotonic() < until:
+        time.sleep(0.05)
+        kind = meets(link)
+    uid, holder = port_holder(link.meet_port)
+    if kind == "peer" and uid in (None, os.getuid()):
+        return ""
+    remedy = "End it, or choose another port with --port or STRANDS_DC_PORT."
+    where = f"The meeting port {link.meet_port} is held by {holder}"
+    if kind == "router":
+        return f"{where}, a Zenoh router such as ROS 2's: robots of other processes may not be found. {remedy}"
+    if kind == "stranger":
+        return f"{where}, which is no robot process: robots of other processes are not found. {remedy}"
+    return f"{where}: its robots and this one share a network, and either user can drive both. {remedy}"
+
+
+def port_holder(port: int) -> tuple[int | None, str]:
+    """Return the user id and a description of what listens on a local TCP port.
+
+    Linux alone tells it; the process of another user is told to root alone.
+    """
+    for uid, inode in _listeners(port):
+        who = f"user {_user(uid)}"
+        process = _process(inode)
+        return uid, f"{process} of {who}" if process else f"a process of {who}"
+    return None, "another program"
+
+
+def _listeners(port: int) -> Iterator[tuple[int, str]]:
+    """Yield user id and inode of the sockets that listen on a loopback port."""
+    ours = {"00000000", socket.inet_aton("127.0.0.1")[:: -1 if sys.byteorder == "little" else 1].hex().upper()}
+    for table in ("tcp", "tcp6"):
+        lines: list[str] = []
+        with suppress(OSError):  # not Linux, or no IPv6
+            lines = Path(f"/proc/net/{table}").read_text("ascii").splitlines()[1:]
+        for line in lines:
+            fields = line.split()
+            address, _, number = fields[1].partition(":")
+            if fields[3] == _LISTEN and int(number, 16) == port and (address in ours or set(address) == {"0"}):
+                yield int(fields[7]), fields[9]
+
+
+def _process(inode: str) -> str:
+    """Return pid and program of the process that has a socket, or empty."""
+    wanted = f"socket:[{inode}]"
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it ended, or is another user's
+            if any(str(each.readlink()) == wanted for each in (folder / "fd").iterdir()):
+                words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
+                return f"pid {folder.name} ({' '.join(Path(each).name for each in words[:3] if each)})"
+    return ""
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
