@@ -17,6 +17,7 @@ from strands_robots.cli.stop import exit_code, report_rows, style_of, summary
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.client import Peer
 from strands_robots.envelope import Envelope, success
+from strands_robots.mesh.console_keys import enrolled_consoles
 from strands_robots.safety import statements
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
@@ -215,3 +216,18 @@ def test_the_fleet_screen_names_a_robot_with_a_wrong_key() -> None:
     button = StopButton(FakeController(), lambda: (), "")  # type: ignore[arg-type]
     fleet.update([LockoutReport("arm-1"), LockoutReport("arm-2", problem="ALARM: a wrong key")])
     assert "arm-2: ALARM: a wrong key." in drawn(fleet, button)
+
+
+def test_key_of_a_console_elsewhere_is_trusted_for_motions(run: Run, stranger: SigningIdentity) -> None:
+    result = run("enroll", "--console", stranger.public_text)
+    assert result.exit_code == 0, result.output
+    assert stranger.fingerprint in result.stdout
+    assert stranger.public in enrolled_consoles().load().values()
+    assert EnrolledKeys().load() == {}
+
+
+def test_text_that_is_no_key_enrolls_no_console(run: Run) -> None:
+    result = run("enroll", "--console", "laptop")
+    assert result.exit_code == 1
+    assert "keys console" in result.stderr and "laptop" in result.stderr
+    assert enrolled_consoles().load() == {}

@@ -11,9 +11,10 @@ from strands_robots.cli.command import Timeout, command
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.cli.resume import ask_robots, lockable_robots
+from strands_robots.safety import ed25519
 from strands_robots.safety.identity import EnrolledKeys, KeyFileError, fingerprint
 from strands_robots.safety.statements import Purpose, own_key
-from strands_robots.utils import device_id, number
+from strands_robots.utils import device_id, number, shown
 
 COMPARE = "Compare each with the fingerprint that `strands-robots doctor` shows at the robot's own machine."
 
@@ -29,9 +30,13 @@ def enroll(
     *,
     devices: Annotated[list[str] | None, typer.Argument(metavar="DEVICE...", help="Which; else all found.")] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Accept the new key of a robot set up anew.")] = False,
+    console: Annotated[str, typer.Option(help="Let a console elsewhere move hardware: its `keys console`.")] = "",
     timeout: Timeout = 2.0,
 ) -> None:
     """Keep the public keys of robots: from then on only a signed answer counts."""
+    if console:
+        _enroll_console(screen, console)
+        return
     wanted = [device_id("DEVICE", each) for each in devices or []]
     seconds = number("--timeout", timeout, above=0, high=60)
     with network.fleet() as fleet:
@@ -41,14 +46,14 @@ def enroll(
         raise CliError(f"No robot answered. {describe(link)}", Exit.SILENT, devices={})
     from strands_robots.device_connect.enrollment import local_name  # noqa: PLC0415 - the network is loaded when it is used
 
-    shown = {each.name: own_key(Purpose.LOCKOUT_STATE, each.name, _statement(each.facts)) for each in reports}
+    keys = {each.name: own_key(Purpose.LOCKOUT_STATE, each.name, _statement(each.facts)) for each in reports}
     problems = {each.name: each.problem for each in reports}
     try:
         file = EnrolledKeys()
         known = file.load()
         outcome: dict[str, tuple[str, str]] = {}
         fresh: dict[str, bytes] = {}
-        for name, public in shown.items():
+        for name, public in keys.items():
             local = local_name(link.tenant, name)
             if public is None:
                 outcome[name] = (
@@ -63,7 +68,7 @@ def enroll(
         file.enroll(fresh, replace=replace)
     except (KeyFileError, OSError) as exc:
         raise CliError(f"Nothing was enrolled: {exc}") from exc
-    prints = {name: fingerprint(public) if public else "" for name, public in shown.items()}
+    prints = {name: fingerprint(public) if public else "" for name, public in keys.items()}
     styles = {"CHANGED KEY": "bold red", "no key": "yellow"}
     rows = (
         (name, label(mark, styles.get(mark, "green")), prints[name], said) for name, (mark, said) in outcome.items()
@@ -86,6 +91,24 @@ def enroll(
         raise CliError("No robot showed a key.", Exit.SILENT, devices=facts)
     screen.data({"status": "success", "devices": facts})
     screen.say(COMPARE)
+
+
+def _enroll_console(screen: Screen, text: str) -> None:
+    """Keep the key of a console on another machine, for the robots of this one."""
+    from strands_robots.mesh.console_keys import enrolled_consoles  # noqa: PLC0415 - loaded when it is used
+
+    public = ed25519.decode(text, 32)
+    if public is None:
+        raise CliError(f"--console must be the key that `strands-robots keys console` prints there, not {shown(text)}.")
+    mark = fingerprint(public)
+    try:
+        enrolled_consoles().enroll({f"console-{mark}": public})
+    except (KeyFileError, OSError) as exc:
+        raise CliError(f"Nothing was enrolled: {exc}") from exc
+    screen.data({"status": "success", "console": mark})
+    screen.say(
+        f"Enrolled the console {mark}: on the mesh it may move this user's robots, with their approval.", "green"
+    )
 
 
 def _statement(facts: Mapping[str, object]) -> Mapping[str, object]:

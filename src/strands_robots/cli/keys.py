@@ -57,7 +57,10 @@ def console(screen: Screen) -> None:
 
     public = _refusable(lambda: console_key().load_or_make()).public_text
     screen.data({"status": "success", "STRANDS_MESH_CONSOLE_PUBLIC_KEYS": public})
-    screen.say("Robots of this user on this machine know it. On each robot's machine set:", "green")
+    screen.say(
+        "Robots of this user on this machine know it. On each robot's machine `enroll --console` takes it, or set:",
+        "green",
+    )
     screen.copyable(f"export STRANDS_MESH_CONSOLE_PUBLIC_KEYS={public}")
 
 
