@@ -53,7 +53,7 @@ class Frames:
         return {**frame, "action": {NUMBERED: degrees}, "events": None, **fields}
 
     def send(self, degrees: float = 0.0, **fields: Any) -> None:
-        self._pair.leader.ask("publish", TOPIC, self.made(degrees, **fields))
+        self._pair.leader.ask("frame", TOPIC, self.made(degrees, **fields))
 
 
 @pytest.fixture
@@ -141,7 +141,7 @@ def test_a_second_leader_of_the_same_name_moves_nothing(pair: ArmPair, frames: F
     state.mkdir(mode=0o700)
     with MeshPeer("other", "none", {**pair.settings["lead"], "STRANDS_STATE_DIR": str(state)}) as other:
         other.sees("follow")
-        other.ask("publish", TOPIC, frames.made(5.0))
+        other.ask("frame", TOPIC, frames.made(5.0))
         eventually(lambda: stat(pair, "rejected_source")() == 1)
     reached(pair, 1)
     frames.send(2.0)
