@@ -13,7 +13,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from strands_robots.audit import flush_audit, log_safety_event
-from strands_robots.cli.demo.output import BUNCHED_S, PAUSE_S, DemoScreen, draw_motion, replayed
+from strands_robots.cli.demo.output import BUNCHED_S, PAUSE_S, DemoScreen, draw_motion, frames_within, replayed
 from strands_robots.cli.demo.processes import AgentEvent
 from strands_robots.cli.demo.steps import NEEDED, DemoReport, DriveSteps, SafetySteps, on_plate
 from strands_robots.cli.output import CliError, Screen
@@ -302,6 +302,11 @@ def test_replay_shortens_pauses_and_spreads_bunches() -> None:
         ({"pan": 3.0}, PAUSE_S),
     ]
     assert replayed([]) == []
+
+
+@pytest.mark.parametrize(("each_s", "frames"), [(0.0, 60), (0.1, 60), (0.4, 30), (5.0, 12)])
+def test_slow_renderer_draws_fewer_frames(each_s: float, frames: int) -> None:
+    assert frames_within(12.0, each_s) == frames
 
 
 def test_recording_shows_the_last_state_of_each_frame(tmp_path: Path) -> None:

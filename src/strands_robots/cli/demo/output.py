@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -19,8 +20,13 @@ from strands_robots.utils import ValidationError
 RECORDING_WIDTH = 96
 """Columns of the recording."""
 
-FRAMES_MAX = 60
-FRAMES_A_SECOND = 12.0
+FRAMES_MIN, FRAMES_MAX = 12, 60
+ANIMATION_S = 5.0
+"""Length of the animation."""
+
+DRAW_S = 12.0
+"""Time to draw it in; where a frame takes long, as with OSMesa, there are fewer."""
+
 SIZE = (400, 300)
 """Pixels of the animation; it stays below a megabyte."""
 
@@ -125,13 +131,16 @@ def draw_motion(
     moves = replayed(setpoints)
     if len(moves) < 2:
         raise CliError("The agent saw too little of the motion to draw it.")
-    frame_s = max(sum(seconds for _, seconds in moves) / FRAMES_MAX, 1 / FRAMES_A_SECOND)
     twin = Simulation("twin", timestep=_TIMESTEP_S, realtime=False)
     try:
         twin.add_robot(robot)
         furnish(twin, scene)
         recording = Recording(twin, camera=_CAMERA, width=SIZE[0], height=SIZE[1])
-        since = frame_s
+        recording.capture()
+        started = time.monotonic()
+        recording.capture()  # the first one also made the OpenGL context
+        most = frames_within(DRAW_S, time.monotonic() - started)
+        frame_s, since = sum(seconds for _, seconds in moves) / most, 0.0
         for told, seconds in moves:
             twin.send_action(told)
             twin.step(round(seconds / _TIMESTEP_S))
@@ -144,7 +153,7 @@ def draw_motion(
         folder.mkdir(parents=True, exist_ok=True)
         files = [
             recording.save_picture(folder / "arm-path.png"),
-            recording.save_animation(folder / "demo.gif", FRAMES_A_SECOND),
+            recording.save_animation(folder / "demo.gif", max(len(recording.frames) / ANIMATION_S, 1.0)),
         ]
     except (OSError, ValidationError) as exc:
         raise CliError(f"The pictures could not be written to {folder}: {exc}") from exc
@@ -154,6 +163,11 @@ def draw_motion(
     if empty:
         raise CliError(f"Nothing was written to {', '.join(empty)}.")
     return files, recording.how
+
+
+def frames_within(seconds: float, each_s: float) -> int:
+    """Return how many frames to draw where each takes ``each_s`` seconds."""
+    return int(min(max(seconds / max(each_s, 1e-3), FRAMES_MIN), FRAMES_MAX))
 
 
 def replayed(setpoints: Sequence[tuple[float, dict[str, float]]]) -> list[tuple[dict[str, float], float]]:
