@@ -48,7 +48,8 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
 }
 _REQUIRED = ("device-connect",)
 _IMPORT_PACKAGE = "strands_robots"
-_OWNS = re.compile(rf"^(\.\./)*{_IMPORT_PACKAGE}/__init__\.py\b", re.MULTILINE)
+_OWNED = f"{_IMPORT_PACKAGE}/__init__.py"
+_OWNS = re.compile(rf"^(\.\./)*{re.escape(_OWNED)}\b", re.MULTILINE)
 _RENDER_S = 20.0
 
 # Runs in its own process: MuJoCo chooses its OpenGL at import, and a broken driver may end the process.
@@ -143,8 +144,8 @@ def _installation() -> Iterator[Finding]:
 def other_owners(path: Sequence[str] | None = None) -> list[str]:
     """Return every other distribution that installs our import package.
 
-    The lists of installed files are searched as text, in about 5 ms: ``importlib.metadata.packages_distributions``
-    parses all of them in about 100 ms, which every command would pay.
+    Every command pays for this. So the lists of installed files are searched as text and not parsed, as
+    ``importlib.metadata.packages_distributions`` does, and by the expression only where the name stands in them.
     """
     found = set()
     for installed in metadata.distributions(path=list(sys.path if path is None else path)):
@@ -152,7 +153,7 @@ def other_owners(path: Sequence[str] | None = None) -> list[str]:
         # A broken list of another package must not keep a command, least of all a stop, from running.
         with suppress(OSError, ValueError):
             files = installed.read_text("RECORD") or installed.read_text("installed-files.txt") or ""
-        name = installed.metadata["Name"] if _OWNS.search(files) else None
+        name = installed.metadata["Name"] if _OWNED in files and _OWNS.search(files) else None
         if name and name.lower().replace("_", "-") != DISTRIBUTION:
             found.add(f"{name} {installed.version}")
     return sorted(found)
