@@ -138,6 +138,16 @@ def test_tampering_is_found_before_the_next_record(journal: Journal, tamper: Cal
     assert not check(journal)["ok"]
 
 
+@pytest.mark.parametrize(("old", "new"), [(b'"sig":"', '"sig":"\u1000'.encode()), (b'"n":3', b'"n":NaN')])
+def test_record_that_no_writer_could_sign_is_found_and_no_crash(journal: Journal, old: bytes, new: bytes) -> None:
+    written = journal.path.read_bytes()
+    assert old in written
+    journal.path.write_bytes(written.replace(old, new, 1))
+    found = check(journal)
+    assert (found["bad"], found["ok"]) == (1, False)
+    assert "the signature does not hold" in [each["why"] for each in found["breaks"]]
+
+
 @pytest.mark.parametrize("restarted", [False, True], ids=["running writer", "restarted writer"])
 @pytest.mark.parametrize("tamper", TAMPERINGS, ids=lambda each: each.__name__)
 def test_tampering_is_found_after_more_records(

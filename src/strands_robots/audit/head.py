@@ -42,10 +42,15 @@ class Seal:
         return fields if self._key is None else {**fields, "sig": self._signature(fields)}
 
     def valid(self, fields: Mapping[str, Any]) -> bool:
-        """True when the key made the ``sig`` of these fields."""
+        """True when the key made the ``sig`` of these fields; never an error."""
         sig = fields.get("sig")
         bare = {name: value for name, value in fields.items() if name != "sig"}
-        return self._key is not None and isinstance(sig, str) and hmac.compare_digest(sig, self._signature(bare))
+        if self._key is None or not isinstance(sig, str) or not sig.isascii():
+            return False
+        try:
+            return hmac.compare_digest(sig, self._signature(bare))
+        except (ValueError, RecursionError):  # no writer wrote a number that JSON cannot carry
+            return False
 
     def read(self, data: bytes) -> dict[str, Any] | None:
         """Return the fields of a file, or None unless :meth:`sign` made its bytes."""
