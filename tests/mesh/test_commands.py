@@ -58,6 +58,7 @@ def test_a_simulation_runs_what_it_is_told(peers: Fleet) -> None:
     assert reply["result"]["status"] == "success"
     assert world.running == {"left": "wave"}
     reply = console.send("sim-1", {"action": "stop"}, timeout=20)
+    assert reply["result"].pop("statement")["ok"] is True
     assert reply["result"] == {"ok": True, "stopped": ["left"], "not_stopped": [], "results": {"left": "stopped"}}
 
 

@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from strands_robots.cli.command import Timeout, command
+from strands_robots.cli.command import OnMesh, Timeout, command
+from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
-from strands_robots.cli.resume import ask_robots, lockable_robots
+from strands_robots.cli.resume import ask_mesh, ask_robots, lockable_robots
 from strands_robots.safety import ed25519
-from strands_robots.safety.identity import EnrolledKeys, KeyFileError, fingerprint
+from strands_robots.safety.identity import DEFAULT_TENANT, EnrolledKeys, KeyFileError, fingerprint, local_name
 from strands_robots.safety.statements import Purpose, own_key
 from strands_robots.utils import device_id, number, shown
 
@@ -32,6 +33,7 @@ def enroll(
     replace: Annotated[bool, typer.Option("--replace", help="Accept the new key of a robot set up anew.")] = False,
     console: Annotated[str, typer.Option(help="Let a console elsewhere move hardware: its `keys console`.")] = "",
     timeout: Timeout = 2.0,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Keep the public keys of robots: from then on only a signed answer counts."""
     if console:
@@ -39,13 +41,9 @@ def enroll(
         return
     wanted = [device_id("DEVICE", each) for each in devices or []]
     seconds = number("--timeout", timeout, above=0, high=60)
-    with network.fleet() as fleet:
-        reports = ask_robots(fleet, wanted or lockable_robots(fleet, seconds), seconds)
-        link = fleet.link
+    reports, tenant, where = (_on_mesh if on_mesh else _on_fleet)(network, wanted, seconds)
     if not reports:
-        raise CliError(f"No robot answered. {describe(link)}", Exit.SILENT, devices={})
-    from strands_robots.device_connect.enrollment import local_name  # noqa: PLC0415 - the network is loaded when it is used
-
+        raise CliError(f"No robot answered. {where}", Exit.SILENT, devices={})
     keys = {each.name: own_key(Purpose.LOCKOUT_STATE, each.name, _statement(each.facts)) for each in reports}
     problems = {each.name: each.problem for each in reports}
     try:
@@ -54,7 +52,7 @@ def enroll(
         outcome: dict[str, tuple[str, str]] = {}
         fresh: dict[str, bytes] = {}
         for name, public in keys.items():
-            local = local_name(link.tenant, name)
+            local = local_name(tenant, name)
             if public is None:
                 outcome[name] = (
                     "no key",
@@ -109,6 +107,16 @@ def _enroll_console(screen: Screen, text: str) -> None:
     screen.say(
         f"Enrolled the console {mark}: on the mesh it may move this user's robots, with their approval.", "green"
     )
+
+
+def _on_fleet(network: Network, wanted: list[str], seconds: float) -> tuple[list[LockoutReport], str, str]:
+    with network.fleet() as fleet:
+        reports = ask_robots(fleet, wanted or lockable_robots(fleet, seconds), seconds)
+        return reports, fleet.link.tenant, describe(fleet.link)
+
+
+def _on_mesh(network: Network, wanted: list[str], seconds: float) -> tuple[list[LockoutReport], str, str]:
+    return ask_mesh(network, seconds, wanted), DEFAULT_TENANT, "It was looked for on the native mesh."
 
 
 def _statement(facts: Mapping[str, object]) -> Mapping[str, object]:

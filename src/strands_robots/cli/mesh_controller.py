@@ -11,6 +11,8 @@ from strands_robots.cli.resume_mesh import ask_peers, lockable_peers
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stopping import explain
 from strands_robots.tools.networks import stop_outcome
 
@@ -30,6 +32,7 @@ class MeshController:
         self._mesh = mesh
         self._key = signing_key
         self._press = ("", Press(0.0, 0.0))
+        self._keys = enrolled_peers()
         self.controller_id = mesh.peer_id
 
     @property
@@ -59,15 +62,18 @@ class MeshController:
             self.press(epoch)
         pressed = self._press[1]
         answers: dict[str, Answer] = {}
+        alarms: dict[str, str] = {}
 
         def note(replies: list[dict[str, Any]]) -> None:
             for reply in replies:
-                name = str(reply["responder_id"])
-                if name not in answers or answers[name].stopped is not True:
-                    answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000)
+                name, why = str(reply["responder_id"]), stop_distrust(reply, self._keys)
+                if why.startswith(ALARM):
+                    alarms[name] = why
+                elif name not in answers or answers[name].stopped is not True or answers[name].claimed:
+                    answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000, claimed=bool(why))
             silent = tuple(sorted(set(expected) - answers.keys()))
             elapsed = (time.monotonic() - pressed.at) * 1000
-            on_progress(Progress(epoch, dict(answers), silent, self.link_up, elapsed))
+            on_progress(Progress(epoch, dict(answers), silent, self.link_up, elapsed, alarms=dict(alarms)))
 
         note([])
         up = self.link_up
@@ -76,12 +82,14 @@ class MeshController:
         told = {name: each for name, each in answers.items() if name in robots}
         return StopReport(
             epoch,
-            {name: each for name, each in told.items() if each.stopped is True},
+            {name: each for name, each in told.items() if each.stopped is True and not each.claimed},
             {name: each for name, each in told.items() if each.stopped is not True},
             {},
-            tuple(sorted(set(expected) - told.keys())),
+            tuple(sorted(set(expected) - told.keys() - alarms.keys())),
             up,
             (time.monotonic() - pressed.at) * 1000,
+            claimed={name: each for name, each in told.items() if each.stopped is True and each.claimed},
+            alarms=alarms,
         )
 
     def review(self, report: StopReport) -> StopReport:
@@ -90,12 +98,14 @@ class MeshController:
 
     def reports(self, known: Collection[str], seconds: float) -> list[LockoutReport]:
         """Ask the robots in reach and those known for their lockouts."""
+        self._keys = enrolled_peers()
         return ask_peers(self._mesh, sorted({*lockable_peers(self._mesh), *known}), seconds)
 
 
-def _answer(name: str, reply: dict[str, Any], latency_ms: float) -> Answer:
+def _answer(name: str, reply: dict[str, Any], latency_ms: float, *, claimed: bool) -> Answer:
     result = reply.get("result")
     if reply.get("type") != "response" or not isinstance(result, dict):
         return Answer(name, None, latency_ms, str(reply.get("error", "no answer")))
     stopped, _ = stop_outcome(result)
-    return Answer(name, stopped, latency_ms, "" if stopped else explain(result), result)
+    why = "" if stopped else explain(result)
+    return Answer(name, stopped, latency_ms, why, result, required=claimed, enrolled=claimed)

@@ -93,7 +93,7 @@ def lockout(
     if not local:
         try:
             if on_mesh:
-                live = _ask_mesh(network, seconds)
+                live = ask_mesh(network, seconds)
             else:
                 with network.fleet() as fleet:
                     live = ask_robots(fleet, lockable_robots(fleet, seconds), seconds)
@@ -162,11 +162,12 @@ def ask_robots(fleet: FleetClient, names: Iterable[str], seconds: float) -> list
         return list(pool.map(lambda name: _ask(fleet, name, seconds, keys.get(name)), wanted))
 
 
-def _ask_mesh(network: Network, seconds: float) -> list[LockoutReport]:
+def ask_mesh(network: Network, seconds: float, wanted: Iterable[str] = ()) -> list[LockoutReport]:
+    """Ask these mesh peers for their lockouts, else all that have a robot."""
     network.use_mesh()
     with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
         discover(mesh)
-        return ask_peers(mesh, lockable_peers(mesh), seconds)
+        return ask_peers(mesh, wanted or lockable_peers(mesh), seconds)
 
 
 def _resume_on_mesh(wanted: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.safety.lockout import OVERFLOW, Lockout
+from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
 from strands_robots.safety.resume import sign
 from strands_robots.utils import shown
 
@@ -31,10 +32,13 @@ def lockable_peers(mesh: Mesh) -> list[str]:
 
 
 def ask_peers(mesh: Mesh, names: Iterable[str], seconds: float) -> list[LockoutReport]:
-    """Ask each peer for its status, in parallel."""
-    wanted = list(dict.fromkeys(names))
+    """Ask each peer for its status, in parallel.
+
+    An enrolled robot whose answer is not its own has a ``problem``.
+    """
+    wanted, keys = list(dict.fromkeys(names)), enrolled_peers()
     with ThreadPoolExecutor(PARALLEL_REQUESTS) as pool:
-        return list(pool.map(lambda name: _ask(mesh, name, seconds), wanted))
+        return list(pool.map(lambda name: _ask(mesh, name, seconds, keys), wanted))
 
 
 def resume_peers(
@@ -88,7 +92,7 @@ def _outcome(before: tuple[Lockout, ...], left: tuple[Lockout, ...] | None, said
     return f"{said or 'it did not confirm'}: its own audit says why"
 
 
-def _ask(mesh: Mesh, name: str, seconds: float) -> LockoutReport:
+def _ask(mesh: Mesh, name: str, seconds: float, keys: Mapping[str, bytes] | None) -> LockoutReport:
     began = time.monotonic()
     reply = mesh.send(name, {"action": "status"}, seconds)
     took_ms = (time.monotonic() - began) * 1000
@@ -99,7 +103,9 @@ def _ask(mesh: Mesh, name: str, seconds: float) -> LockoutReport:
     if not isinstance(rows, list):
         return LockoutReport(name, problem="it does not report lockouts", facts=result, round_trip_ms=took_ms)
     lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping))
-    return LockoutReport(name, lockouts, str(result.get("estop_unheard", "")), result, took_ms)
+    distrusted = lockout_distrust(name, result, [each.epoch for each in lockouts], keys)
+    problem = distrusted or str(result.get("estop_unheard", ""))
+    return LockoutReport(name, () if distrusted else lockouts, problem, result, took_ms)
 
 
 def _send(mesh: Mesh, name: str, assertion: Mapping[str, Any], seconds: float) -> str:

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.safety.identity import EnrolledKeys
-
-
-def local_name(tenant: str, device_id: str) -> str:
-    """Return the name of a device here; two tenants may each have this id."""
-    return device_id if tenant == "default" else f"{tenant}.{device_id}"
+from strands_robots.safety.identity import EnrolledKeys, local_name
 
 
 def enrolled_robots(link: LinkConfig) -> dict[str, bytes]:

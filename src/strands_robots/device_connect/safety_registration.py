@@ -12,12 +12,11 @@ from device_connect_edge.drivers import DeviceDriver
 
 from strands_robots.contract import Haltable
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.enrollment import local_name
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.identity import robot_identity
+from strands_robots.safety.identity import local_name, robot_identity
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane

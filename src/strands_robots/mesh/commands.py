@@ -15,6 +15,8 @@ from strands_robots.mesh.console_keys import MOTION
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
+from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.peer_answers import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.robot_verbs import PEER_VERBS, RobotStop, peer_stop_answer, run_to_end, stop_within
@@ -122,6 +124,7 @@ class CommandReceiver:
         target_of: finds what a stop means by a name; by default in the pipeline's robot.
         before_stop: called when a stop has arrived; it may wait for nothing.
         after_stop: called before stops are answered.
+        robot_key: signs the answers to stops; without one they are not signed.
     """
 
     def __init__(
@@ -132,8 +135,10 @@ class CommandReceiver:
         target_of: TargetOf | None = None,
         before_stop: Callable[[], None] = lambda: None,
         after_stop: Callable[[], None] = lambda: None,
+        robot_key: SigningIdentity | None = None,
     ) -> None:
         self._context = context
+        self._robot_key = robot_key
         self._pipeline = pipeline
         self._target_of = target_of or partial(stop_target, pipeline.robot)
         self._before_stop, self._after_stop = before_stop, after_stop
@@ -234,7 +239,7 @@ class CommandReceiver:
             event, fields["reason"] = "command_refused", explain(result)
             self._log_doubt(fields["reason"])
         for sender, turn in requests:
-            self._reply(sender, turn, result=result)
+            self._reply(sender, turn, result=with_stop_statement(self._robot_key, self._context.peer_id, turn, result))
             audit(event, sender, turn_id=turn, **fields)
 
     def _log_doubt(self, reason: str) -> None:

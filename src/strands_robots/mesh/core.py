@@ -154,7 +154,11 @@ class Mesh(SensorLoopsMixin):
             robot, lambda: peer, hardware=hardware, authorize=SenderCheck(context, hardware=hardware), own=own
         )
         self._commands = CommandReceiver(
-            context, self._pipeline, before_stop=self._teleop.void, after_stop=self._teleop.reap
+            context,
+            self._pipeline,
+            before_stop=self._teleop.void,
+            after_stop=self._teleop.reap,
+            robot_key=self._adapter.identity,
         )
         self._safety = FleetSafety(
             context, self._adapter, self._requester, self._pipeline.shares.urgent, robot=robot is not None

@@ -29,7 +29,9 @@ from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.identity import robot_identity
 from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch, signed_bytes
+from strands_robots.safety.peer_answers import with_lockout_statement
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
 from strands_robots.safety.statements import Purpose
@@ -93,6 +95,7 @@ class SafetyAdapter:
         self._plane = own or plane()
         self._peer_id = peer_id
         self._robot = robot or NoRobot()
+        self.identity = None if robot is None else robot_identity(peer_id)
         self._key = key
         self._entry: Registered | None = None
         self._decision = StopRules()
@@ -128,7 +131,8 @@ class SafetyAdapter:
     def report(self) -> dict[str, Any]:
         """Return the fields of ``status``: the lockouts and the check-in."""
         check_in = self._plane.checkin.fields(time.monotonic())
-        return {**self.facts(), "lockout": self.lockouts(), "check_in": check_in}
+        facts = with_lockout_statement(self.identity, self._peer_id, self.facts())
+        return {**facts, "lockout": self.lockouts(), "check_in": check_in}
 
     def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
         """The reason why an e-stop of ``source`` does not count, or None."""

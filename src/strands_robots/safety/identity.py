@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 ROBOTS = "robots"
 """Folder of the keys of robots; a console's keys have a folder of their own."""
 
+DEFAULT_TENANT = "default"
+
 VERSION = 1
 FILE_MAX_BYTES = 2**20
 SEED_BYTES = 32
@@ -125,6 +127,14 @@ class KeyFile:
         if known is None:
             raise KeyFileError(f"{self.path} was removed while it was made.")
         return known
+
+
+def local_name(tenant: str, device_id: str) -> str:
+    """Return the name of a device here; two tenants may each have this id.
+
+    A robot has one key on Device Connect's default tenant and on the native mesh.
+    """
+    return device_id if tenant == DEFAULT_TENANT else f"{tenant}.{device_id}"
 
 
 def robot_identity(name: str) -> SigningIdentity | None:

@@ -41,6 +41,9 @@ def covered(purpose: Purpose, source: str, fields: Mapping[str, Any]) -> bytes:
 STATED_WITHIN_S = 60.0
 """Largest age of a statement that no question's id dates; the two clocks have to agree as well as that."""
 
+ALARM = "ALARM"
+"""First word of the reason for an answer that cannot be the robot's."""
+
 
 class Proof(Enum):
     """Grades of a statement's signature."""
@@ -102,12 +105,12 @@ def distrust(
     fields = statement if isinstance(statement, Mapping) else {}
     proof = proof_of(purpose, source, fields, enrolled)
     if proof is Proof.WRONG:
-        return "ALARM: its answer has a signature that is not of its enrolled key"
+        return f"{ALARM}: its answer has a signature that is not of its enrolled key"
     if proof is Proof.CLAIMED:
         return "its answer is only claimed: it is not signed, and this robot is enrolled"
     at = fields.get("t")
     if not isinstance(at, int | float) or abs(time.time() - at) > STATED_WITHIN_S:
         return "its signed answer is not of this minute: it is an old one, or the clocks disagree"
     if any(fields.get(name) != value for name, value in answered.items()):
-        return "ALARM: its answer says something else than its signed part"
+        return f"{ALARM}: its answer says something else than its signed part"
     return ""

@@ -17,6 +17,8 @@ from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import MissingExtraError, ValidationError
 
@@ -142,7 +144,9 @@ class NativeMesh:
         def stopped(mesh: Mesh) -> Envelope:
             command = {"action": "stop"}
             if target:
-                return combined_verdict({target: _stop_answer(target, _reply(mesh, target, command, STOP_S))})
+                return combined_verdict(
+                    {target: _stop_answer(target, _reply(mesh, target, command, STOP_S), enrolled_peers())}
+                )
             return _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S))
 
         return _on_mesh(stopped, stopped=None)
@@ -182,10 +186,11 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
     def send() -> None:
         nonlocal sent
         sent = time.monotonic()
-        for reply in stop():
+        replies, keys = stop(), enrolled_peers()
+        for reply in replies:
             name = reply["responder_id"]
             if name != mesh.peer_id:
-                answers[name] = _stop_answer(name, reply)
+                answers[name] = _stop_answer(name, reply, keys)
 
     def unconfirmed() -> bool:
         seen.update(_in_reach(mesh))
@@ -199,12 +204,15 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
     return combined_verdict(silent | answers)
 
 
-def _stop_answer(target: str, reply: dict[str, Any]) -> Envelope:
+def _stop_answer(target: str, reply: dict[str, Any], keys: Mapping[str, bytes] | None) -> Envelope:
     if reply.get("status") in ("timeout", "error"):
         return error(f"{target} did not answer.", stopped=None)
     result = reply.get("result")
     if grade(result).stopped:
-        return success("stopped", stopped=True)
+        why = stop_distrust(reply, keys)
+        if not why:
+            return success("stopped", stopped=True)
+        return error(why, stopped=False if why.startswith(ALARM) else None)
     return error(explain(result) if result is not None else str(reply.get("error", "")), stopped=False)
 
 

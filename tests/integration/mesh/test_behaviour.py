@@ -157,6 +157,7 @@ def test_a_simulation_starts_and_stops_on_demand(net: Network) -> None:
     assert console.ask("send", "sim-1", WAVE, 20)["result"]["status"] == "success"
     assert sim.ask("moving") == ["left"]
     result = console.ask("send", "sim-1", {"action": "stop"}, 20)["result"]
+    assert result.pop("statement")["ok"] is True
     assert result == {"ok": True, "stopped": ["left"], "not_stopped": [], "results": {"left": "stopped"}}
     assert sim.ask("moving") == []
 

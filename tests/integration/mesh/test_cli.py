@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
 from strands_robots.mesh.resume_authority import keygen
+from strands_robots.safety.identity import EnrolledKeys, robot_identity
 from strands_robots.safety.persistence import LockoutStore
 
 
@@ -47,6 +48,20 @@ def test_served_arm_is_stopped_locked_and_cleared_from_another_terminal(tmp_path
         eventually(lambda: lockouts(store) == {"arm-1": True})
         assert machine.json("resume", "--local", "arm-1")[0] == 0
         assert lockouts(store) == {"arm-1": False}
+
+
+def test_enrolled_arm_of_the_mesh_stops_green_by_its_own_key_alone(tmp_path: Path, machine: Machine) -> None:
+    with machine.serving("arm-1", "--mesh"):
+        code, answer = machine.json("enroll", "--mesh")
+        assert (code, answer["devices"]["arm-1"]["outcome"]) == (0, "enrolled")
+        assert machine.json("estop", "--mesh")[0] == 0
+        other = robot_identity("arm-2")
+        assert other is not None
+        EnrolledKeys(tmp_path / "state").enroll({"arm-1": other.public}, replace=True)
+        code, answer = machine.json("estop", "--mesh")
+        assert (code, answer["not_stopped"]) == (1, ["arm-1"])
+        assert "ALARM" in answer["robots"]["arm-1"]
+        assert machine.json("enroll", "--mesh")[0] == 1
 
 
 def test_served_arm_is_called_by_any_action_of_the_mesh(machine: Machine) -> None:
