@@ -1,4 +1,4 @@
-.PHONY: help demo test test-all lint bench serve api system venv clean real-arm real-arm-next dds-security models
+.PHONY: help demo test test-all lint bench serve api system venv clean mcp real-arm real-arm-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -33,6 +33,7 @@ system:
 	@./scripts/reachy-daemon.sh 1.4.1
 	@./scripts/real-arm.sh
 	@./scripts/models.sh
+	@./scripts/mcp.sh
 	@./scripts/rosbridge.sh
 	@./scripts/registry.sh
 	@./scripts/dds-peers.sh
@@ -42,7 +43,12 @@ test-all: venv system  ## What needs Debian or npm packages besides
 	@$(BIN)/python -m pytest -m system $(ARGS)
 	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
 	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
+	@.venv-mcp/bin/python -m pytest tests/integration/mcp $(ARGS)
 	@$(DDS_SECURITY)/python -m pytest $(DDS_TESTS) $(ARGS)
+
+mcp:  ## The MCP server on the official SDK, in .venv-mcp, and its tests
+	@./scripts/mcp.sh
+	@.venv-mcp/bin/python -m pytest tests/integration/mcp $(ARGS)
 
 dds-security:  ## DDS Security on a Cyclone DDS that has it, in .venv-dds-security, and its tests
 	@./scripts/dds-security.sh

@@ -36,7 +36,7 @@ FLOORS: list[set[str]] = [
     },
     {"serving"},
     {"device_connect", "mesh", "mesh_session"},
-    {"cli", "tools", "robot"},
+    {"cli", "tools", "mcp", "robot"},
 ]
 
 SIBLING_NAMES: dict[str, str] = {}

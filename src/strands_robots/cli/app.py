@@ -27,6 +27,7 @@ COMMANDS = {
     "enroll": ("enroll",),
     "doctor": ("doctor",),
     "demo": ("demo",),
+    "mcp": ("mcp",),
 }
 """Words of the command line, by the module that has them."""
 

@@ -183,6 +183,16 @@ class FleetClient:
         """
         return self.run(self._stop(device, timeout), 2 * timeout + 4.0)
 
+    async def call_async(
+        self, device: str, function: str, params: Mapping[str, Any] | None = None, within: float = 10.0
+    ) -> Envelope:
+        """Do as :meth:`call`, on the event loop of the caller."""
+        return await self._awaited(self._call(device, function, dict(params or {}), within))
+
+    async def stop_async(self, device: str, within: float = 5.0) -> Envelope:
+        """Do as :meth:`stop`, on the event loop of the caller."""
+        return await self._awaited(self._stop(device, within))
+
     def stop_all(self, timeout: float = 5.0) -> dict[str, Envelope]:
         """Stop each device when it is found; return the answers by id.
 
@@ -209,6 +219,9 @@ class FleetClient:
         except BaseException:
             done.cancel()
             raise
+
+    async def _awaited(self, work: Coroutine[Any, Any, T]) -> T:
+        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._loop))
 
     @property
     def _found(self) -> Discovery:

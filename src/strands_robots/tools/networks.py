@@ -314,30 +314,33 @@ class DeviceConnect:
 
         A device that is in reach and did not answer it gets a plain ``stop`` as well.
         """
-        from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415
+        return _on_fleet(lambda fleet: stop_and_lock(fleet, reason), stopped=None)
 
-        def stopped(fleet: FleetClient) -> Envelope:
-            with ThreadPoolExecutor(1) as pool:
-                controller = safety_controller(SOURCE, fleet.link)
-                try:
-                    seen = pool.submit(fleet.peers)
-                    report = controller.stop((), reason, deadline_s=ESTOP_S)
-                finally:
-                    controller.close()
-            failed = {**report.not_stopped, **report.refused}
-            rest = [
-                peer.id
-                for peer in seen.result()
-                if peer.stop_verb and peer.id not in failed and peer.id not in report.stopped
-            ]
-            if not rest:
-                return envelope(report)
-            answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
-            answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
-            answers |= {name: fleet.stop(name, STOP_S) for name in rest}
-            return {**combined_verdict(answers), "not_locked": rest}
 
-        return _on_fleet(stopped, stopped=None)
+def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
+    """Send an emergency stop under the client's name; answers by name.
+
+    A device that is in reach and did not answer it gets a plain ``stop`` as well.
+    """
+    from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415
+
+    with ThreadPoolExecutor(1) as pool:
+        controller = safety_controller(fleet.source, fleet.link)
+        try:
+            seen = pool.submit(fleet.peers)
+            report = controller.stop((), reason, deadline_s=ESTOP_S)
+        finally:
+            controller.close()
+    failed = {**report.not_stopped, **report.refused}
+    rest = [
+        peer.id for peer in seen.result() if peer.stop_verb and peer.id not in failed and peer.id not in report.stopped
+    ]
+    if not rest:
+        return envelope(report)
+    answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
+    answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
+    answers |= {name: fleet.stop(name, STOP_S) for name in rest}
+    return {**combined_verdict(answers), "not_locked": rest}
 
 
 def _peer_list(rows: list[dict[str, Any]], stale: str = "") -> Envelope:
