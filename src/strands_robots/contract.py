@@ -46,6 +46,7 @@ class RolloutEvent:
     """An event of a rollout, given to observers from the control thread.
 
     ``kind`` is started, step or finished; ``state`` of a finished one is completed, stopped or error.
+    ``clamped_steps`` counts the actions that the robot's speed limit held back.
     ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units. ``follows_instruction``
     is False for a policy that moves by itself, whatever it was told, as ``mock`` does.
     """
@@ -55,6 +56,7 @@ class RolloutEvent:
     instruction: str
     policy: str
     step: int = 0
+    clamped_steps: int = 0
     elapsed_s: float = 0.0
     state: str = "running"
     error: str = ""

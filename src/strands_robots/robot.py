@@ -20,7 +20,7 @@ from strands_robots.utils import ValidationError, choice, device_id, identifier,
 
 logger = logging.getLogger(__name__)
 
-HARDWARE_OPTIONS = ("control_hz", "joint_ranges", "stop_level", "rest_pose", "model")
+HARDWARE_OPTIONS = ("control_hz", "joint_ranges", "stop_level", "rest_pose", "model", "speed_limit")
 
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
 """Error code for a simulated robot whose model is unknown or cannot be loaded."""
@@ -66,7 +66,8 @@ def Robot(  # the factory reads as the class it stands for
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
         options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), and ``scene``
             (``tabletop``: a table with a red cube and a plate). ``real``:
-            ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``, and every other one goes to the
+            ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``,
+            ``speed_limit``, and every other one goes to the
             LeRobot configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
             dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
             ``reachy_mini``: ``host`` (by default searched on the local network) and the arguments of

@@ -11,6 +11,7 @@ import pytest
 
 from strands_robots.bus_access import action_ranges
 from strands_robots.hardware.arm import arm_of
+from strands_robots.hardware.speed import default_speeds
 from strands_robots.utils import ValidationError
 
 MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -89,3 +90,16 @@ def test_device_without_a_joint_of_the_model_is_refused() -> None:
         part.pop("wrist_roll", None)
     with pytest.raises(ValidationError, match="so101_follower has no joint wrist_roll"):
         arm(made)
+
+
+@pytest.mark.parametrize("mode", ["DEGREES", "RANGE_M100_100"])
+def test_default_speed_of_a_real_joint_is_two_radians_a_second_in_its_unit(mode: str) -> None:
+    per_radian = 180 / math.pi if mode == "DEGREES" else 100 / math.radians(2503 / 2 * 360 / 4095)
+    speeds = default_speeds(device(mode))
+    assert speeds["shoulder_pan.pos"] == pytest.approx(2 * per_radian)
+    assert "gripper.pos" not in speeds
+
+
+def test_motions_are_planned_within_the_speed_limit() -> None:
+    made = arm_of(device(), action_ranges(device()), None, {"shoulder_pan.pos": 18.0, "elbow_flex.pos": 500.0})
+    assert made.bounds.speed == pytest.approx([math.radians(18), 2.0, 2.0, 2.0, 2.0])

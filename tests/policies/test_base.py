@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from strands_robots.policies.base import SpeedLimit, checked_action, numbers
+from strands_robots.policies.base import SpeedLimit, checked_action, checked_speeds, numbers
 from strands_robots.utils import ValidationError
 
 RANGES = {"a": (-1.0, 1.0), "b": (-math.inf, math.inf)}
@@ -52,3 +52,14 @@ def test_speed_limit_bounds_every_step(before: float, wanted: float, dt: float) 
     assert abs(after["a"] - before) <= 4 * dt + 1e-9
     assert abs(after["b"] - before) <= 10 * dt + 1e-9
     assert min(before, wanted) - 1e-9 <= after["a"] <= max(before, wanted) + 1e-9
+
+
+@pytest.mark.parametrize("bad", [0, -1, math.nan, math.inf, True, "1", {"c": 1.0}, {"a": 0}, {"a": True}])
+def test_speed_limit_outside_its_domain_is_refused(bad: object) -> None:
+    with pytest.raises(ValidationError, match="speed_limit"):
+        checked_speeds(bad, RANGES)
+
+
+def test_speed_limit_is_for_all_keys_or_for_those_it_names() -> None:
+    assert checked_speeds(2, RANGES) == {"a": 2.0, "b": 2.0}
+    assert checked_speeds({"b": 3.0}, RANGES) == {"b": 3.0}

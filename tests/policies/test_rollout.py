@@ -327,3 +327,38 @@ def test_a_policy_that_fails_at_once_is_told_with_its_reason() -> None:
     bare.start()
     assert "the policy bare failed: OSError: no weights" in bare.not_begun(20)
     assert bare.join(20)
+
+
+def limited(policy: ScriptedPolicy, **late: float) -> tuple[Rollout, RecordingBody, StepClock]:
+    body, clock = RecordingBody(), StepClock()
+    body.speeds = {"a": 1.0}
+    clock.late = {int(wait.removeprefix("wait")): seconds for wait, seconds in late.items()}
+    return rollout(body, policy, clock=clock, hz=10.0), body, clock
+
+
+def test_no_step_of_a_policy_is_faster_than_the_speed_limit_of_the_body() -> None:
+    one, body, _ = limited(ScriptedPolicy([{"a": 1.0}, {"a": -1.0}, {"a": 0.2}]))
+    one.run()
+    assert [action["a"] for _, action in body.writes] == pytest.approx([0.35, 0.25, 0.2])
+    assert (one.step_count, one.clamped_steps) == (3, 2)
+
+
+def test_pause_adds_up_to_no_jump_under_a_speed_limit() -> None:
+    one, body, _ = limited(ScriptedPolicy([{"a": 1.0}, {"a": 1.0}]), wait1=5.0)
+    one.run()
+    assert [action["a"] for _, action in body.writes] == pytest.approx([0.35, 0.45])
+
+
+def test_action_that_was_held_back_is_carried_on_while_the_policy_waits() -> None:
+    one, body, _ = limited(ScriptedPolicy([{"a": 0.5}, (), (), ()]))
+    one.run()
+    assert [action["a"] for _, action in body.writes] == pytest.approx([0.35, 0.45, 0.5])
+    assert (one.step_count, one.clamped_steps) == (1, 1)
+
+
+def test_finished_event_counts_the_clamped_steps() -> None:
+    body, observers, events = RecordingBody(), RolloutObservers(), list[RolloutEvent]()
+    body.speeds = {"a": 1.0}
+    observers.subscribe(events.append)
+    rollout(body, ScriptedPolicy([{"a": 1.0}]), clock=StepClock(), observers=observers).run()
+    assert (events[-1].kind, events[-1].clamped_steps) == ("finished", 1)

@@ -26,6 +26,7 @@ from strands_robots.cli.record import record_robot
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import text_of
 from strands_robots.policies import warm_profiles
+from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
 from strands_robots.utils import ValidationError, device_id, number, redacted
 
@@ -83,6 +84,13 @@ def serve(
     allow_mock: Annotated[
         bool, typer.Option("--allow-mock", help="Let the policy mock, which follows no instruction, move hardware.")
     ] = False,
+    speed_limit: Annotated[
+        float | None,
+        typer.Option(
+            "--speed-limit",
+            help="Greatest speed of each position, in its unit a second; by default 2 rad/s on a real arm.",
+        ),
+    ] = None,
     state_hz: Annotated[float | None, typer.Option("--state-hz", help="stateUpdate events a second, idle.")] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Also record joints, pictures and events: a new .mcap file.")
@@ -119,6 +127,8 @@ def serve(
     chosen = assignments(options or []) | ({} if host is None else {"host": host})
     if serial_port is not None:
         chosen["port"] = serial_port
+    if speed_limit is not None:
+        chosen["speed_limit"] = number("--speed-limit", speed_limit, above=0, high=SPEED_MAX)
     mode = mode or ("real" if serial_port is not None or robot == "reachy_mini" else "sim")
     if serial_port is not None and mode == "sim":
         raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")

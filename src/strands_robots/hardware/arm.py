@@ -14,7 +14,7 @@ from typing import Any
 
 import mujoco
 
-from strands_robots.hardware.device_facts import joint_units, kind
+from strands_robots.hardware.device_facts import calibration, half_ranges, joint_units, kind
 from strands_robots.kinematics.arm import Arm, JawMap, JointMap
 from strands_robots.kinematics.chain import MODELS, ArmJoint, Chain, built_in
 from strands_robots.policies.base import Ranges
@@ -30,13 +30,14 @@ FULL_TURN_RAD = math.pi * 0.99
 """Half range of a joint that was calibrated without ends; it tells nothing about the zero."""
 
 
-def arm_of(device: Any, bounds: Ranges, model: str | None = None) -> Arm:
+def arm_of(device: Any, bounds: Ranges, model: str | None = None, speeds: Mapping[str, float] | None = None) -> Arm:
     """Return the arm of a LeRobot device.
 
     Args:
         device: the device.
         bounds: range of every action key, in the device's unit.
         model: so100, so101 or the path of an MJCF file; by default that of the device's type.
+        speeds: the robot's speed limit by action key.
 
     Raises:
         ValidationError: no model is known, or its joints do not fit the device; the message names the joint.
@@ -50,7 +51,7 @@ def arm_of(device: Any, bounds: Ranges, model: str | None = None) -> Arm:
         if all(math.isfinite(end) for end in bounds[each.commanded])
     }
     narrowed = chain.limited({name: (low, high) for name, (low, high) in ranges.items()})
-    return Arm(narrowed, maps, _jaw(chain, bounds))
+    return Arm(narrowed, maps, _jaw(chain, bounds), speeds or {})
 
 
 def chain_of(device: Any, model: str | None) -> Chain:
@@ -74,8 +75,8 @@ def _mapped(device: Any, joint: ArmJoint, bounds: Ranges, units: Mapping[str, st
     if key is None:
         raise ValidationError(f"the model {label} does not fit: {kind(device)} has no joint {joint.name}.")
     unit = units.get(key, "")
-    entry = _calibration(device).get(joint.name)
-    half = None if entry is None else math.radians((entry.range_max - entry.range_min) / 2 * 360 / 4095)
+    entry = calibration(device).get(joint.name)
+    half = half_ranges(device).get(joint.name)
     if entry is not None and half is not None:
         if entry.drive_mode:
             raise ValidationError(f"{joint.name} is calibrated with drive_mode 1, so its sign is not known.")
@@ -103,8 +104,3 @@ def _jaw(chain: Chain, bounds: Ranges) -> JawMap | None:
     if key is None or not all(math.isfinite(end) for end in bounds[key]):
         return None
     return JawMap(key, key, bounds[key], bounds[key])
-
-
-def _calibration(device: Any) -> Mapping[str, Any]:
-    entries = getattr(getattr(device, "bus", None), "calibration", None)
-    return entries if isinstance(entries, Mapping) else {}

@@ -13,7 +13,8 @@ from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read
 from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
 from strands_robots.hardware.device_facts import require_port
-from strands_robots.policies.base import Action, numbers
+from strands_robots.hardware.speed import default_speeds
+from strands_robots.policies.base import Action, checked_speeds, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.stopping import StopLevel
 from strands_robots.utils import ValidationError, number, shown
@@ -41,6 +42,7 @@ class DeviceBody:
         device: the device.
         joint_ranges: lowest and highest target by action key; what is not named is asked of the device.
         stop_level: hold (freeze with torque on), limp (torque off: an arm falls) or settle, whose stop freezes too.
+        speed_limit: greatest speed of every position, or by action key, in its unit a second.
 
     Raises:
         ValidationError: the device lacks a part of the interface, a range is none, or it cannot release torque.
@@ -52,6 +54,7 @@ class DeviceBody:
         device: Any,
         joint_ranges: Mapping[str, tuple[float, float]] | None = None,
         stop_level: StopLevel = "hold",
+        speed_limit: float | Mapping[str, float] | None = None,
     ) -> None:
         self.name = name
         self.device = device
@@ -68,6 +71,8 @@ class DeviceBody:
         self._limp: set[str] = set()
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
+        positions = [key for key in self.bounds if not is_velocity(key)]
+        self._speeds = {} if speed_limit is None else checked_speeds(speed_limit, positions)
         self._latest: tuple[float, dict[str, float]] | None = None
         self.targets: dict[str, float] = {}
         """What it was told last by an action, by key; empty once it was frozen or let go."""
@@ -75,6 +80,11 @@ class DeviceBody:
         self._stops: list[object] = []
         self.driven = False
         """True from an action until it was frozen or let go."""
+
+    @property
+    def speeds(self) -> dict[str, float]:
+        """Greatest speed by action key: as given, else 2 rad/s for an angle."""
+        return default_speeds(self.device) | self._speeds
 
     @property
     def lost(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -123,6 +124,21 @@ def joint_units(device: Any) -> dict[str, str]:
         if unit:
             units[str(key)] = str(unit)
     return units
+
+
+def calibration(device: Any) -> Mapping[str, Any]:
+    """Return the calibration of the device's bus by motor; empty without one."""
+    entries = getattr(getattr(device, "bus", None), "calibration", None)
+    return entries if isinstance(entries, Mapping) else {}
+
+
+def half_ranges(device: Any) -> dict[str, float]:
+    """Return half the calibrated range of each motor, in radians."""
+    return {
+        str(motor): math.radians((entry.range_max - entry.range_min) / 2 * 360 / 4095)
+        for motor, entry in calibration(device).items()
+        if hasattr(entry, "range_max") and hasattr(entry, "range_min")
+    }
 
 
 def has_temperatures(device: Any) -> bool:

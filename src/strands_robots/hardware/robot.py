@@ -76,6 +76,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             ``STRANDS_ESTOP_TORQUE`` says.
         rest_pose: where a robot that settles goes: a target for every action key that is a position.
         model: of the arm for motions to a point: so100, so101 or an MJCF file; that of the device's type by default.
+        speed_limit: greatest speed in a rollout, for every position or by action key, in its unit a second; 2 rad/s by
+            default where that unit is an angle.
 
     Raises:
         ValidationError: an argument outside its domain, or a device that lacks a part of the interface.
@@ -94,6 +96,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         stop_level: StopLevel | Literal["release"] | None = None,
         rest_pose: Mapping[str, float] | None = None,
         model: str | None = None,
+        speed_limit: float | Mapping[str, float] | None = None,
     ) -> None:
         name = text("tool_name", tool_name, longest=128)
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
@@ -105,7 +108,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         self.gate = MotionGate()
         self.starting = threading.RLock()
         self.observers = RolloutObservers()
-        self._body = DeviceBody(name, device, joint_ranges, level)
+        self._body = DeviceBody(name, device, joint_ranges, level, speed_limit)
         self._settling = self._made_to_settle(level, rest_pose)
         self._arm: Arm | None = None
         self._model = None if model is None else text("model", model)
@@ -258,7 +261,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
         body = self.body(robot_name)
         if self._arm is None:
-            self._arm = arm_of(self.device, body.bounds, self._model)
+            self._arm = arm_of(self.device, body.bounds, self._model, body.speeds)
         return self._arm
 
     def targets(self, robot_name: str = "") -> Mapping[str, float]:
@@ -584,6 +587,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             "instruction": "" if task is None else task.instruction,
             "policy": "" if task is None else task.policy_name,
             "step_count": 0 if task is None else task.step_count,
+            "clamped_steps": 0 if task is None else task.clamped_steps,
             "duration": 0.0 if task is None else round(task.elapsed_s, 3),
             "error": "" if task is None else task.error,
             **({} if self._settling is None else {"settling": self._settling.state}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -9,11 +10,11 @@ import numpy as np
 
 from strands_robots.kinematics.chain import Chain, Floats
 from strands_robots.kinematics.trajectory import Bounds
+from strands_robots.policies.base import JOINT_SPEED_RAD_S
 from strands_robots.utils import ValidationError
 
-SPEED_RAD_S = 2.0
 ACCELERATION_RAD_S2 = 8.0
-"""Bounds of a planned motion at full speed."""
+"""Bound of a planned motion at full speed."""
 
 GRIP_MARGIN = 0.03
 """Share of the gripper's range by which an object keeps the jaws from where they are told to go."""
@@ -96,16 +97,21 @@ class Arm:
         chain: its kinematics.
         maps: of the chain's joints, in their order.
         jaw: of its gripper.
+        speeds: the body's speed limit by action key, in its unit a second; motions are planned within it.
     """
 
     chain: Chain
     maps: tuple[JointMap, ...]
     jaw: JawMap | None
+    speeds: Mapping[str, float] = field(default_factory=dict)
     bounds: Bounds = field(init=False)
 
     def __post_init__(self) -> None:
         count = len(self.chain.joints)
-        bounds = Bounds(np.full(count, SPEED_RAD_S), np.full(count, ACCELERATION_RAD_S2))
+        speeds = [
+            min(JOINT_SPEED_RAD_S, self.speeds.get(each.commanded, math.inf) / abs(each.factor)) for each in self.maps
+        ]
+        bounds = Bounds(np.array(speeds), np.full(count, ACCELERATION_RAD_S2))
         object.__setattr__(self, "bounds", bounds)
 
     @classmethod

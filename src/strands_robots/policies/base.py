@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.errors import StrandsRobotsError
@@ -83,6 +83,30 @@ def _plain(value: object) -> object:
     return item() if callable(item) and getattr(value, "ndim", None) == 0 else value
 
 
+JOINT_SPEED_RAD_S = 2.0
+"""Greatest speed of a joint of a real arm, unless its robot is given another."""
+
+SPEED_MAX = 1e6
+
+
+def checked_speeds(value: object, keys: Iterable[str]) -> dict[str, float]:
+    """Return a speed limit by action key: a number for all ``keys``, or some by name.
+
+    Raises:
+        ValidationError: an unknown key, or a speed that is not above 0 and at most 1,000,000.
+    """
+    known = list(keys)
+    given = mapping("speed_limit", value) if isinstance(value, Mapping) else dict.fromkeys(known, value)
+    for key in given:
+        if key not in known:
+            raise ValidationError(f"speed_limit has no key {shown(key)}; the robot has {', '.join(known)}.")
+    named = isinstance(value, Mapping)
+    return {
+        key: number(f"speed_limit[{key!r}]" if named else "speed_limit", per_s, above=0, high=SPEED_MAX)
+        for key, per_s in given.items()
+    }
+
+
 class SpeedLimit:
     """Bound on how fast each target may change, in units a second of its key.
 
@@ -93,19 +117,25 @@ class SpeedLimit:
     """
 
     def __init__(self, ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> None:
-        self._per_s = {
+        self._per_s: dict[str, float] = {
             key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
             for key, (low, high) in ranges.items()
         }
 
+    @classmethod
+    def per_second(cls, speeds: Mapping[str, float]) -> SpeedLimit:
+        """Return the bound of each key's own speed; a key that is not named has none."""
+        made = cls({}, 1.0, 1.0)
+        made._per_s = dict(speeds)
+        return made
+
     def limit(self, target: Action, last: Mapping[str, float], dt: float) -> Action:
         """Return ``target``, moved no further from ``last`` than ``dt`` seconds allow.
 
-        A key without a last value is not limited.
+        A key without a last value, or without a bound, is not limited.
         """
         limited: Action = {}
         for key, value in target.items():
-            reach = self._per_s[key] * dt
-            before = last.get(key, value)
-            limited[key] = min(max(value, before - reach), before + reach)
+            per_s, before = self._per_s.get(key), last.get(key, value)
+            limited[key] = value if per_s is None else min(max(value, before - per_s * dt), before + per_s * dt)
         return limited

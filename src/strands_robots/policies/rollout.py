@@ -8,6 +8,7 @@ A rollout that ends in any other way than a halt makes the body hold its positio
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -22,6 +23,7 @@ from strands_robots.policies.base import (
     Policy,
     PolicyError,
     Ranges,
+    SpeedLimit,
     checked_action,
     follows_instruction,
     numbers,
@@ -86,6 +88,10 @@ class Body(Protocol):
     @property
     def bounds(self) -> Ranges:
         """Range of every action key, in the body's own units."""
+
+    @property
+    def speeds(self) -> Mapping[str, float]:
+        """Greatest speed by action key, in its unit a second; only of bounded keys."""
 
     def get_observation(self) -> dict[str, Any]:
         """Return the numbers and images that the body observes."""
@@ -200,6 +206,8 @@ class Rollout:
         self.error = ""
         self.step_count = 0
         self.missed_ticks = 0
+        self.clamped_steps = 0
+        """Actions that the body's speed limit held back."""
         self._body = body
         self._policy = policy
         self._permit = permit
@@ -207,6 +215,10 @@ class Rollout:
         self._observers = observers or RolloutObservers()
         self._clock = clock or Clock()
         self._ends_at_rest = ends_at_rest
+        self._speed = SpeedLimit.per_second(body.speeds)
+        self._last: dict[str, float] = {}
+        self._written_at = -math.inf
+        self._held_back: Action = {}
         self._stop_requested = threading.Event()
         self._begun = threading.Event()
         self.follows_instruction = follows_instruction(policy)
@@ -339,12 +351,28 @@ class Rollout:
                     return "completed"
                 chunk.extend([actions] if isinstance(actions, Mapping) else actions)
             if chunk:
-                sent = self._body.send_action(checked_action(chunk.popleft(), bounds), self._permit)
+                action = self._limited(checked_action(chunk.popleft(), bounds), observation)
+                sent = self._body.send_action(action, self._permit)
                 self.step_count += 1
+                self.clamped_steps += bool(self._held_back)
                 self._notify("step", observation=numbers(observation), action=numbers(sent))
+            elif self._held_back:
+                # The policy waits for the end of an action that the speed limit has not let through yet.
+                self._body.send_action(self._limited(self._held_back, observation), self._permit)
             tick = self._next(tick, started)
             self._clock.wait(started + tick * self._period, self._stop_requested)
         return "stopped"
+
+    def _limited(self, action: Action, observation: Mapping[str, Any]) -> Action:
+        """Return the action to write now, within the speed limit of the body."""
+        now = self._clock.now()
+        # A pause must not add up to a jump.
+        dt = min(now - self._written_at, self._period)
+        wanted = {**self._held_back, **action}
+        limited = self._speed.limit(wanted, {**numbers(observation), **self._last}, dt)
+        self._written_at, self._last = now, {**self._last, **limited}
+        self._held_back = {key: value for key, value in wanted.items() if limited[key] != value}
+        return limited
 
     def _next(self, tick: int, started: float) -> int:
         late = int((self._clock.now() - started) / self._period) - tick
@@ -382,6 +410,7 @@ class Rollout:
                 instruction=self.instruction,
                 policy=self.policy_name,
                 step=self.step_count,
+                clamped_steps=self.clamped_steps,
                 elapsed_s=self.elapsed_s,
                 follows_instruction=self.follows_instruction,
                 **more,

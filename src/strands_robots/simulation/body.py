@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from strands_robots.kinematics.arm import Arm
 from strands_robots.kinematics.chain import Chain
+from strands_robots.policies.base import checked_speeds
 from strands_robots.safety.gate import Permit
 from strands_robots.simulation.catalog import ModelSource
 from strands_robots.simulation.engine import mujoco
@@ -30,10 +32,13 @@ class RobotBody:
     A rollout or a teleoperation drives it. Every method raises :class:`ValidationError` once the robot was removed.
     """
 
-    def __init__(self, name: str, physics: Physics, clock: WorldClock) -> None:
+    def __init__(
+        self, name: str, physics: Physics, clock: WorldClock, speed_limit: float | Mapping[str, float] | None = None
+    ) -> None:
         self.name = name
         self._physics = physics
         self._clock = clock
+        self._speed_limit = speed_limit
 
     @property
     def parts(self) -> RobotParts:
@@ -62,10 +67,18 @@ class RobotBody:
         return {key: float(setpoints[actuator.index]) for key, actuator in self.parts.actuators.items()}
 
     @property
+    def speeds(self) -> dict[str, float]:
+        """Greatest speed of each position servo that was given one, in its unit a second."""
+        if self._speed_limit is None:
+            return {}
+        return checked_speeds(self._speed_limit, [key for key, each in self.parts.actuators.items() if each.servo])
+
+    @property
     def arm(self) -> Arm:
         """The robot's arm, planned in the frame of its base. Raises without one."""
         plan = next(each for each in self._present()[0].stage.plan.robots if each.name == self.name)
-        return arm_of(plan.source, plan.position[2])
+        made, speeds = arm_of(plan.source, plan.position[2]), self.speeds
+        return replace(made, speeds=speeds) if speeds else made
 
     @property
     def joint_units(self) -> dict[str, str]:

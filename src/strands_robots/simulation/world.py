@@ -19,6 +19,7 @@ from strands_robots.kinematics.arm import Arm
 from strands_robots.kinematics.grasp import SeenObject
 from strands_robots.kinematics.motion import Motion
 from strands_robots.policies import create_policy
+from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
@@ -44,7 +45,7 @@ from strands_robots.simulation.rendering import (
 )
 from strands_robots.simulation.stage import compile_stage, in_floor
 from strands_robots.teleop_mixin import TeleopMixin
-from strands_robots.utils import ValidationError, flag, identifier, shown, text, whole
+from strands_robots.utils import ValidationError, flag, identifier, number, shown, text, whole
 
 logger = logging.getLogger(__name__)
 
@@ -78,6 +79,8 @@ class Simulation(ArmMixin, TeleopMixin):
         viscosity: of the medium, Pa·s, 0 to 1000.
         realtime: false if single commands shall start no clock, so that only :meth:`step` and rollouts move time.
 
+        speed_limit: greatest speed of every position servo in a rollout, radians or metres a second; None for none.
+
     Raises:
         ValidationError: an argument outside its domain.
     """
@@ -91,6 +94,7 @@ class Simulation(ArmMixin, TeleopMixin):
         density: float = 0.0,
         viscosity: float = 0.0,
         realtime: bool = True,
+        speed_limit: float | None = None,
     ) -> None:
         self.tool_name_str = text("tool_name", tool_name, longest=128)
         self.gate = MotionGate()
@@ -98,6 +102,7 @@ class Simulation(ArmMixin, TeleopMixin):
         self.observers = RolloutObservers()
         self.physics = Physics(compile_stage(Plan.checked(timestep, gravity, density, viscosity)))
         self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime))
+        self._speed_limit = None if speed_limit is None else number("speed_limit", speed_limit, above=0, high=SPEED_MAX)
         self._bodies: dict[str, RobotBody] = {}
         self._rollouts: dict[str, Rollout] = {}
         self._moved: dict[str, None] = {}
@@ -587,7 +592,8 @@ class Simulation(ArmMixin, TeleopMixin):
         """Compile ``plan`` and switch to it; nothing changes when it does not compile."""
         self.physics.replace(compile_stage(plan))
         self._bodies = {
-            r.name: self._bodies.get(r.name) or RobotBody(r.name, self.physics, self._clock) for r in plan.robots
+            r.name: self._bodies.get(r.name) or RobotBody(r.name, self.physics, self._clock, self._speed_limit)
+            for r in plan.robots
         }
 
     def _in_floor(self, owner: str) -> dict[str, float]:
@@ -638,7 +644,12 @@ class Simulation(ArmMixin, TeleopMixin):
 
 
 def _row(rollout: Rollout) -> dict[str, Any]:
-    return {**rollout.row(), "state": rollout.state, "error": rollout.error}
+    return {
+        **rollout.row(),
+        "state": rollout.state,
+        "error": rollout.error,
+        "clamped_steps": rollout.clamped_steps,
+    }
 
 
 def _range(low: float, high: float) -> list[float] | None:

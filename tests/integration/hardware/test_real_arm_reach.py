@@ -11,8 +11,8 @@ import pytest
 from fixtures.feetech_bus import FeetechBus, arm_calibration
 from fixtures.waiting import eventually
 
-from strands_robots.kinematics.arm import SPEED_RAD_S
 from strands_robots.kinematics.chain import built_in
+from strands_robots.policies.base import JOINT_SPEED_RAD_S
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 
@@ -44,7 +44,7 @@ def test_tip_goes_to_the_point_by_the_goals_on_the_bus(arm: Any, bus: FeetechBus
     for joint in JOINTS:
         angles = [angle for _, angle in goals[joint]]
         # A goal is a whole count, which is 0.0015 rad.
-        assert all(abs(b - a) <= SPEED_RAD_S * step + 0.0032 for a, b in itertools.pairwise(angles)), joint
+        assert all(abs(b - a) <= JOINT_SPEED_RAD_S * step + 0.0032 for a, b in itertools.pairwise(angles)), joint
 
 
 def test_pose_and_gripper_are_told_and_the_jaws_close(arm: Any) -> None:
