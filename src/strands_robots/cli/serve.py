@@ -256,7 +256,9 @@ def _network_flags(link: LinkConfig, network: Network) -> str:
 
 
 def _example(functions: Mapping[str, str]) -> str:
-    return "execute instruction='wave' duration=5" if "execute" in functions else next(iter(functions), "FUNCTION")
+    if "execute" in functions:
+        return "execute instruction='wave' duration=5"
+    return next((name for name in ("wakeUp", "getStatus") if name in functions), next(iter(functions), "FUNCTION"))
 
 
 def _halt(screen: Screen, body: Any) -> bool:
