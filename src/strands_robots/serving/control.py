@@ -99,6 +99,33 @@ class ControlChange:
 OnChange = Callable[[ControlChange], None]
 
 
+class _Observers:
+    """Observers of a holder's changes; thread-safe, and one that fails alone."""
+
+    def __init__(self) -> None:
+        self._changing = threading.Lock()
+        self._observers: tuple[OnChange, ...] = ()
+
+    def add(self, observer: OnChange) -> Callable[[], None]:
+        """Tell ``observer`` of every change; return what ends that."""
+        with self._changing:
+            self._observers = (*self._observers, observer)
+
+        def end() -> None:
+            with self._changing:
+                self._observers = tuple(each for each in self._observers if each is not observer)
+
+        return end
+
+    def tell(self, change: ControlChange) -> None:
+        """Hand a change to every observer."""
+        for observer in self._observers:
+            try:
+                observer(change)
+            except Exception:
+                logger.exception("An observer of the control lease failed.")
+
+
 class Admission:
     """Leave of one motion to begin; of a holder with a lease it is nothing to end.
 
@@ -204,7 +231,7 @@ class ControlLease:
         self._starting: set[Admission] = set()
         self._displaced: dict[str, str] = {}
         self._nonces: dict[str, float] = {}
-        self._observers: tuple[OnChange, ...] = ()
+        self._observers = _Observers()
         self.epoch = 0
         """Rises with every new holder."""
 
@@ -216,14 +243,7 @@ class ControlLease:
 
     def observe(self, observer: OnChange) -> Callable[[], None]:
         """Tell ``observer`` of every change of the holder; return what ends that."""
-        with self._changing:
-            self._observers = (*self._observers, observer)
-
-        def end() -> None:
-            with self._changing:
-                self._observers = tuple(each for each in self._observers if each is not observer)
-
-        return end
+        return self._observers.add(observer)
 
     def facts(self) -> dict[str, Any]:
         """Return the holder as everyone may read it."""
@@ -427,11 +447,7 @@ class ControlLease:
 
     def _tell(self, event: str, lease: Lease, reason: str = "") -> None:
         change = ControlChange(event, self._robot, lease.holder, lease.kind, self.epoch, reason)
-        for observer in self._observers:
-            try:
-                observer(change)
-            except Exception:
-                logger.exception("An observer of the control lease failed.")
+        self._observers.tell(change)
 
 
 class ControlLeases:
@@ -445,7 +461,7 @@ class ControlLeases:
         self._served: list[weakref.ref[Robot]] = []
         self._by_name: dict[str, ControlLease] = {}
         self._changing = threading.Lock()
-        self._observers: tuple[OnChange, ...] = ()
+        self._observers = _Observers()
 
     def only(self, name: str) -> ControlLeases:
         """Return the same leases, for a network peer that is one robot of the world."""
@@ -459,14 +475,7 @@ class ControlLeases:
 
     def observe(self, observer: OnChange) -> Callable[[], None]:
         """Tell ``observer`` of every change of a holder; return what ends that."""
-        with self._changing:
-            self._observers = (*self._observers, observer)
-
-        def end() -> None:
-            with self._changing:
-                self._observers = tuple(each for each in self._observers if each is not observer)
-
-        return end
+        return self._observers.add(observer)
 
     def of(self, name: str = "") -> ControlLease:
         """Return the lease of the robot, or of the named robot of the world."""
@@ -485,7 +494,7 @@ class ControlLeases:
                     lambda: self._moves(name),
                     hardware=self._hardware,
                 )
-                lease.observe(self._tell)
+                lease.observe(self._observers.tell)
         return lease
 
     def admit(self, command: str, caller: object, lease_id: str, name: str | None) -> Admission:
@@ -524,10 +533,6 @@ class ControlLeases:
             robot.stop_policy(name)
         elif robot is not None:
             stop_executor().halt(robot, robot.tool_name_str, reason)
-
-    def _tell(self, change: ControlChange) -> None:
-        for observer in self._observers:
-            observer(change)
 
 
 _LEASES: WeakKeyDictionary[Any, ControlLeases] = WeakKeyDictionary()
