@@ -63,7 +63,10 @@ class Attacker:
     def edit(self) -> None:
         path, data = self._draw_file()
         at = self._draw_place(data)
-        path.write_bytes(data[:at] + self.data.draw(st.binary(min_size=1, max_size=3)) + data[at + 1 :])
+        new = self.data.draw(st.binary(min_size=1, max_size=3))
+        # Always a change: what a signature has there depends on the number of an inode.
+        fresh = bytes([new[0] ^ 1]) if new == data[at : at + 1] else new
+        path.write_bytes(data[:at] + fresh + data[at + 1 :])
 
     def cut(self) -> None:
         path, data = self._draw_file()

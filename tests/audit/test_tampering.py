@@ -209,6 +209,18 @@ def test_head_of_before_a_rotation_with_the_size_of_the_current_file_is_older(tm
     assert (found["head"], found["ok"]) == ("older", False)
 
 
+@pytest.mark.parametrize("more", [0, 2, 40])
+def test_rotated_file_that_was_renamed_is_found(tmp_path: Path, more: int) -> None:
+    journal = signed_journal(tmp_path, max_bytes=900)
+    while len(journal.files()) < 3:
+        journal.append([entry(0)])
+    oldest = journal.files()[0]
+    oldest.rename(oldest.with_name(f"{journal.path.name}.4"))
+    for number in range(more):
+        journal.append([entry(number)])
+    assert not check(journal)["ok"]
+
+
 def test_running_writer_remembers_what_was_rolled_back_with_its_anchor(journal: Journal, tmp_path: Path) -> None:
     older = copy_files(journal, anchor=True)
     journal.append([entry(10)])

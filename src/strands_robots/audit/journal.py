@@ -150,6 +150,10 @@ class Journal:
         names = [self._rotated(number) for number in range(self._kept, 0, -1)]
         return [path for path in (*names, self.path) if path.exists()]
 
+    def in_order(self, files: Sequence[Path]) -> bool:
+        """True when the numbers of these files have no gap."""
+        return list(files) == [*(self._rotated(number) for number in range(len(files) - 1, 0, -1)), self.path]
+
     def signature_valid(self, record: dict[str, Any]) -> bool:
         """True when the key made the record's ``sig``."""
         return self._seal.valid(record)
@@ -363,6 +367,8 @@ class Journal:
         files = self.files()
         if len(files) != len(head.origins):
             return [f"it has {len(files)} files of {len(head.origins)}"]
+        if not self.in_order(files):
+            return ["its rotated files were renamed"]
         if len(files) <= self._kept or continues(files[0], head.origins[0], head.origins[1]):
             return []
         return [f"records were changed in {files[0].name}, the oldest file, which is removed now"]

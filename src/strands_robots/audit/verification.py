@@ -83,6 +83,7 @@ class _Check:
             reached = None if reached is None else reached + 1
             if head is not None and last == head.last:
                 reached = head.count
+        self._names(head)
         standing = self._standing(head, reached, last, anchored=anchored)
         for each in head.breaks if head is not None else ():
             found.tampered += not self._tampering_seen(each)
@@ -95,6 +96,13 @@ class _Check:
         if last is not None:
             return bool(record["prev"] == last)
         return head is None or record["prev"] in head.origins[: 2 if head.rotating else 1]
+
+    def _names(self, head: Head | None) -> None:
+        """Find a renamed file: only a rotation leaves a gap in their numbers."""
+        files = [path for path, _, size in self._snapshot.files if size]
+        if head is not None and head.size and not head.rotating and not self._journal.in_order(files):
+            self._found.broken += 1
+            self._found.note("files", f"not in the order of rotation: {', '.join(each.name for each in files)}")
 
     def _record(self, record: dict[str, Any], where: str, follows: bool) -> None:
         found, peer = self._found, record["peer_id"]
