@@ -109,7 +109,7 @@ def test_presence_loses_only_the_field_that_cannot_be_read(caplog: pytest.LogCap
     description = Description("arm-1", Mute())
     with caplog.at_level(logging.WARNING):
         facts = [description.read() for _ in range(3)][-1]
-    assert facts == {"tool_name": "arm", "action_keys": ["shoulder.pos"]}
+    assert facts == {"tool_name": "arm", "robot_kind": "robot", "action_keys": ["shoulder.pos"]}
     assert len([record for record in caplog.records if record.name.startswith("strands_robots.mesh")]) == 1
 
 

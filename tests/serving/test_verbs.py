@@ -15,11 +15,17 @@ from strands_robots.device_connect.simulation_driver import SimulationDeviceDriv
 from strands_robots.mesh.security import validate_command
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
-from strands_robots.serving.robot_verbs import ARM_VERBS, PEER_VERBS
+from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
 from strands_robots.tools import robot_mesh
 from strands_robots.utils import ValidationError, whole
+
+REACHY_MOTIONS = {
+    *("look", "antennas", "body", "nod", "shake", "happy", "wakeUp", "sleep", "playMove"),
+    *("enableMotors", "disableMotors"),
+}
 
 DRIVERS = (
     RobotDeviceDriver,
@@ -69,10 +75,30 @@ def test_the_mesh_knows_the_documented_actions() -> None:
         *ARM_MOTION_VERBS,
         *PICTURE_VERBS,
         *CONTROL_VERBS,
+        *("drive", "navigateTo"),
+        *REACHY_MOTIONS,
+        *("getDaemonStatus", "getJoints", "getImu", "listMoves"),
     }
     moving = {name for name, verb in PEER_VERBS.items() if verb.kind is Kind.MOTION}
     arm = {"moveJoints", "moveTo", "moveBy", "setGripper", "goTo", "savePlace", "pick", "place"}
-    assert moving == {"execute", "start", "step", "reset", "teleop_receive", "releaseTorque", "acquireControl"} | arm
+    world = {"execute", "start", "step", "reset", "teleop_receive", "releaseTorque", "acquireControl"}
+    assert moving == world | arm | {"drive", "navigateTo"} | REACHY_MOTIONS
+
+
+@pytest.mark.parametrize(
+    ("kind", "driver"),
+    [
+        ("reachy_mini", ReachyMiniDriver),
+        ("mobile_base", MobileBaseDeviceDriver),
+        ("navigating_base", NavigatingBaseDeviceDriver),
+    ],
+)
+def test_every_kind_of_robot_has_its_motions_on_the_mesh_as_on_device_connect(kind: str, driver: Any) -> None:
+    own = {name for name, verb in driver.verbs.items() if verb.kind is Kind.MOTION} - set(ARM_VERBS)
+    assert own
+    assert own <= set(KINDS[kind]) <= set(PEER_VERBS)
+    for name in own:
+        assert list(PEER_VERBS[name].by_name) == list(driver.verbs[name].by_name), name
 
 
 def test_the_mesh_fills_in_defaults_and_drops_what_an_action_does_not_have() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots import settings
-from strands_robots.contract import RolloutEvent, TaskRobot
+from strands_robots.contract import RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver
 from strands_robots.drivers.reachy import ReachyDriver
@@ -62,8 +62,7 @@ class ReachyMiniDriver(RobotDriver):
         self.reachy = robot or ReachyDriver(host, prefix, api_port, transport=transport)
         if flag("release_on_estop", release_on_estop):
             self.reachy.release_on_estop = True
-        # A driver needs of a robot its name, gate, halt and subscribe; tasks by instruction are not a Reachy's.
-        super().__init__(cast(TaskRobot, self.reachy), hardware=True, authorization=authorization, approval=approval)
+        super().__init__(self.reachy, hardware=True, authorization=authorization, approval=approval)
         self._emergencies = Share()
 
     @property

@@ -23,8 +23,9 @@ from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Declaration, TransportError, undeclare
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.peer_verbs import TELEOP_VERBS
 from strands_robots.serving.pipeline import Own, Pipeline
-from strands_robots.serving.robot_verbs import TELEOP_VERBS, RobotStop
+from strands_robots.serving.robot_verbs import RobotStop
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)

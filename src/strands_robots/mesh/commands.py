@@ -18,8 +18,9 @@ from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
+from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
-from strands_robots.serving.robot_verbs import PEER_VERBS, RobotStop, peer_stop_answer, run_to_end, stop_within
+from strands_robots.serving.robot_verbs import RobotStop, peer_stop_answer, run_to_end, stop_within
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb

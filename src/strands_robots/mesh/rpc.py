@@ -19,7 +19,7 @@ from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.security import validate_command
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.stopping import Outcome, grade
-from strands_robots.serving.robot_verbs import PEER_VERBS
+from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.verbs import Kind
 from strands_robots.utils import ValidationError, number, shown
 

@@ -36,8 +36,9 @@ from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plan
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain
+from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Own
-from strands_robots.serving.robot_verbs import PEER_VERBS, peer_stop_answer
+from strands_robots.serving.robot_verbs import peer_stop_answer
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.utils import ValidationError, identifier, shown

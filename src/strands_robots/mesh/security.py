@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.serving.robot_verbs import PEER_VERBS
+from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.utils import ValidationError, identifier, mapping, number, shown
 
 __all__ = [

@@ -17,6 +17,7 @@ from strands_robots.contract import TaskRobot, WorldRobot, body_of
 from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh.throttle import TroubleLog
+from strands_robots.serving.peer_verbs import kind_of
 
 logger = logging.getLogger(__name__)
 
@@ -160,7 +161,7 @@ class Description:
         robot = self._robot
         if robot is None:
             return {}
-        fields: dict[str, Any] = {"tool_name": robot.tool_name_str}
+        fields: dict[str, Any] = {"tool_name": robot.tool_name_str, "robot_kind": kind_of(robot)}
         if isinstance(robot, WorldRobot):
             fields["world"] = True
             fields.update(self._field("sim_robots", lambda: {"sim_robots": robot.list_robots()}))

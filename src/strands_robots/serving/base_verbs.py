@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
-from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
-from strands_robots.envelope import Envelope
+from strands_robots.contract import Robot, body_of
+from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import Approved
 from strands_robots.serving.robot_verbs import ARM_VERBS
-from strands_robots.serving.verbs import Arguments, Kind, Parameter, Verb, table
+from strands_robots.serving.verbs import Arguments, Kind, Parameter, Run, Verb, table
 from strands_robots.utils import DURATION_MAX_S, duration, number, text
 
 
-def _drive(base: MobileBaseRobot, arguments: Arguments) -> Envelope:
-    # The operator's approval of this verb is the approval of the commands that it sends.
-    return base.start_drive(**arguments, tool_context=Approved())
+def _of_base(method: str, cannot: str) -> Run:
+    """Carry a verb out by a method of a mobile base; any other robot refuses it."""
 
+    def run(robot: Robot, arguments: Arguments) -> Envelope:
+        start = getattr(body_of(robot), method, None)
+        if not callable(start):
+            return error(cannot)
+        # The operator's approval of this verb is the approval of what it sends.
+        answer: Envelope = start(**arguments, tool_context=Approved())
+        return answer
 
-def _navigate(base: RosBridgedRobot, arguments: Arguments) -> Envelope:
-    # The operator's approval of this verb is the approval of the goal that it sends.
-    return base.start_navigation(**arguments, tool_context=Approved())
+    return run
 
 
 DRIVE = Verb(
@@ -36,7 +39,7 @@ DRIVE = Verb(
         ),
     ),
     returns="task_status",
-    run=_drive,
+    run=_of_base("start_drive", "drive: this robot is no mobile base."),
 )
 NAVIGATE_TO = Verb(
     "navigateTo",
@@ -62,7 +65,7 @@ NAVIGATE_TO = Verb(
         ),
     ),
     returns="task_status",
-    run=_navigate,
+    run=_of_base("start_navigation", "navigateTo: this robot has no navigation stack."),
 )
 
 BASE_VERBS = {**ARM_VERBS, **table([DRIVE])}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from strands_robots import settings
@@ -20,27 +20,22 @@ from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verd
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS, for_robot
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
-from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.verbs import (
-    ASSERTION,
     DURATION,
     INSTRUCTION,
     MOTOR_IDS,
     N_STEPS,
     POLICY_PORT,
     POLICY_PROVIDER,
-    REQUIRED,
     RESUME,
     ROBOT_NAME,
     Arguments,
     Kind,
-    Parameter,
     Verb,
-    between,
     release_torque_verb,
     table,
 )
-from strands_robots.utils import ValidationError, identifier, number, port, shown
+from strands_robots.utils import ValidationError, shown
 
 POLL_S = 0.05
 EXECUTE_GRACE_S = 10.0
@@ -179,17 +174,20 @@ def _execute(world: WorldRobot, arguments: Arguments) -> Envelope:
     return {**answer, "robot_name": name}
 
 
-def _step(robot: Robot, arguments: Arguments) -> Envelope:
+def step_world(robot: Robot, arguments: Arguments) -> Envelope:
+    """Advance the physics of a world; refused by any other robot."""
     if not isinstance(robot, WorldRobot):
         return error("step: this robot is no simulation.")
     return robot.step(arguments.get("n_steps", arguments.get("steps", 1)))
 
 
-def _reset(robot: Robot, arguments: Arguments) -> Envelope:
+def reset_world(robot: Robot, arguments: Arguments) -> Envelope:
+    """Restore the initial state of a world; refused by any other robot."""
     return robot.reset() if isinstance(robot, WorldRobot) else error("reset: this robot is no simulation.")
 
 
-def _status(robot: Robot, arguments: Arguments) -> Envelope:
+def status(robot: Robot, arguments: Arguments) -> Envelope:
+    """Return the task of a robot, or the policies that run in a world."""
     if not isinstance(robot, WorldRobot):
         return robot.get_task_status()
     running = robot.list_policies_running()
@@ -278,7 +276,8 @@ def _accepted(method: Callable[..., Any], options: dict[str, Any]) -> set[str]:
     return set(parameters)
 
 
-def _release_torque(robot: Robot, arguments: Arguments) -> Envelope:
+def release_torque(robot: Robot, arguments: Arguments) -> Envelope:
+    """Switch the motors off, where the robot can."""
     own = getattr(body_of(robot), "release_torque", None)
     if not callable(own):
         return error("releaseTorque: this robot cannot switch its torque off.")
@@ -316,7 +315,7 @@ ARM_VERBS = table(
             "Stop everything that moves the robot now; the answer says whether it stopped.",
             returns="stopped, halted, not_stopped, unknown, elapsed_ms",
         ),
-        release_torque_verb(MOTOR_IDS, run=_release_torque),
+        release_torque_verb(MOTOR_IDS, run=release_torque),
         RESUME,
         Verb(
             "getStatus",
@@ -363,14 +362,14 @@ WORLD_VERBS = table(
             "Step physics by hand, as fast as it computes.",
             (N_STEPS,),
             returns="sim_time, step_count",
-            run=_step,
+            run=step_world,
             critical=False,
         ),
         Verb(
             "reset",
             Kind.MOTION,
             "Halt everything and put the world back to its initial state.",
-            run=_reset,
+            run=reset_world,
             critical=False,
         ),
         *WORLD_MOTION_VERBS.values(),
@@ -378,78 +377,3 @@ WORLD_VERBS = table(
         *(for_robot(verb, ROBOT_NAME) for verb in CONTROL_VERBS.values()),
     ]
 )
-
-
-def _optional(name: str, type_: type, meaning: str, check: Any) -> Parameter:
-    return Parameter(name, type_, meaning, check, default=None)
-
-
-def _frequency(name: str, value: object) -> float:
-    return number(name, value, low=0.1, high=2000)
-
-
-_PEER_ROBOT = _optional("robot_name", str, "Which robot of the world; left out where there is only one", identifier)
-_PEER_POLICY = (
-    Parameter("policy_provider", str, POLICY_PROVIDER.meaning, known_provider, default=REQUIRED),
-    _optional("instruction", str, INSTRUCTION.meaning, INSTRUCTION.check),
-    DURATION,
-    Parameter("policy_host", str, "Host of the policy's server, loopback or allowed", policy_host, "localhost"),
-    _optional("policy_port", int, "TCP port of the policy's server, 1 to 65535", port),
-    _optional("pretrained_name_or_path", str, "Checkpoint on the Hub, org/name", repository),
-    _optional("control_frequency", float, "Rate of the policy in Hz, 0.1 to 2000", _frequency),
-    _optional("action_horizon", int, "Actions taken of each chunk, 1 to 10000", between(1, 10_000)),
-    _optional("n_steps", int, "Actions after which the policy ends, 1 to 10000000", between(1, 10_000_000)),
-    _optional("target_pose", list, "Goal of the tip: 7 numbers", vector(7, exactly=True)),
-    _optional("target_joints", list, "Goal of the joints: at most 256 numbers", vector(256)),
-    _optional("target_velocity", list, "Goal velocity: at most 16 numbers", vector(16)),
-    _PEER_ROBOT,
-)
-_SOURCE = Parameter("source_peer_id", str, "Peer that leads", identifier)
-_PEER_ASSERTION = _optional("assertion", dict, ASSERTION.meaning, ASSERTION.check)
-_DEVICE = _optional("device_name", str, "The leader's device; leader where left out", identifier)
-
-
-def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter, ...] = (), **carried_out: Any) -> Verb:
-    return Verb(name, kind, summary, parameters, drops_unknown=True, **carried_out)
-
-
-PEER_VERBS = table(
-    [
-        _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", run=_status),
-        _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
-        _peer_verb("features", Kind.READ, GET_FEATURES.summary, method="get_features"),
-        _peer_verb("state", Kind.READ, GET_STATE.summary, method="get_state"),
-        _peer_verb("execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True),
-        _peer_verb("start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start),
-        _peer_verb(
-            "step",
-            Kind.MOTION,
-            WORLD_VERBS["step"].summary,
-            (_optional("steps", int, "Physics steps to take, 1 to 10000", between(1, 10_000)),),
-            run=_step,
-        ),
-        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=_reset),
-        _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream."),
-        _peer_verb("teleop_receive", Kind.MOTION, "Follow a leader's input stream.", (_SOURCE, _DEVICE)),
-        _peer_verb(
-            "teleop_stop",
-            Kind.READ,
-            "Close the named input stream, or all of them.",
-            (_optional("source_peer_id", str, _SOURCE.meaning, identifier), _DEVICE),
-            urgent=True,
-        ),
-        release_torque_verb(
-            _optional("motor_ids", str, MOTOR_IDS.meaning, MOTOR_IDS.check), drops_unknown=True, run=_release_torque
-        ),
-        _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
-        _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
-        *(
-            for_robot(verb, _PEER_ROBOT, drops_unknown=True)
-            for verb in (*ARM_MOTION_VERBS.values(), *CONTROL_VERBS.values())
-        ),
-        *(replace(verb, drops_unknown=True) for verb in PICTURE_VERBS.values()),
-    ]
-)
-"""The actions of the mesh; ``execute``, ``stop``, ``resume``, ``ping`` and teleoperation are the peer's own."""
-
-TELEOP_VERBS = tuple(name for name in PEER_VERBS if name.startswith("teleop_"))

@@ -106,13 +106,19 @@ class NativeMesh:
     """Robots on the native mesh, called by a peer without a robot."""
 
     def peers(self) -> Envelope:
-        """List every peer in reach, with its type and state."""
+        """List every peer in reach, with its type, state and actions."""
+        from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - loaded when it is used
 
         def listed(mesh: Mesh) -> Envelope:
             discover(mesh)
             return _peer_list(
                 [
-                    {"id": row["peer_id"], "type": row["type"], "status": row.get("task_status", "")}
+                    {
+                        "id": row["peer_id"],
+                        "type": row["type"],
+                        "status": row.get("task_status", ""),
+                        "functions": list(KINDS.get(str(row.get("robot_kind")), ())),
+                    }
                     for row in mesh.peers
                     if row["reachable"]
                 ]

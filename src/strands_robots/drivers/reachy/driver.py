@@ -8,7 +8,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.audit import log_safety_event
-from strands_robots.contract import Observer, Unsubscribe
+from strands_robots.contract import AT_REST, Observer, Unsubscribe
 from strands_robots.drivers.reachy.connection import FRESH_S, Connection
 from strands_robots.drivers.reachy.links import (
     DEFAULT_PREFIX,
@@ -29,7 +29,7 @@ from strands_robots.drivers.reachy.target import (
     check,
     from_action,
 )
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, choice, flag, identifier, shown, text
@@ -41,6 +41,8 @@ ARRIVED = 0.2
 """Largest error of a joint at the end of a move, in radians."""
 
 POSE_EVERY_S = 0.005
+
+NO_POLICIES = "{} follows no policy; move it with look, a gesture such as nod, or playMove."
 
 MOTOR_IDS = {
     "body_rotation": 10,
@@ -375,6 +377,42 @@ class ReachyDriver:
         """Call ``observer`` at every motion's end."""
         return self.motions.observers.subscribe(observer)
 
+    # The robot contract, so that every network takes a Reachy Mini.
+
+    def start_task(
+        self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
+    ) -> Envelope:
+        """Refuse: a Reachy Mini has motions of its own, it follows no policy."""
+        del instruction, policy_provider, duration, policy_port
+        return error(NO_POLICIES.format(self.tool_name_str))
+
+    def stop_task(self) -> Envelope:
+        """Halt, as :meth:`halt` does."""
+        return self.halt("stop").envelope()
+
+    def get_task_status(self) -> Envelope:
+        """Return :meth:`facts`, with ``task_status`` of the present or the last motion."""
+        task = self._task()
+        return success(f"{task['instruction'] or 'No motion'}: {task['task_status']}.", **self.facts(), **task)
+
+    def get_features(self) -> Envelope:
+        """Return ``observation_features``, ``action_features`` and ``ranges``."""
+        features = dict.fromkeys(ACTION_KEYS, "float")
+        return success(
+            "A Reachy Mini: metres and radians.",
+            observation_features=features,
+            action_features=features,
+            ranges={key: list(bounds) for key, bounds in BOUNDS.items()},
+        )
+
+    def get_state(self) -> Envelope:
+        """Return ``joints`` in radians by motor, ``joints_age_s`` and ``task``."""
+        joints = self.get_joints()
+        fields: dict[str, Any] = {"joints": joints.get("joints", {}), "joints_age_s": joints["age_s"]}
+        if joints["status"] == "error":
+            fields["joints_error"] = str(joints["reason"])
+        return success(text_of(joints), **fields, task=self._task())
+
     def halt_ordered(self) -> None:
         """Note what moves before the permits are void."""
         self.motions.halt_ordered()
@@ -474,6 +512,14 @@ class ReachyDriver:
             "head_error_rad": round(sent.angle_to(measured), 4) if sent and measured else None,
             "unusable_frames": feed.unusable_frames,
         }
+
+    def _task(self) -> dict[str, str]:
+        motion = self.motions.current
+        if motion is None:
+            return {"task_status": "idle", "instruction": ""}
+        # A move whose end the daemon did not report has ended here.
+        state = motion.state if motion.state in AT_REST or motion.running else "error"
+        return {"task_status": "running" if motion.running else state, "instruction": motion.name}
 
     def _awake(self) -> str:
         joints = self.connection.feed.fresh_joints

@@ -1,0 +1,166 @@
+"""Verbs of a mesh peer: of arms, worlds, mobile bases and Reachy Mini alike.
+
+A peer does not tell its verbs apart by its robot's kind: a robot that lacks what a verb needs refuses it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from strands_robots.contract import Robot, WorldRobot, body_of
+from strands_robots.drivers.reachy import ReachyDriver
+from strands_robots.envelope import error
+from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, for_robot
+from strands_robots.serving.base_verbs import DRIVE, NAVIGATE_TO
+from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.picture_verbs import PICTURE_VERBS
+from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
+from strands_robots.serving.reachy_verbs import REACHY_VERBS
+from strands_robots.serving.robot_verbs import (
+    GET_FEATURES,
+    GET_STATE,
+    WORLD_VERBS,
+    release_torque,
+    reset_world,
+    start,
+    status,
+    step_world,
+)
+from strands_robots.serving.verbs import (
+    ASSERTION,
+    DURATION,
+    INSTRUCTION,
+    MOTOR_IDS,
+    POLICY_PROVIDER,
+    REQUIRED,
+    RESUME,
+    Arguments,
+    Kind,
+    Parameter,
+    Verb,
+    between,
+    release_torque_verb,
+    table,
+)
+from strands_robots.utils import identifier, number, port
+
+
+def _optional(name: str, type_: type, meaning: str, check: Any) -> Parameter:
+    return Parameter(name, type_, meaning, check, default=None)
+
+
+def _frequency(name: str, value: object) -> float:
+    return number(name, value, low=0.1, high=2000)
+
+
+_PEER_ROBOT = _optional("robot_name", str, "Which robot of the world; left out where there is only one", identifier)
+_PEER_POLICY = (
+    Parameter("policy_provider", str, POLICY_PROVIDER.meaning, known_provider, default=REQUIRED),
+    _optional("instruction", str, INSTRUCTION.meaning, INSTRUCTION.check),
+    DURATION,
+    Parameter("policy_host", str, "Host of the policy's server, loopback or allowed", policy_host, "localhost"),
+    _optional("policy_port", int, "TCP port of the policy's server, 1 to 65535", port),
+    _optional("pretrained_name_or_path", str, "Checkpoint on the Hub, org/name", repository),
+    _optional("control_frequency", float, "Rate of the policy in Hz, 0.1 to 2000", _frequency),
+    _optional("action_horizon", int, "Actions taken of each chunk, 1 to 10000", between(1, 10_000)),
+    _optional("n_steps", int, "Actions after which the policy ends, 1 to 10000000", between(1, 10_000_000)),
+    _optional("target_pose", list, "Goal of the tip: 7 numbers", vector(7, exactly=True)),
+    _optional("target_joints", list, "Goal of the joints: at most 256 numbers", vector(256)),
+    _optional("target_velocity", list, "Goal velocity: at most 16 numbers", vector(16)),
+    _PEER_ROBOT,
+)
+_SOURCE = Parameter("source_peer_id", str, "Peer that leads", identifier)
+_PEER_ASSERTION = _optional("assertion", dict, ASSERTION.meaning, ASSERTION.check)
+_DEVICE = _optional("device_name", str, "The leader's device; leader where left out", identifier)
+
+
+def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter, ...] = (), **carried_out: Any) -> Verb:
+    return Verb(name, kind, summary, parameters, drops_unknown=True, **carried_out)
+
+
+def _of_reachy(verb: Verb) -> Verb:
+    """Return a verb of Reachy Mini that every other robot refuses."""
+    carry_out = verb.run
+
+    def run(robot: Robot, arguments: Arguments) -> object:
+        body = body_of(robot)
+        if carry_out is None or not isinstance(body, ReachyDriver):
+            return error(f"{verb.name}: this robot is no Reachy Mini.")
+        return carry_out(body, arguments)
+
+    return replace(verb, drops_unknown=True, run=run)
+
+
+_COMMON = {"getStatus", "resume", "releaseTorque", *CONTROL_VERBS}
+"""Verbs of Reachy Mini that every peer has; its status is the peer's ``status``."""
+
+_REACHY = tuple(_of_reachy(verb) for verb in REACHY_VERBS.values() if verb.run and verb.name not in _COMMON)
+
+PEER_VERBS = table(
+    [
+        _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", run=status),
+        _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
+        _peer_verb("features", Kind.READ, GET_FEATURES.summary, method="get_features"),
+        _peer_verb("state", Kind.READ, GET_STATE.summary, method="get_state"),
+        _peer_verb("execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True),
+        _peer_verb("start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start),
+        _peer_verb(
+            "step",
+            Kind.MOTION,
+            WORLD_VERBS["step"].summary,
+            (_optional("steps", int, "Physics steps to take, 1 to 10000", between(1, 10_000)),),
+            run=step_world,
+        ),
+        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=reset_world),
+        _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream."),
+        _peer_verb("teleop_receive", Kind.MOTION, "Follow a leader's input stream.", (_SOURCE, _DEVICE)),
+        _peer_verb(
+            "teleop_stop",
+            Kind.READ,
+            "Close the named input stream, or all of them.",
+            (_optional("source_peer_id", str, _SOURCE.meaning, identifier), _DEVICE),
+            urgent=True,
+        ),
+        release_torque_verb(
+            _optional("motor_ids", str, MOTOR_IDS.meaning, MOTOR_IDS.check), drops_unknown=True, run=release_torque
+        ),
+        _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
+        _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
+        *(
+            for_robot(verb, _PEER_ROBOT, drops_unknown=True)
+            for verb in (*ARM_MOTION_VERBS.values(), *CONTROL_VERBS.values())
+        ),
+        *(replace(verb, drops_unknown=True) for verb in (*PICTURE_VERBS.values(), DRIVE, NAVIGATE_TO)),
+        *_REACHY,
+    ]
+)
+"""The actions of the mesh; ``execute``, ``stop``, ``resume``, ``ping`` and teleoperation are the peer's own."""
+
+TELEOP_VERBS = tuple(name for name in PEER_VERBS if name.startswith("teleop_"))
+
+_OF_ALL = ("status", "stop", "features", "state", "resume", "ping", *CONTROL_VERBS)
+_OF_TASKS = ("execute", "start", *(name for name in PEER_VERBS if name.startswith("teleop_")))
+_OF_ARMS = (*_OF_TASKS, "releaseTorque", *ARM_MOTION_VERBS, *PICTURE_VERBS)
+
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "world": (*_OF_ALL, "execute", "start", "step", "reset", *ARM_MOTION_VERBS, *PICTURE_VERBS),
+    "robot": (*_OF_ALL, *_OF_ARMS),
+    "mobile_base": (*_OF_ALL, "drive"),
+    "navigating_base": (*_OF_ALL, "drive", "navigateTo"),
+    "reachy_mini": (*_OF_ALL, "releaseTorque", *(verb.name for verb in _REACHY)),
+}
+"""Actions that the robots of a kind carry out, as presence names the kind; every other one they refuse."""
+
+
+def kind_of(robot: Robot) -> str:
+    """Return the kind of a robot, one of :data:`KINDS`."""
+    body = body_of(robot)
+    if isinstance(robot, WorldRobot):
+        return "world"
+    if isinstance(body, ReachyDriver):
+        return "reachy_mini"
+    if not callable(getattr(body, "start_drive", None)):
+        return "robot"
+    return "mobile_base" if getattr(body, "nav_action", None) is None else "navigating_base"

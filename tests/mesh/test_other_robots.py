@@ -1,0 +1,135 @@
+"""Mobile bases and Reachy Mini as peers of the mesh, on the in-memory transport."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.mesh_robots import Arm, World
+from fixtures.ros_bases import SHUT, velocities
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet
+
+from strands_robots.drivers.reachy import ReachyDriver
+from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
+from strands_robots.mesh.core import Mesh
+from strands_robots.ros.link import Goal
+from strands_robots.ros.memory import MemoryLink
+from strands_robots.safety.approval import Grants, state_dir
+
+NAV = "/navigate_to_pose"
+STANDING = {"twist": {"twist": {"linear": {"x": 0.0}, "angular": {"z": 0.0}}}}
+
+
+@pytest.fixture
+def link() -> MemoryLink:
+    return MemoryLink()
+
+
+@pytest.fixture
+def goals() -> list[Goal]:
+    return []
+
+
+@pytest.fixture
+def base(link: MemoryLink, goals: list[Goal]) -> Iterator[RosBridgedRobot]:
+    link.serve(NAV, lambda goal, feedback, sent: goals.append(sent))
+    link.watch("/cmd_vel", None, lambda _: link.publish("/odom", "nav_msgs/msg/Odometry", STANDING))
+    robot = RosBridgedRobot("rover", "/cmd_vel", "/odom", nav_action=NAV, link=link, command_gate=SHUT)
+    yield robot
+    robot.disconnect()
+
+
+@pytest.fixture
+def console(peers: Fleet) -> Mesh:
+    return peers.join(None, "console")
+
+
+def send(console: Mesh, peer: str, action: str, **arguments: Any) -> dict[str, Any]:
+    reply = console.send(peer, {"action": action, **arguments}, timeout=20)
+    return reply if "result" not in reply else {"error": "", **reply["result"]}
+
+
+def test_base_is_driven_over_the_mesh_once_approved_and_stopped_by_anyone(
+    peers: Fleet, base: RosBridgedRobot, link: MemoryLink, console: Mesh
+) -> None:
+    peers.join(base, "base-1")
+    order = {"linear": 0.5, "angular": 0.0, "duration": 30.0}
+    assert "strands-robots grant drive@base-1" in send(console, "base-1", "drive", **order)["error"]
+    assert not velocities(link)
+    Grants(state_dir() / "grants").grant("drive", "base-1")
+    assert send(console, "base-1", "drive", **order)["status"] == "success"
+    eventually(lambda: (0.5, 0.0) in velocities(link), what="a velocity")
+    assert send(console, "base-1", "status")["task_status"] == "running"
+    assert send(console, "base-1", "stop")["ok"] is True
+    assert velocities(link)[-1] == (0.0, 0.0)
+    assert send(console, "base-1", "status")["task_status"] == "stopped"
+
+
+def test_base_navigates_over_the_mesh(peers: Fleet, base: RosBridgedRobot, goals: list[Goal], console: Mesh) -> None:
+    peers.join(base, "base-1")
+    Grants(state_dir() / "grants").grant("navigateTo", "base-1")
+    assert send(console, "base-1", "navigateTo", x=1.0, y=2.0)["status"] == "success"
+    eventually(lambda: goals, what="the goal")
+    goals[0].end(4, {})
+    eventually(lambda: send(console, "base-1", "status")["task_status"] == "completed", what="the arrival")
+
+
+@pytest.mark.parametrize(
+    ("action", "arguments", "says"),
+    [
+        ("drive", {"linear": float("nan"), "angular": 0.0, "duration": 1.0}, "linear"),
+        ("drive", {"linear": 0.1, "angular": 0.0, "duration": True}, "duration"),
+        ("navigateTo", {"x": 1.0}, "y is missing"),
+        ("look", {"pitch": 41}, "pitch"),
+        ("playMove", {"move_name": "a b"}, "move_name"),
+        ("playMove", {"move_name": "joy", "library": "films"}, "library"),
+    ],
+)
+def test_argument_outside_its_domain_is_refused_by_name(
+    peers: Fleet, base: RosBridgedRobot, link: MemoryLink, console: Mesh, action: str, arguments: Any, says: str
+) -> None:
+    peers.join(base, "base-1")
+    assert says in str(send(console, "base-1", action, **arguments))
+    assert not velocities(link)
+
+
+@pytest.mark.parametrize(
+    ("action", "arguments", "says"),
+    [
+        ("drive", {"linear": 0.1, "angular": 0.0, "duration": 1.0}, "no mobile base"),
+        ("navigateTo", {"x": 1.0, "y": 0.0}, "no navigation stack"),
+        ("look", {"pitch": 10}, "no Reachy Mini"),
+        ("playMove", {"move_name": "joy"}, "no Reachy Mini"),
+    ],
+)
+def test_verb_of_another_kind_of_robot_is_refused_by_name(
+    peers: Fleet, console: Mesh, action: str, arguments: Any, says: str
+) -> None:
+    peers.join(World("left"), "sim-1", "sim")
+    answer = send(console, "sim-1", action, **arguments)
+    assert answer["status"] == "error"
+    assert says in answer["reason"]
+
+
+def test_reachy_that_is_away_says_so_over_the_mesh(peers: Fleet, console: Mesh) -> None:
+    reachy = ReachyDriver("127.0.0.1", api_port=1)
+    peers.join(reachy, "head-1")
+    status = send(console, "head-1", "status")
+    assert (status["task_status"], status["connected"]) == ("idle", False)
+    assert "strands-robots grant look@head-1" in send(console, "head-1", "look", pitch=10)["error"]
+    Grants(state_dir() / "grants").grant("look", "head-1")
+    assert send(console, "head-1", "look", pitch=10)["status"] == "error"
+    assert "look, a gesture such as nod, or playMove" in str(reachy.start_task("wave"))
+    assert send(console, "head-1", "stop")["ok"] is True
+
+
+def test_presence_names_the_kind_whose_actions_the_tool_lists(
+    peers: Fleet, base: RosBridgedRobot, console: Mesh
+) -> None:
+    for robot, peer in ((base, "base-1"), (Arm(), "arm-1"), (ReachyDriver("127.0.0.1", api_port=1), "head-1")):
+        peers.join(robot, peer)
+    eventually(lambda: peers.meet() or len(console.peers) == 3, what="three peers")
+    kinds = {row["peer_id"]: row.get("robot_kind") for row in console.peers}
+    assert kinds == {"base-1": "navigating_base", "arm-1": "robot", "head-1": "reachy_mini"}
