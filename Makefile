@@ -1,4 +1,4 @@
-.PHONY: help demo test test-all lint bench serve api system venv clean mcp real-arm real-arm-next dds-security models
+.PHONY: help demo test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,7 +14,7 @@ GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 help:  ## Show these targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
 
-venv:  ## What tests, examples and every extra but lerobot need, in .venv
+venv:  ## What tests, examples and every extra but bridge and lerobot need, in .venv
 	@./scripts/venv.sh $(VENV) requirements/dev.lock
 
 demo:  ## An agent in another process has a simulated arm put a cube on a plate, and is stopped
@@ -34,6 +34,7 @@ system:
 	@./scripts/real-arm.sh
 	@./scripts/models.sh
 	@./scripts/mcp.sh
+	@./scripts/venv.sh .venv-bridge requirements/bridge.lock
 	@./scripts/rosbridge.sh
 	@./scripts/registry.sh
 	@./scripts/dds-peers.sh
@@ -44,11 +45,16 @@ test-all: venv system  ## What needs Debian or npm packages besides
 	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
 	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
 	@.venv-mcp/bin/python -m pytest tests/integration/mcp $(ARGS)
+	@.venv-bridge/bin/python -m pytest tests/integration/device_connect/test_agents.py $(ARGS)
 	@$(DDS_SECURITY)/python -m pytest $(DDS_TESTS) $(ARGS)
 
-mcp:  ## The MCP server on the official SDK, in .venv-mcp, and its tests
+mcp:  ## The MCP server on the newest MCP SDK, in .venv-mcp, and its tests
 	@./scripts/mcp.sh
 	@.venv-mcp/bin/python -m pytest tests/integration/mcp $(ARGS)
+
+bridge:  ## The framework's own MCP bridge, in .venv-bridge, and its test
+	@./scripts/venv.sh .venv-bridge requirements/bridge.lock
+	@.venv-bridge/bin/python -m pytest tests/integration/device_connect/test_agents.py $(ARGS)
 
 dds-security:  ## DDS Security on a Cyclone DDS that has it, in .venv-dds-security, and its tests
 	@./scripts/dds-security.sh

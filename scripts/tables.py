@@ -19,7 +19,11 @@ EXTRA_MEANINGS = {
     "device-connect": "the Device Connect networks (Zenoh, NATS), drivers and client",
     "sim": "the MuJoCo simulation and its pictures",
     "remote": "policies served over a WebSocket",
-    "agent": "the Strands agent tool and the MCP bridge",
+    "agent": "the Strands agent tool",
+    "mcp": "the MCP server of all robots, `strands-robots mcp`",
+    "bridge": "the framework's own MCP bridge (excludes `mcp`; not in `all`)",
+    "dashboard": "the operator's page in a browser",
+    "groot": "policies served by a GR00T server",
     "mesh": "the native Zenoh mesh, for robots without Device Connect",
     "iot": "the mesh over AWS IoT Core (MQTT 5)",
     "reachy": "Reachy Mini",
@@ -28,7 +32,7 @@ EXTRA_MEANINGS = {
     "record": "recordings of robots as MCAP files",
     "dataset": "episodes of LeRobot's datasets as leaders (not in `all`)",
     "lerobot": "real arms through LeRobot, and its checkpoints (brings torch; not in `all`)",
-    "all": "everything but `dataset` and `lerobot`",
+    "all": "everything but `bridge`, `dataset` and `lerobot`",
 }
 
 

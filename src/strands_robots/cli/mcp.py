@@ -10,7 +10,7 @@ import typer
 from strands_robots.cli.command import command
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen
-from strands_robots.utils import device_id
+from strands_robots.utils import device_id, install_line
 
 
 def register(app: typer.Typer) -> None:
@@ -31,6 +31,6 @@ def mcp(
         from strands_robots.mcp.caller import Caller  # noqa: PLC0415 - loaded when it is used
         from strands_robots.mcp.server import serve_stdio  # noqa: PLC0415 - as above
     except ModuleNotFoundError as missing:
-        raise CliError(f"The MCP server needs mcp 2.1 or newer, in an environment of its own: {missing}.") from missing
+        raise CliError(f"The MCP server needs the extra mcp ({install_line('mcp')}): {missing}.") from missing
     with network.fleet(name) as fleet:
         asyncio.run(serve_stdio(Caller(fleet), read_only=read_only))

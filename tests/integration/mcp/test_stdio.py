@@ -1,7 +1,4 @@
-"""An MCP client on stdio lists, moves and stops robots; a call that is given up halts what it began.
-
-Run in .venv-mcp: the framework's own MCP bridge needs an older mcp than the server.
-"""
+"""An MCP client on stdio lists, moves and stops robots; a call that is given up halts what it began."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from fixtures.waiting import eventually, free_port
 from strands_robots import Robot
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 
-pytest.importorskip("mcp.server.mcpserver", reason="needs mcp 2: make mcp", exc_type=ImportError)
+pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 
 from mcp.client.client import Client
 from mcp.client.stdio import StdioServerParameters, stdio_client
