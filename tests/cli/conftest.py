@@ -49,8 +49,8 @@ class FakeFleet:
             raise self.answer
         return self.answer
 
-    def stop(self, device: str, timeout: float) -> Envelope:
-        return self.stops[device]
+    def stop(self, device: str, timeout: float, robot_name: str = "") -> Envelope:
+        return self.stops[f"{device}/{robot_name}" if robot_name else device]
 
     def stop_all(self, timeout: float) -> dict[str, Envelope]:
         return self.stops

@@ -118,7 +118,14 @@ def test_stop_prints_each_verdict_and_exits_with_the_worst(run: Run, fleet: Fake
     assert "DID NOT STOP" in run("stop", "--all").stdout
 
 
-@pytest.mark.parametrize("arguments", [("stop",), ("stop", "a", "--all")])
+def test_stop_of_one_robot_of_a_world_names_it(run: Run, fleet: FakeFleet) -> None:
+    fleet.stops = {"world-1/left": success("Stopped left.", stopped=True)}
+    result = run("stop", "world-1", "--robot", "left")
+    assert result.exit_code == 0
+    assert "Stopped left." in result.stdout
+
+
+@pytest.mark.parametrize("arguments", [("stop",), ("stop", "a", "--all"), ("stop", "--all", "--robot", "left")])
 def test_stop_takes_a_device_or_all(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
     assert run(*arguments).exit_code == 2
 

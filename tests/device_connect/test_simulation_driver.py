@@ -92,6 +92,37 @@ async def test_stop_names_what_stopped(world: ToyWorld) -> None:
         assert "left" in answer["content"][0]["text"]
 
 
+async def test_stop_of_one_robot_leaves_the_others_moving(world: ToyWorld) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        for name in ("left", "right"):
+            assert (await bench.call("execute", instruction="wave", robot_name=name))["status"] == "success"
+        answer = await bench.call("stop", robot_name="left")
+        assert (answer["status"], answer["stopped"], answer["not_stopped"]) == ("success", ["left"], [])
+        assert [row["robot"] for row in world.list_policies_running()] == ["right"]
+        assert (await bench.call("stop", robot_name=""))["stopped"] == ["right"]
+
+
+@pytest.mark.parametrize("name", ["middle", 5, True, None, "x" * 129])
+async def test_stop_of_a_robot_that_is_not_there_stops_nothing_and_is_no_success(world: ToyWorld, name: Any) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        await bench.call("execute", instruction="wave", robot_name="left")
+        answer = await bench.call("stop", robot_name=name)
+        assert answer["status"] == "error"
+        assert answer.get("not_stopped") == ["middle"] if name == "middle" else "robot_name" in answer["reason"]
+        assert [row["robot"] for row in world.list_policies_running()] == ["left"]
+
+
+async def test_stop_of_one_robot_voids_its_pending_command_alone(world: ToyWorld) -> None:
+    async with DriverBench(driver := SimulationDeviceDriver(world)) as bench:
+        pending = {name: driver.pipeline.pending.arrive(name) for name in ("left", "right")}
+        await bench.call("stop", robot_name="left")
+        for name, voided in (("left", True), ("right", False)):
+            asked = pending[name]
+            assert asked is not None
+            with driver.pipeline.pending.serving(asked):
+                assert (driver.robot.gate.refusal("execute") is not None) is voided
+
+
 async def test_stop_of_a_still_simulation_is_an_affirmative_nothing(world: ToyWorld) -> None:
     async with DriverBench(SimulationDeviceDriver(world)) as bench:
         answer = await bench.call("stop")

@@ -47,6 +47,7 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
     robot_mesh(action="status", target="arm-1")
     robot_mesh(action="stop", target="arm-1")
     robot_mesh(action="stop")
+    robot_mesh(action="stop", target="world-1", arguments={"robot_name": "left"})
     robot_mesh(action="emergency_stop", instruction="smoke")
     robot_mesh(action="release_torque", target="arm-1")
     assert fake.calls == [
@@ -55,6 +56,7 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
         ("status", "arm-1"),
         ("stop", "arm-1"),
         ("stop", ""),
+        ("stop", "world-1", "left"),
         ("emergency_stop", "smoke"),
         ("release_torque", "arm-1"),
     ]
@@ -78,6 +80,9 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
         ({"action": "move", "target": "arm-1", "arguments": [1]}, "arguments"),
         ({"action": "release_torque"}, "target"),
         ({"action": "stop", "target": "arm 1"}, "target"),
+        ({"action": "stop", "arguments": {"robot_name": "left"}}, "target"),
+        ({"action": "stop", "target": "world-1", "arguments": {"robot": "left"}}, "robot_name"),
+        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": ""}}, "robot_name"),
     ],
 )
 def test_argument_out_of_its_domain_is_refused_by_name(

@@ -20,7 +20,7 @@ from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import DEADLINE_S, Progress, SafetyController, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.tools.networks import NativeMesh, stop_outcome
-from strands_robots.utils import device_id, number
+from strands_robots.utils import device_id, number, text
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
@@ -53,19 +53,23 @@ def stop(
     *,
     device: Annotated[str | None, typer.Argument(help="The device's id.")] = None,
     everything: Annotated[bool, typer.Option("--all", help="Stop every device that answers.")] = False,
+    one: Annotated[str, typer.Option("--robot", help="Stop this robot of DEVICE's world alone.")] = "",
     timeout: Timeout = 5.0,
     on_mesh: OnMesh = False,
 ) -> None:
     """Stop one robot, or all. Exits with 1 when one did not stop, with 3 when one is silent."""
     if (device is None) != everything:
         raise CliError("stop takes a DEVICE or --all.", Exit.USAGE)
+    if one and device is None:
+        raise CliError("stop takes --robot with a DEVICE, whose world has that robot.", Exit.USAGE)
+    name = text("--robot", one, longest=128, empty=True)
     if on_mesh:
         network.use_mesh()
-        _report_mesh_stop(screen, NativeMesh().stop(device or ""))
+        _report_mesh_stop(screen, NativeMesh().stop(device or "", name))
         return
     seconds = number("--timeout", timeout, above=0, high=60)
     with network.fleet() as fleet:
-        answers = fleet.stop_all(seconds) if device is None else {device: fleet.stop(device, seconds)}
+        answers = fleet.stop_all(seconds) if device is None else {device: fleet.stop(device, seconds, name)}
     if not answers:
         raise CliError(f"No robot that can be stopped answered. {describe(fleet.link)}", Exit.SILENT, devices={})
     outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}

@@ -37,7 +37,7 @@ from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Re
 from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
-from strands_robots.utils import shown, text
+from strands_robots.utils import ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
 
@@ -179,10 +179,10 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
         if verb.kind is Kind.STOP:
-            problem = verb.unfit(params)
-            return error(problem) if problem else await self.stop_answer(verb.name)
-        moves = verb.kind is Kind.MOTION
-        command = Command(verb, params, caller, self.pipeline.pending.arrive() if moves else None)
+            return await self._stop(verb, params)
+        moves, named = verb.kind is Kind.MOTION, params.get("robot_name")
+        asked = self.pipeline.pending.arrive(named if isinstance(named, str) else "") if moves else None
+        command = Command(verb, params, caller, asked)
         answered, hand_over = loop_future()
         try:
             self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
@@ -228,18 +228,34 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
 
     # Stops.
 
-    def stop_target(self) -> Haltable:
-        """Return what ``stop`` halts: everything that moves."""
+    def stop_target(self, robot_name: str = "") -> Haltable:
+        """Return what ``stop`` halts: the named robot of a world, or all that moves.
+
+        Raises:
+            ValidationError: the world has no robot of this name.
+        """
         return self.robot
 
     def stop_envelope(self, verdict: StopVerdict) -> Envelope:
         """Return the answer to ``stop`` for a verdict."""
         return verdict.envelope()
 
-    async def stop_answer(self, reason: str) -> Envelope:
+    async def _stop(self, verb: Verb, given: Mapping[str, Any]) -> Envelope:
+        try:
+            name = verb.checked(given).get("robot_name", "")
+        except ValidationError as refused:
+            return error(str(refused), stopped=None)
+        self.pipeline.pending.void(name)
+        try:
+            target = self.stop_target(name)
+        except ValidationError as unknown:
+            return enveloped("stop", self.stop_envelope(StopVerdict(not_stopped={name: str(unknown)})))
+        return await self.stop_answer(verb.name, target, name)
+
+    async def stop_answer(self, reason: str, target: Haltable | None = None, name: str = "") -> Envelope:
         """Halt and answer within the halt deadline, for any caller."""
-        target = self.stop_target()
-        halting = stop_executor().submit(target, self.peer_id, reason, within=stop_within(target))
+        target = target or self.stop_target()
+        halting = stop_executor().submit(target, name or self.peer_id, reason, within=stop_within(target))
         verdict = await asyncio.wrap_future(halting)
         return enveloped("stop", self.stop_envelope(verdict))
 

@@ -176,12 +176,12 @@ class FleetClient:
 
         return EventSubscription(self, self.run(self._subscribe(f"{name}.event.*", arrived), 5.0))
 
-    def stop(self, device: str, timeout: float = 5.0) -> Envelope:
+    def stop(self, device: str, timeout: float = 5.0, robot_name: str = "") -> Envelope:
         """Stop a device by ``stop``, else ``stopMotion``; return its envelope.
 
-        ``stopped`` is true only for an affirmative answer.
+        ``stopped`` is true only for an affirmative answer. ``robot_name`` stops one robot of a world alone.
         """
-        return self.run(self._stop(device, timeout), 2 * timeout + 4.0)
+        return self.run(self._stop(device, timeout, robot_name), 2 * timeout + 4.0)
 
     async def call_async(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, within: float = 10.0
@@ -189,9 +189,9 @@ class FleetClient:
         """Do as :meth:`call`, on the event loop of the caller."""
         return await self._awaited(self._call(device, function, dict(params or {}), within))
 
-    async def stop_async(self, device: str, within: float = 5.0) -> Envelope:
+    async def stop_async(self, device: str, within: float = 5.0, robot_name: str = "") -> Envelope:
         """Do as :meth:`stop`, on the event loop of the caller."""
-        return await self._awaited(self._stop(device, within))
+        return await self._awaited(self._stop(device, within, robot_name))
 
     def stop_all(self, timeout: float = 5.0) -> dict[str, Envelope]:
         """Stop each device when it is found; return the answers by id.
@@ -258,11 +258,12 @@ class FleetClient:
             return DeviceTimeoutError(f"{device} is on the network and did not answer within {within:g} s ({exc}).")
         return exc
 
-    async def _stop(self, device: str, within: float) -> Envelope:
+    async def _stop(self, device: str, within: float, robot_name: str = "") -> Envelope:
+        params = {"robot_name": robot_name} if robot_name else {}
         try:
-            answer = await self._call(device, "stop", {}, within)
+            answer = await self._call(device, "stop", params, within)
         except CallRefusedError as exc:
-            if exc.code != -32601:
+            if robot_name or exc.code != -32601:
                 return error(str(exc), stopped=None)
             try:
                 answer = await self._call(device, "stopMotion", {}, within)

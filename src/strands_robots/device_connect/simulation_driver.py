@@ -17,7 +17,7 @@ from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.policy_arguments import profile_list
-from strands_robots.serving.robot_verbs import WORLD_VERBS, WorldStop, served_world, world_stop_answer
+from strands_robots.serving.robot_verbs import WORLD_VERBS, WorldStop, robot_stop, served_world, world_stop_answer
 from strands_robots.serving.verbs import Verb
 
 
@@ -57,9 +57,9 @@ class SimulationDeviceDriver(RobotDriver):
             description=f"Simulation {self._model}{profile_list()}",
         )
 
-    def stop_target(self) -> Haltable:
-        """Return what ``stop`` halts: the world, and each rollout by its own word."""
-        return WorldStop(self.world)
+    def stop_target(self, robot_name: str = "") -> Haltable:
+        """Return what ``stop`` halts: one robot, or the world and each rollout."""
+        return robot_stop(self.world, robot_name) if robot_name else WorldStop(self.world)
 
     def stop_envelope(self, verdict: StopVerdict) -> Envelope:
         """Return the names of what stopped and of what did not."""

@@ -45,6 +45,7 @@ STOP = ToolAnnotations(read_only_hint=False, destructive_hint=False, idempotent_
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Flag = Annotated[bool, Field(strict=True)]
 Robot = Annotated[str, Field(description="The robot's id, as list_robots has it")]
+StopInWorld = Annotated[str, Field(description="Which robot of a simulated world; empty for all of them")]
 InWorld = Annotated[str, Field(description="Which robot of a simulated world; empty for its only one")]
 Wait = Annotated[Flag, Field(description="Answer at the end of the motion; false needs acquire_control")]
 Approach = Annotated[Number | None, Field(description="Degrees of the gripper below the horizontal")]
@@ -165,12 +166,12 @@ def _add_reads(server: MCPServer[Any], caller: Caller) -> None:
 
 def _add_stops(server: MCPServer[Any], caller: Caller) -> None:
     @server.tool(annotations=STOP)
-    async def stop(robot: Robot) -> Result:
+    async def stop(robot: Robot, robot_name: StopInWorld = "") -> Result:
         """Stop a robot now.
 
         Only a success confirms it: a refused or missing answer means that it may still move.
         """
-        return _result(await caller.stop(robot))
+        return _result(await caller.stop(robot, robot_name))
 
     @server.tool(annotations=STOP)
     async def emergency_stop(reason: Annotated[str, Field(description="Why, 1 to 200 characters")]) -> Result:

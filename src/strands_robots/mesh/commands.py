@@ -20,7 +20,7 @@ from strands_robots.safety.peer_answers import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
-from strands_robots.serving.robot_verbs import RobotStop, peer_stop_answer, run_to_end, stop_within
+from strands_robots.serving.robot_verbs import peer_stop_answer, robot_stop, run_to_end, stop_within
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
@@ -101,10 +101,7 @@ def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
     """
     if robot is None or not name or not isinstance(robot, WorldRobot):
         return robot
-    robots = robot.list_robots()
-    if name not in robots:
-        raise ValidationError(f"there is no robot of this name; there are {', '.join(robots) or 'none'}")
-    return RobotStop(robot, name)
+    return robot_stop(robot, name)
 
 
 def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lambda: False) -> Own:

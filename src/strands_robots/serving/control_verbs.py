@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from strands_robots.contract import Robot
-from strands_robots.envelope import Envelope, success
+from strands_robots.contract import Robot, WorldRobot
+from strands_robots.envelope import Envelope, is_error, success
 from strands_robots.serving.control import KINDS, TTL_MAX_S, TTL_MIN_S, TTL_S, ControlLease, ControlLeases
 from strands_robots.serving.verbs import LEASE_ID, LEASE_ID_MAX, Arguments, Kind, Parameter, Verb, table
 from strands_robots.utils import choice, number, text
@@ -45,7 +45,8 @@ def _lease(arguments: Arguments) -> ControlLease:
 
 def _acquire(robot: Robot, arguments: Arguments) -> Envelope:
     held = arguments.get(LEASE_ID, "") or ""
-    return _lease(arguments).acquire(arguments["caller"], arguments["kind"], arguments["ttl_s"], held)
+    answer = _lease(arguments).acquire(arguments["caller"], arguments["kind"], arguments["ttl_s"], held)
+    return _of_one(robot, arguments, answer)
 
 
 def _renew(robot: Robot, arguments: Arguments) -> Envelope:
@@ -59,7 +60,15 @@ def _release(robot: Robot, arguments: Arguments) -> Envelope:
 def _take(robot: Robot, arguments: Arguments) -> Envelope:
     name, device = arguments.get("robot_name", "") or "", arguments["robot"]
     who = f"{device}/{name}" if name else device
-    return _lease(arguments).take(arguments["caller"], arguments["reason"], who, arguments.get("assertion"))
+    answer = _lease(arguments).take(arguments["caller"], arguments["reason"], who, arguments.get("assertion"))
+    return _of_one(robot, arguments, answer)
+
+
+def _of_one(robot: Robot, arguments: Arguments, answer: Envelope) -> Envelope:
+    """Name the robot of a world whose lease it is, which the caller may have left out."""
+    if not isinstance(robot, WorldRobot) or is_error(answer):
+        return answer
+    return {**answer, "robot_name": arguments.get("robot_name") or next(iter(robot.list_robots()), "")}
 
 
 def _read(robot: Robot, arguments: Arguments) -> Envelope:
@@ -75,7 +84,7 @@ CONTROL_VERBS = table(
             Kind.MOTION,
             "Hold a free robot: it then moves only with your lease_id, and halts when you have been silent for ttl_s.",
             (_KIND, _TTL),
-            returns="lease_id, epoch, expires_in_s; refused with the holder and the seconds left",
+            returns="lease_id, epoch, expires_in_s, robot_name; refused with the holder and the seconds left",
             run=_acquire,
             on_lease=True,
             critical=False,

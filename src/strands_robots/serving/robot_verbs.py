@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from strands_robots import settings
@@ -131,6 +131,18 @@ class RobotStop:
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop the robot's rollout and grade the answer."""
         return verdict_of(self.stop, self.name)
+
+
+def robot_stop(world: WorldRobot, name: str) -> RobotStop:
+    """Return the stop of the named robot of a world.
+
+    Raises:
+        ValidationError: the world has no robot of this name.
+    """
+    robots = world.list_robots()
+    if name not in robots:
+        raise ValidationError(f"there is no robot of this name; there are {', '.join(robots) or 'none'}")
+    return RobotStop(world, name)
 
 
 def stop_within(target: object) -> float | None:
@@ -344,7 +356,8 @@ WORLD_VERBS = table(
         Verb(
             "stop",
             Kind.STOP,
-            "Stop everything that moves in the simulation; the answer names what stopped and what did not.",
+            "Stop the named robot, or all that moves in the world; the answer names what stopped and what did not.",
+            (replace(ROBOT_NAME, meaning="Which robot of the world; empty for all of them"),),
             returns="stopped, not_stopped, reasons",
         ),
         RESUME,

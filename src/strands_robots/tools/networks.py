@@ -144,11 +144,14 @@ class NativeMesh:
         """Send the peer a ``releaseTorque``."""
         return self._request(target, action="releaseTorque")
 
-    def stop(self, target: str) -> Envelope:
-        """Stop one peer, or every peer in reach at once; answers by name."""
+    def stop(self, target: str, robot_name: str = "") -> Envelope:
+        """Stop one peer, or every peer in reach at once; answers by name.
+
+        ``robot_name`` stops one robot of the target's world alone.
+        """
 
         def stopped(mesh: Mesh) -> Envelope:
-            command = {"action": "stop"}
+            command = {"action": "stop", **({"robot_name": robot_name} if robot_name else {})}
             if target:
                 return combined_verdict(
                     {target: _stop_answer(target, _reply(mesh, target, command, STOP_S), enrolled_peers())}
@@ -304,12 +307,15 @@ class DeviceConnect:
         """Call the device's ``releaseTorque``."""
         return _on_fleet(lambda fleet: fleet.call(target, "releaseTorque", {}, ANSWER_S))
 
-    def stop(self, target: str) -> Envelope:
-        """Stop one device, or every device at once; answers by name."""
+    def stop(self, target: str, robot_name: str = "") -> Envelope:
+        """Stop one device, or every device at once; answers by name.
+
+        ``robot_name`` stops one robot of the target's world alone.
+        """
 
         def stopped(fleet: FleetClient) -> Envelope:
             if target:
-                return combined_verdict({target: fleet.stop(target, STOP_S)})
+                return combined_verdict({target: fleet.stop(target, STOP_S, robot_name)})
             answers = fleet.stop_all(STOP_S)
             return combined_verdict(answers, fleet.stale)
 

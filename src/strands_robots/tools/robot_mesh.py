@@ -18,7 +18,7 @@ from strands_robots.arm_mixin import WAIT_S
 from strands_robots.envelope import error
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.tools import networks
-from strands_robots.utils import ValidationError, choice, device_id, identifier, mapping, text
+from strands_robots.utils import ValidationError, choice, device_id, identifier, mapping, shown, text
 
 CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
 """Verb of each action that calls one where none is named."""
@@ -47,7 +47,8 @@ def robot_mesh(
 
     Args:
         action: peers lists the robots; tell gives one an instruction and returns once the motion has started; status
-            returns what one is doing; stop stops one, or all without a target; emergency_stop stops and locks all;
+            returns what one is doing; stop stops one, or all without a target, or with arguments {"robot_name": ...}
+            one robot of a world; emergency_stop stops and locks all;
             release_torque stops one and switches its motors off, so that it falls, once its operator approved that;
             move moves an arm (moveTo, or another verb) and returns what it reached; picture returns a camera's
             picture (getPicture); wait waits for the end of a motion; call calls any verb that peers lists.
@@ -74,13 +75,23 @@ def robot_mesh(
             return networks.network().tell(robot, task["instruction"], task["policy_provider"], task["duration"])
         if asked == "emergency_stop":
             return networks.network().emergency_stop(text("instruction", instruction, empty=True))
+        if asked == "stop":
+            return networks.network().stop(robot, *_one_of_world(robot, arguments))
     except ValidationError as refused:
         return error(str(refused))
-    if asked == "stop":
-        return networks.network().stop(robot)
     if asked == "release_torque":
         return networks.network().release_torque(robot)
     return networks.network().status(robot) if asked == "status" else networks.network().peers()
+
+
+def _one_of_world(target: str, arguments: object) -> tuple[str, ...]:
+    """Return the name of the one robot of a world that is to stop; empty for all."""
+    if arguments is None:
+        return ()
+    given = mapping("arguments", arguments)
+    if set(given) != {"robot_name"} or not target:
+        raise ValidationError(f"arguments of stop must be robot_name alone, with a target, not {shown(given)}.")
+    return (text("robot_name", given["robot_name"], longest=128),)
 
 
 def _with_image(answer: dict[str, Any]) -> dict[str, Any]:

@@ -118,6 +118,22 @@ async def test_a_lease_and_its_motion_end_with_the_client(site: Site) -> None:
     await site.until(False)
 
 
+async def test_client_holds_and_stops_the_robots_of_a_world_one_by_one(site: Site) -> None:
+    async with site.client("--as", "first") as client, site.client("--as", "second") as other:
+        for robot_name in ("left", "right"):
+            held = await client.call_tool("acquire_control", {"robot": "arm-1", "robot_name": robot_name})
+            assert held.structured_content["data"]["robot_name"] == robot_name, held
+        for robot_name in ("left", "right"):
+            wave = {**WAVE, "robot_name": robot_name, "wait": False}
+            refused = await other.call_tool("run_policy", {**WAVE, "robot_name": robot_name})
+            assert "holds control" in refused.structured_content["text"]
+            assert not (await client.call_tool("run_policy", wave)).is_error
+        await site.until(True)
+        assert not (await client.call_tool("stop", {"robot": "arm-1", "robot_name": "left"})).is_error
+        assert not site.moving
+        assert [row["robot"] for row in site.world.list_policies_running()] == ["right"]
+
+
 async def test_a_read_only_client_has_no_tool_that_moves_and_may_stop(site: Site) -> None:
     async with site.client("--read-only") as client:
         names = {tool.name for tool in (await client.list_tools()).tools}
