@@ -81,7 +81,7 @@ class Caller:
             return answer
 
     async def stop(self, robot: str, robot_name: str = "") -> Envelope:
-        """Stop a robot, or one of a world; it needs no lease and waits for no call."""
+        """Stop a robot, or one of a world, without a lease or a wait."""
         try:
             return await self.fleet.stop_async(robot, robot_name=robot_name)
         except ValidationError as refused:

@@ -110,7 +110,7 @@ def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lamb
 
 
 def pong(context: Context) -> dict[str, Any]:
-    """Return the answer to a ping; peers in the field take one without ``pong`` for none."""
+    """Return the answer to a ping, with the ``pong`` that older peers look for."""
     return {"pong": True, "peer_id": context.peer_id, "t": context.clock()}
 
 

@@ -65,7 +65,7 @@ def _take(robot: Robot, arguments: Arguments) -> Envelope:
 
 
 def _of_one(robot: Robot, arguments: Arguments, answer: Envelope) -> Envelope:
-    """Name the robot of a world whose lease it is, which the caller may have left out."""
+    """Name the robot of a world whose lease it is."""
     if not isinstance(robot, WorldRobot) or is_error(answer):
         return answer
     return {**answer, "robot_name": arguments.get("robot_name") or next(iter(robot.list_robots()), "")}
