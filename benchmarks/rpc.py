@@ -26,7 +26,6 @@ from strands_robots.device_connect.backends import LinkConfig, open_client
 
 IN_FLIGHT = 32
 EVENT_HZ = 10_000.0
-STRETCH = 20
 CROWD_STRETCH = 8 * IN_FLIGHT
 
 
@@ -73,17 +72,17 @@ async def _run(effort: Effort) -> list[Row]:
 
 
 async def _round_trips(name: str, pair: Pair, effort: Effort) -> list[Row]:
-    ours: list[list[float]] = []
-    bare: list[list[float]] = []
-    both: list[list[float]] = []
+    sides = ((pair.bare, pair.device_bare), (pair.ours, pair.device_ours), (pair.ours_both, pair.device_ours))
+    turns: list[list[list[float]]] = [[], [], []]
     for _ in range(effort.turns):
-        for turns in (bare, ours, both):
-            turns.append([])
-        # Short stretches in turns: what else the machine does for a second falls on all three.
-        for _ in range(effort.calls // STRETCH):
-            bare[-1] += await _latencies(pair.bare, pair.device_bare, STRETCH)
-            ours[-1] += await _latencies(pair.ours, pair.device_ours, STRETCH)
-            both[-1] += await _latencies(pair.ours_both, pair.device_ours, STRETCH)
+        for kept in turns:
+            kept.append([])
+        # Call by call in turns: what else the machine does for a moment falls on all three.
+        for number in range(effort.calls):
+            for place in range(len(sides)):
+                side = (number + place) % len(sides)
+                turns[side][-1].append(await _timed(*sides[side], "getStatus"))
+    bare, ours, both = turns
     bound = 1.1 if name == "NATS" else 1.0
     calls = f"getStatus, {name}, {effort.calls} calls"
     rows = [

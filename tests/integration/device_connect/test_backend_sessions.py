@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 
 import psutil
 import pytest
@@ -12,7 +13,7 @@ from fixtures.bare_caller import Caller
 from fixtures.echo_device import EchoDevice
 from fixtures.waiting import accepts, eventually, free_port, until
 
-from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client
+from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client, zenoh_session
 
 FLEET = """
 import asyncio, json, os, sys, threading
@@ -182,6 +183,7 @@ def test_links_that_differ_are_unequal():
 
 AGENT = """
 import sys
+import threading
 from device_connect_agent_tools import connect, disconnect, discover_devices, invoke_device
 from fixtures.waiting import eventually
 connect()
@@ -261,3 +263,26 @@ def _listeners_of(pid):
         for each in psutil.Process(pid).net_connections("tcp")
         if each.status == psutil.CONN_LISTEN
     }
+
+
+def test_interpreter_keeps_its_state_of_a_zenoh_thread_between_callbacks() -> None:
+    where, seen = f"tcp/127.0.0.1:{free_port()}", []
+    of_thread = threading.local()
+
+    def on_sample(_sample: object) -> None:
+        of_thread.calls = getattr(of_thread, "calls", 0) + 1
+        seen.append(of_thread.calls)
+
+    listening = zenoh_session.acquire(LinkConfig(mode="peer", listen=(where,), multicast=False))
+    sending = zenoh_session.acquire(LinkConfig(mode="peer", connect=(where,), multicast=False))
+    try:
+        listening.subscribe("t/ticks", on_sample)
+
+        def threads_remember() -> bool:
+            sending.session.put("t/ticks", b"tick")
+            return max(seen, default=0) >= 3
+
+        eventually(threads_remember, what="one thread that counts its callbacks")
+    finally:
+        zenoh_session.release(sending)
+        zenoh_session.release(listening)
