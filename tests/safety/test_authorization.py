@@ -13,6 +13,8 @@ from strands_robots.safety.authorization import (
     Authorization,
     caller_name,
     estop_refusal,
+    matcher,
+    matches,
     motion_refusal,
     provider_refusal,
 )
@@ -109,3 +111,8 @@ def test_a_refused_caller_is_logged_as_self_declared(caplog: pytest.LogCaptureFi
     with caplog.at_level(logging.WARNING):
         assert robot.motion("stranger", "execute") is not None
     assert "'stranger' (self-declared)" in caplog.text
+
+
+@given(names, st.lists(st.one_of(names, names.map(lambda n: n[:2] + "*"), st.sampled_from(["*", "?x", "[a-c]*"]))))
+def test_compiled_list_admits_the_names_that_the_list_admits(name: str, allow: list[str]) -> None:
+    assert bool(matcher(allow)(name)) == matches(name, allow)

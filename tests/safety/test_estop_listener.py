@@ -132,8 +132,17 @@ def test_failures_of_one_source_cost_no_other() -> None:
     assert budget.allows("safety-1", 10.0)
 
 
+def test_failures_under_made_up_names_use_up_the_budget_of_all() -> None:
+    budget = FailureBudget(in_all_per_s=3)
+    for number in range(3):
+        assert budget.allows(f"forger-{number}", 10.0)
+        budget.record(f"forger-{number}", 10.0)
+    assert not budget.allows("forger-4", 10.9)
+    assert budget.allows("forger-4", 11.0)
+
+
 def test_invented_sources_are_bounded_and_the_latest_is_remembered() -> None:
-    budget = FailureBudget(per_s=1)
+    budget = FailureBudget(per_s=1, in_all_per_s=11 * SOURCES_MAX)
     for number in range(10 * SOURCES_MAX):
         budget.record(f"forger-{number}", 10.0)
     assert not budget.allows(f"forger-{10 * SOURCES_MAX - 1}", 10.0)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from device_connect_edge.messaging import MessagingError
 
-from strands_robots.device_connect.backends import LinkConfig, backend_for
+from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.estop_listener import OnEvent, OnState, StopLink
 
 if TYPE_CHECKING:
@@ -263,18 +263,20 @@ class NatsStopLink:
             self._state.set(False)
 
     async def _serve(self, events: Collection[str], on_event: OnEvent, end: asyncio.Event) -> None:
-        async def on_message(data: bytes, subject: str, reply: str | None) -> None:
+        from strands_robots.device_connect.backends.nats import NatsBackend  # noqa: PLC0415 - loaded with the first link
+
+        def on_message(data: bytes, subject: str) -> None:
             parts = subject.split(".")
             if len(parts) == 5:
                 on_event(parts[4], parts[2], data)
 
         while not end.is_set():
-            client = backend_for(self._link)
+            client = NatsBackend(self._link)
             if not await self._connected(client, end):
                 continue
             try:
                 for event in events:
-                    await client.subscribe_with_subject(f"{self._root}.*.event.{event}", on_message)
+                    await client.listen(f"{self._root}.*.event.{event}", on_message)
                 # The server has the subscriptions when it has answered this.
                 await client.flush()
                 self._client = client

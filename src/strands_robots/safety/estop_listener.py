@@ -16,8 +16,7 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from strands_robots.audit import audit_head, log_safety_event
 from strands_robots.safety.checkin import CheckInRules
@@ -94,8 +93,7 @@ def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> b
     return json.dumps({"jsonrpc": "2.0", "method": event, "params": {**params, **stamp}}).encode()
 
 
-@dataclass(frozen=True, slots=True)
-class StopEvent:
+class StopEvent(NamedTuple):
     """Event from a link: name, declared source, bytes, monotonic s at receipt."""
 
     event: str
@@ -145,7 +143,9 @@ class FairQueue:
             bucket.append(received)
         elif len(bucket) < BUCKET_CAPACITY // 2:
             bucket.appendleft(received)
-        self._waiting.set()
+        # While it is set, the listener's next look is still to come: most messages of a flood need not wake it.
+        if not self._waiting.is_set():
+            self._waiting.set()
 
     def get(self) -> StopEvent | None:
         """Return the next event, waiting for one; None once closed and empty."""
@@ -185,22 +185,31 @@ class FairQueue:
 
 
 class FailureBudget:
-    """Failed signature checks of each source, counted in windows of a second."""
+    """Failed signature checks of each source and of all in a second.
 
-    def __init__(self, per_s: int = 20) -> None:
-        self._per_s = per_s
+    Without the sum, a flood under made-up names would have each of them checked.
+    """
+
+    def __init__(self, per_s: int = 20, in_all_per_s: int = 100) -> None:
+        self._per_s, self._in_all_per_s = per_s, in_all_per_s
         self._failures: dict[str, tuple[float, int]] = {}
+        self._in_all = (float("-inf"), 0)
 
     def allows(self, source: str, now: float) -> bool:
         """Return True while one more message of ``source`` may be checked."""
         since, count = self._failures.get(source, (now, 0))
-        return count < self._per_s or now - since >= 1.0
+        if count >= self._per_s and now - since < 1.0:
+            return False
+        since, count = self._in_all
+        return count < self._in_all_per_s or now - since >= 1.0
 
     def record(self, source: str, now: float) -> None:
         """Count a failure of ``source``."""
         since, count = self._failures.pop(source, (now, 0))
         self._failures[source] = (since, count + 1) if now - since < 1.0 else (now, 1)
         _bound(self._failures)
+        since, count = self._in_all
+        self._in_all = (since, count + 1) if now - since < 1.0 else (now, 1)
 
 
 class LatchAnswers:

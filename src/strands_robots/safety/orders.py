@@ -15,7 +15,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.safety import ed25519
-from strands_robots.safety.authorization import estop_refusal
+from strands_robots.safety.authorization import caller_name, entries, estop_refusal, matcher
 from strands_robots.safety.clocks import ObservedClocks, seconds_of
 from strands_robots.safety.lockout import OVERFLOW
 from strands_robots.safety.resume import is_epoch
@@ -214,7 +214,8 @@ class StopRules:
         keys: Sequence[bytes] | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._allow = tuple(settings.items(ALLOW) if allow is None else allow)
+        self._allow = entries(settings.items(ALLOW) if allow is None else allow)
+        self._fits = matcher(self._allow)
         self._keys = tuple(estop_keys() if keys is None else keys)
         self._clock = clock
         self._clocks = ObservedClocks()
@@ -244,7 +245,12 @@ class StopRules:
 
     def source_refusal(self, source: str) -> str | None:
         """Return the reason why this source may not stop, or None; costs next to nothing."""
+        if self._may_stop(source):
+            return None
         return estop_refusal(source, self._allow)
+
+    def _may_stop(self, source: str) -> bool:
+        return caller_name(source) is not None and (not self._allow or self._fits(source) is not None)
 
     def order_of(self, source: str, payload: bytes, received: float | None = None) -> StopOrder | StopRefused:
         """Decide on the bytes of an ``emergencyStop`` event."""

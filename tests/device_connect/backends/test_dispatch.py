@@ -420,3 +420,18 @@ async def test_work_started_inside_a_task_begins_in_the_next_turn():
     assert not seen
     await task
     assert seen == [task]
+
+
+async def test_feed_takes_no_more_than_so_many_messages_a_second():
+    seen = []
+
+    async def handler(_data, number):
+        seen.append(number)
+
+    feed = dispatch.OrderedFeed("s", handler, call_soon, per_s=10)
+    for number in range(1_000):
+        feed.accept(b"x", number)
+    await until(lambda: len(seen) >= 10)
+    await feed.close()
+    assert seen[:10] == list(range(10))
+    assert len(seen) < 1_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,9 @@ from ...errors import StrandsRobotsError
 from . import jsonrpc
 from .config import LinkConfig
 from .dispatch import CommandServer, Handler, OrderedFeed, PendingReplies, Serve, relaying, send
+
+STOPS_PER_S = 200
+"""Emergency stops of one subscription that a handler is called with in a second; it loses those beyond."""
 
 Undo = Callable[[], Awaitable[None]]
 """Ends what was declared on the network."""
@@ -77,7 +81,7 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         """
         if subject.endswith((".cmd", "/cmd")) and not subscribe_only:
             return await self._serve(subject, queue, relaying(callback, self._replies))
-        feed = OrderedFeed(subject, callback, self._call_soon)
+        feed = self._feed(subject, callback)
         return await self._consumed(subject, queue, feed, answers=not subscribe_only)
 
     async def serve(self, subject: str, serve: Serve) -> Subscription:
@@ -97,8 +101,13 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         subscribe_only: bool = False,
     ) -> Subscription:
         """Have ``callback(data, subject, reply)`` called with the subject that matched."""
-        feed = OrderedFeed(subject, callback, self._call_soon)
+        feed = self._feed(subject, callback)
         return await self._consumed(subject, queue, feed, answers=not subscribe_only, with_subject=True)
+
+    def _feed(self, subject: str, callback: Callable[..., Awaitable[None]]) -> OrderedFeed:
+        # The e-stop listener has every stop by a link of its own; here a flood of them would take its computing time.
+        per_s = STOPS_PER_S if subject.endswith("emergencyStop") else math.inf
+        return OrderedFeed(subject, callback, self._call_soon, per_s)
 
     async def _serve(self, subject: str, queue: str | None, serve: Serve) -> Subscription:
         server = CommandServer(subject, serve, self._read, self._answer, self._call_soon)

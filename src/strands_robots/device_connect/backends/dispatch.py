@@ -21,6 +21,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Generator
 from functools import partial
 from typing import Any
 
+from ...serving.rate_limiter import RateLimiter
 from . import jsonrpc
 
 logger = logging.getLogger(__name__)
@@ -309,19 +310,25 @@ class OrderedFeed:
         subject: for the log.
         handler: called with what ``accept`` was given.
         call_soon: has a function called on the feed's loop; ``accept`` may be called from the threads that it may.
+        per_s: how many messages are taken in a second; those beyond are dropped at once.
     """
 
-    def __init__(self, subject: str, handler: Callable[..., Awaitable[None]], call_soon: CallSoon) -> None:
+    def __init__(
+        self, subject: str, handler: Callable[..., Awaitable[None]], call_soon: CallSoon, per_s: float = math.inf
+    ) -> None:
         self._subject = subject
         self._handler = handler
         self._arrived = asyncio.Event()
         self._backlog = Backlog(partial(call_soon, self._arrived.set), MAX_EVENTS, MAX_WAITING_BYTES)
+        self._limit = RateLimiter(per_s, burst=per_s) if per_s < math.inf else None
         self._log = Throttled(logger)
         self._task = asyncio.ensure_future(self._work())
 
     def accept(self, *message: Any) -> None:
         """Take a message, whose bytes come first, for the handler."""
-        if self._backlog.push(message, len(message[0])):
+        if self._limit is not None and not self._limit.admit():
+            self._log.warning("too many messages on %s; dropped the latest", self._subject)
+        elif self._backlog.push(message, len(message[0])):
             self._log.warning("the handler of %s does not keep up; dropped the oldest messages", self._subject)
 
     async def close(self) -> None:

@@ -30,6 +30,7 @@ class NatsBackend(Backend):
     def __init__(self, link: LinkConfig, *, open_ended: bool = False) -> None:
         super().__init__(link, open_ended=open_ended)
         self._connection: NatsConnection | None = None
+        self._listening: list[Undo] = []
         self._closing = False
 
     async def connect(
@@ -98,6 +99,21 @@ class NatsBackend(Backend):
         payload: bytes = answer.data
         return payload
 
+    async def listen(self, subject: str, sink: Callable[[bytes, str], None]) -> None:
+        """Have ``sink(data, subject)`` called on the loop as each message arrives.
+
+        It lasts until ``close``, and ``sink`` returns at once. Unlike ``subscribe`` it keeps no backlog.
+
+        Raises:
+            NotConnectedError: not connected.
+            SubscribeError: the subject is malformed.
+        """
+
+        def take(message: Msg) -> None:
+            sink(message.data, message.subject)
+
+        self._listening.append(await self._subscribed(subject, "", take))
+
     async def flush(self) -> None:
         """Wait until the server has everything sent so far, subscriptions too."""
         if self.is_connected:
@@ -109,6 +125,9 @@ class NatsBackend(Backend):
     async def close(self) -> None:
         """Unsubscribe, send what is pending, and leave the connection."""
         self._closing = True
+        listening, self._listening = self._listening, []
+        for undo in listening:
+            await undo()
         await self._unsubscribe_all()
         await self.flush()
         connection, self._connection = self._connection, None
@@ -152,11 +171,14 @@ class NatsBackend(Backend):
                 matched = (message.subject,) if with_subject else ()
                 consumer.accept(message.data, *matched, message.reply or None)
 
+        return await self._subscribed(subject, queue or "", feed)
+
+    async def _subscribed(self, subject: str, queue: str, sink: Callable[[Msg], None]) -> Undo:
         # Without a connection this raises.
         connected, connection = self._connected, self._connection
         assert connected is not None and connection is not None
         try:
-            return await connection.subscribe(subject, queue or "", feed)
+            return await connection.subscribe(subject, queue, sink)
         except nats.errors.Error as error:
             raise SubscribeError(f"cannot subscribe to {subject}: {error}") from error
 

@@ -21,9 +21,10 @@ import nats.errors
 from device_connect_edge.messaging.exceptions import AuthenticationError, MessagingConnectionError
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.aio.subscription import Subscription
 
 from ...utils import redacted
-from ._compat import EncryptedClient
+from ._compat import EncryptedClient, direct_parser
 from .config import LinkConfig
 from .dispatch import Throttled
 
@@ -47,7 +48,8 @@ class NatsConnection:
 
     def __init__(self, link: LinkConfig, sign: Sign | None) -> None:
         self.link = link
-        self.client = Client()
+        self.client = EncryptedClient() if link.encrypted else Client()
+        self._parser = direct_parser(self.client)
         self._sign = sign
         self._users: dict[object, OnLink] = {}
         self._opening: asyncio.Task[None] | None = None
@@ -94,16 +96,29 @@ class NatsConnection:
             nats.errors.Error: the server would refuse it.
         """
         if queue:
-            subscription = await self.client.subscribe(subject, queue=queue, cb=_handing(lambda: (sink,)))
-            return partial(_unsubscribe, subscription)
+            return partial(self._unsubscribe, await self._subscribe(subject, queue, sink))
         async with self._declaring:
             topic = self._topics.get(subject)
             if topic is None:
                 topic = _Topic()
-                topic.subscription = await self.client.subscribe(subject, cb=_handing(lambda: topic.sinks))
+                topic.subscription = await self._subscribe(subject, "", topic.accept)
                 self._topics[subject] = topic
             topic.sinks = (*topic.sinks, sink)
         return partial(self._forget, subject, topic, sink)
+
+    async def _subscribe(self, subject: str, queue: str, sink: Sink) -> Subscription:
+        async def on_message(message: Msg) -> None:
+            sink(message)
+
+        subscription = await self.client.subscribe(subject, queue=queue, cb=on_message)
+        self._parser.hand_over(subscription, sink)
+        return subscription
+
+    async def _unsubscribe(self, subscription: Subscription) -> None:
+        self._parser.forget(subscription)
+        # A closed connection has dropped its subscriptions already.
+        with contextlib.suppress(nats.errors.Error):
+            await subscription.unsubscribe()
 
     async def _forget(self, subject: str, topic: _Topic, sink: Sink) -> None:
         async with self._declaring:
@@ -111,7 +126,7 @@ class NatsConnection:
             if topic.sinks or self._topics.get(subject) is not topic:
                 return
             del self._topics[subject]
-            await _unsubscribe(topic.subscription)
+            await self._unsubscribe(topic.subscription)
 
     async def _open(self) -> None:
         link, problems = self.link, list[str]()
@@ -134,7 +149,6 @@ class NatsConnection:
             options["user_jwt_cb"] = lambda: bytearray(link.jwt.encode())
             options["signature_cb"] = self._sign or partial(_signed, link.nkey_seed)
         if link.encrypted:
-            self.client = EncryptedClient()
             options["tls"] = _tls_context(link)
         where = ", ".join(link.connect) or DEFAULT_URL
         try:
@@ -172,6 +186,11 @@ class _Topic:
         self.sinks: tuple[Sink, ...] = ()
         self.subscription: Any = None
 
+    def accept(self, message: Msg) -> None:
+        """Hand a message to every sink."""
+        for sink in self.sinks:
+            sink(message)
+
 
 PROBLEMS_KEPT = 8
 """Errors of a connection that are kept, to name the last one where it cannot be made."""
@@ -190,20 +209,6 @@ def connection_for(link: LinkConfig, sign: Sign | None = None) -> NatsConnection
     if key not in _CONNECTIONS:
         _CONNECTIONS[key] = NatsConnection(link, None)
     return _CONNECTIONS[key]
-
-
-def _handing(sinks: Callable[[], tuple[Sink, ...]]) -> Callable[[Msg], Awaitable[None]]:
-    async def on_message(message: Msg) -> None:
-        for sink in sinks():
-            sink(message)
-
-    return on_message
-
-
-async def _unsubscribe(subscription: Any) -> None:
-    # A closed connection has dropped its subscriptions already.
-    with contextlib.suppress(nats.errors.Error):
-        await subscription.unsubscribe()
 
 
 def _signed(seed: str, nonce: str | bytes) -> bytes:

@@ -1,0 +1,124 @@
+"""The parser of NATS frames that hands messages over without a queue."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nats.aio.client import Client
+from nats.errors import ProtocolError
+
+from strands_robots.device_connect.backends._compat import DirectParser
+
+OWN, OTHER = 1, 2
+
+
+class RecordingClient(Client):
+    """A client that records what nats-py's own parser gives it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.taken: list[Any] = []
+        self.parser: DirectParser
+
+    async def _process_msg(self, sid: int, subject: bytes, reply: bytes, data: bytes, headers: Any) -> None:
+        self.taken.append((sid, subject.decode(), reply.decode(), data, headers))
+
+    async def _process_ping(self) -> None:
+        self.taken.append("ping")
+
+    async def _process_pong(self) -> None:
+        self.taken.append("pong")
+
+    async def _process_err(self, err_msg: str) -> None:
+        self.taken.append(err_msg)
+        self.parser.reset()
+
+
+class FakeSubscription:
+    """The number of a subscription."""
+
+    def __init__(self, number: int) -> None:
+        self._id = number
+
+
+def parser() -> tuple[DirectParser, RecordingClient, list[Any]]:
+    client, received = RecordingClient(), list[Any]()
+    made = client.parser = DirectParser(client)
+    subscription: Any = FakeSubscription(OWN)
+    made.hand_over(subscription, lambda message: received.append((message.subject, message.reply, message.data)))
+    return made, client, received
+
+
+def framed(sid: int, subject: str, data: bytes, reply: str = "") -> bytes:
+    return b"MSG %s %d %s%d\r\n%s\r\n" % (
+        subject.encode(),
+        sid,
+        f"{reply} ".encode() if reply else b"",
+        len(data),
+        data,
+    )
+
+
+FRAMES = (
+    framed(OWN, "a.b", b"one")
+    + b"PING\r\n"
+    + framed(OWN, "a.c", b"MSG x 1 3\r\nabc\r\n", "_INBOX.1")
+    + framed(OTHER, "_INBOX.2", b"answer")
+    + b"HMSG a.b 1 12 17\r\nNATS/1.0\r\n\r\nhello\r\n"
+    + framed(OWN, "a.b", b"")
+    + b"+OK\r\nPONG\r\n"
+    + framed(OWN, "a.b", bytes(70_000))
+)
+
+
+@given(cuts=st.lists(st.integers(1, len(FRAMES) - 1), max_size=12))
+async def test_frames_cut_anywhere_are_handed_over_whole_and_in_order(cuts: list[int]) -> None:
+    made, client, received = parser()
+    ends = [*sorted(set(cuts)), len(FRAMES)]
+    for begin, end in zip([0, *ends], ends, strict=False):
+        await made.parse(FRAMES[begin:end])
+    big = ("a.b", "", bytes(70_000))
+    assert received == [("a.b", "", b"one"), ("a.c", "_INBOX.1", b"MSG x 1 3\r\nabc\r\n"), ("a.b", "", b""), big]
+    answer = (OTHER, "_INBOX.2", "", b"answer", None)
+    assert client.taken == ["ping", answer, (OWN, "a.b", "", b"hello", b"NATS/1.0\r\n\r\n"), "pong"]
+
+
+async def test_sink_that_raises_loses_no_message_behind_it(caplog: pytest.LogCaptureFixture) -> None:
+    made, _, received = parser()
+    subscription: Any = FakeSubscription(3)
+
+    def fail(message: object) -> None:
+        raise RuntimeError("a fault")
+
+    made.hand_over(subscription, fail)
+    await made.parse(framed(3, "x", b"") + framed(OWN, "a.b", b"next"))
+    assert [data for *_, data in received] == [b"next"]
+    assert "a message on x was lost" in caplog.text
+
+
+async def test_what_a_lost_connection_left_is_forgotten() -> None:
+    made, _, received = parser()
+    await made.parse(framed(OWN, "a.b", b"half")[:-3])
+    made.reset()
+    await made.parse(b"-ERR 'stale connection'\r\n" + framed(OWN, "a.b", b"of the old one"))
+    await made.parse(framed(OWN, "a.b", b"new"))
+    assert [data for *_, data in received] == [b"new"]
+
+
+async def test_subscription_that_ended_is_handed_over_no_more() -> None:
+    made, client, received = parser()
+    subscription: Any = FakeSubscription(OWN)
+    made.forget(subscription)
+    await made.parse(framed(OWN, "a.b", b"late"))
+    assert not received
+    assert client.taken == [(OWN, "a.b", "", b"late", None)]
+
+
+@pytest.mark.parametrize("line", [b"MSG a 1 -3\r\n", b"MSG a\r\n", b"HMSG a 1 b 2 3 x\r\n", b"\r\n", b"NOISE\r\n"])
+async def test_another_protocol_is_an_error(line: bytes) -> None:
+    made, _, _ = parser()
+    with pytest.raises(ProtocolError):
+        await made.parse(line)
