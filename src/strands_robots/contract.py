@@ -48,7 +48,8 @@ class RolloutEvent:
     ``kind`` is started, step or finished; ``state`` of a finished one is completed, stopped or error.
     ``clamped_steps`` counts the actions that the robot's speed limit held back.
     ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units. ``follows_instruction``
-    is False for a policy that moves by itself, whatever it was told, as ``mock`` does.
+    is False for a policy that moves by itself, whatever it was told, as ``mock`` does. ``loop`` of a finished one has
+    the figures of its control loop.
     """
 
     kind: Literal["started", "step", "finished"]
@@ -63,6 +64,7 @@ class RolloutEvent:
     observation: Mapping[str, float] = field(default_factory=dict)
     action: Mapping[str, float] = field(default_factory=dict)
     follows_instruction: bool = True
+    loop: Mapping[str, float] = field(default_factory=dict)
 
 
 Observer = Callable[[RolloutEvent], None]

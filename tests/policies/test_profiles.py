@@ -111,7 +111,7 @@ def test_its_name_is_a_provider_on_every_network_and_in_the_devices_description(
         ({"policy_host": "10.0.0.1"}, "policy_host must be 'localhost'"),
         ({"policy_port": 9001}, "policy_port must be 9000"),
         ({"pretrained_name_or_path": "lerobot/act"}, "pretrained_name_or_path must be ''"),
-        ({"control_frequency": 50.0}, "control_frequency is set by the profile"),
+        ({"control_frequency": 25.0}, "control_frequency is set by the profile"),
         ({"device": "cuda"}, "device is set by the profile pick alone"),
     ],
 )
@@ -119,8 +119,8 @@ def test_a_caller_may_repeat_a_profile_and_not_change_it(file: Path, options: di
     pick = load_profiles(file)["pick"]
     with pytest.raises(ValidationError, match=words):
         pick.loop_options(options, 50.0)
-    same = {"policy_host": "localhost", "policy_port": 9000, "n_steps": 3, "control_frequency": 25.0}
-    assert pick.loop_options(same, 50.0) == {"n_steps": 3, "control_frequency": 25.0}
+    same = {"policy_host": "localhost", "policy_port": 9000, "n_steps": 3, "control_frequency": 50.0}
+    assert pick.loop_options(same, 50.0) == {"n_steps": 3, "control_frequency": 50.0}
 
 
 class Spy:
@@ -147,7 +147,9 @@ class Spy:
 
 
 RANGES = {"pan": (-math.pi, math.pi), "lift": (-1.0, 1.0)}
-ARM = RobotFacts("arm", {"pan": 0.0, "lift": 0.0}, ["pan", "lift"], dict.fromkeys(("pan", "lift"), "radians"))
+ARM = RobotFacts(
+    "arm", {"pan": 0.0, "lift": 0.0}, ["pan", "lift"], dict.fromkeys(("pan", "lift"), "radians"), rate=10.0
+)
 
 
 def profile(**changed: Any) -> Profile:
@@ -156,7 +158,7 @@ def profile(**changed: Any) -> Profile:
 
 
 def profiled(inner: Any, **changed: Any) -> ProfiledPolicy:
-    policy = ProfiledPolicy(profile(**changed), inner)
+    policy = ProfiledPolicy(profile(**changed), inner, now=lambda: 0.0, inline=True)
     policy.fit(ARM)
     policy.reset("wave", RANGES)
     return policy
@@ -165,11 +167,11 @@ def profiled(inner: Any, **changed: Any) -> ProfiledPolicy:
 def test_the_policy_sees_the_profiles_keys_in_its_order_and_unit_and_nothing_else() -> None:
     spy = Spy({"pan": 90.0, "lift": 0.0})
     policy = profiled(spy)
-    actions = policy.act({"battery": 80.0, "pan": math.pi / 2, "lift": 0.5, "flag": True})
+    action = policy.act({"battery": 80.0, "pan": math.pi / 2, "lift": 0.5, "flag": True})
     assert list(spy.seen[0].items()) == [("lift", pytest.approx(math.degrees(0.5))), ("pan", pytest.approx(90.0))]
     assert list(spy.ranges) == ["lift", "pan"]
     assert spy.ranges["pan"] == pytest.approx((-180.0, 180.0))
-    assert actions == [{"lift": 0.0, "pan": pytest.approx(math.pi / 2)}]
+    assert action == {"lift": 0.0, "pan": pytest.approx(math.pi / 2)}
 
 
 def test_the_task_of_the_profile_outranks_the_instruction() -> None:
@@ -178,19 +180,23 @@ def test_the_task_of_the_profile_outranks_the_instruction() -> None:
     assert spy.task == "pick up the cube"
 
 
+def played(policy: ProfiledPolicy, steps: int) -> list[dict[str, float]]:
+    """The actions of so many control steps; a step without one is an empty action."""
+    return [dict(policy.act({"pan": 0.0, "lift": 0.0}) or {}) for _ in range(steps)]
+
+
 def test_no_more_of_a_chunk_is_played_than_the_horizon() -> None:
-    chunk = [{"pan": float(step), "lift": 0.0} for step in range(20)]
-    actions = profiled(Spy(chunk), horizon=5).act({"pan": 0.0, "lift": 0.0})
-    assert actions is not None
-    assert len(actions) == 5
+    chunks = [[{"pan": float(10 * chunk + step), "lift": 0.0} for step in range(20)] for chunk in range(2)]
+    policy = profiled(Spy(*chunks), horizon=3)
+    degrees = [math.degrees(action["pan"]) for action in played(policy, 6)]
+    assert degrees == pytest.approx([0.0, 1.0, 2.0, 10.0, 11.0, 12.0])
 
 
-def test_a_jump_at_the_seam_is_bounded_by_the_profiles_speed() -> None:
+def test_a_jump_at_the_seam_is_bounded_by_the_profiles_speed_and_counted() -> None:
     policy = profiled(Spy([{"pan": 180.0, "lift": 0.0}] * 3), max_speed=0.5)
-    actions = policy.act({"pan": 0.0, "lift": 0.0})
-    assert actions is not None
     # Half of a range of two pi a second, at 10 Hz.
-    assert [action["pan"] for action in actions] == pytest.approx([math.pi / 10 * step for step in (1, 2, 3)])
+    assert [action["pan"] for action in played(policy, 3)] == pytest.approx([math.pi / 10 * n for n in (1, 2, 3)])
+    assert policy.counts()["speed_limited_steps"] == 3
 
 
 @pytest.mark.parametrize(
@@ -299,8 +305,8 @@ def test_a_profile_moves_an_arm_at_its_rate_with_each_value_on_its_own_joint(
     answer = arm.start_task("anything", policy_provider="pick")
     assert answer["status"] == "success", answer
     eventually(lambda: arm.get_task_status()["task_status"] == "completed")
-    # One step at 25 Hz, with the speed bound of the profile: a whole range in a second.
-    assert arm.device.writes[0].action == pytest.approx({"pan.pos": 2.0, "lift.pos": 2.0, "grip.pos": 14.0})
+    # One step at 50 Hz, with the speed bound of the profile: a whole range in a second.
+    assert arm.device.writes[0].action == pytest.approx({"pan.pos": 6.0, "lift.pos": 6.0, "grip.pos": 12.0})
     assert list(spies[0].seen[0]) == ["lift.pos", "pan.pos", "grip.pos"]
     assert spies[0].task == "pick up the cube"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Optional
 
 from device_connect_edge.types import DeviceIdentity
 
@@ -78,7 +78,14 @@ class RobotDeviceDriver(RobotDriver):
 
     @emit()
     async def taskComplete(
-        self, instruction: str, steps: int, duration: float, state: str = "completed", error: str = ""
+        self,
+        instruction: str,
+        steps: int,
+        duration: float,
+        state: str = "completed",
+        error: str = "",
+        *,
+        loop: Optional[dict[str, Any]] = None,  # noqa: UP045 - the framework reads no `X | None`
     ) -> None:
         """A task ended.
 
@@ -88,6 +95,7 @@ class RobotDeviceDriver(RobotDriver):
             duration: Seconds from its start to its end
             state: How it ended: completed, stopped or error
             error: What went wrong, when state is error
+            loop: Figures of the control loop, such as underruns and latency_p99_ms
         """
 
     @emit(labels={"modality": "motion"})
@@ -156,4 +164,5 @@ class RobotDeviceDriver(RobotDriver):
                 duration=event.elapsed_s,
                 state=event.state,
                 error=event.error,
+                loop=dict(event.loop),
             )

@@ -80,7 +80,14 @@ class SimulationDeviceDriver(RobotDriver):
 
     @emit()
     async def policyComplete(
-        self, robot_name: str, instruction: str, steps: int, state: str = "completed", error: str = ""
+        self,
+        robot_name: str,
+        instruction: str,
+        steps: int,
+        state: str = "completed",
+        error: str = "",
+        *,
+        loop: Optional[dict[str, Any]] = None,  # noqa: UP045 - the framework reads no `X | None`
     ) -> None:
         """A policy ended.
 
@@ -90,6 +97,7 @@ class SimulationDeviceDriver(RobotDriver):
             steps: Steps executed
             state: How it ended: completed, stopped or error
             error: What went wrong, when state is error
+            loop: Figures of the control loop, such as underruns and latency_p99_ms
         """
 
     @emit()
@@ -200,4 +208,5 @@ class SimulationDeviceDriver(RobotDriver):
                 steps=event.step,
                 state=event.state,
                 error=event.error,
+                loop=dict(event.loop),
             )

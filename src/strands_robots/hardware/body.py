@@ -14,7 +14,7 @@ from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import write_to_servos
 from strands_robots.hardware.device_facts import require_port
 from strands_robots.hardware.speed import default_speeds
-from strands_robots.policies.base import Action, checked_speeds, numbers
+from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.stopping import StopLevel
 from strands_robots.utils import ValidationError, number, shown
@@ -339,11 +339,6 @@ class DeviceBody:
         except BaseException:
             self._limp = limp
             raise
-
-
-def is_velocity(key: str) -> bool:
-    """True for an action key that is a velocity."""
-    return key.endswith((".vel", "_vel", ".velocity"))
 
 
 def _torque_buses(device: Any) -> dict[str, tuple[Any, str | None]]:

@@ -18,11 +18,11 @@ from strands_robots.audit import log_safety_event
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
-from strands_robots.hardware.body import READ_TRIES, DeviceBody, is_velocity
+from strands_robots.hardware.body import READ_TRIES, DeviceBody
 from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
 from strands_robots.hardware.settling import Settling, checked_rest_pose
 from strands_robots.policies import create_policy, resolve_provider
-from strands_robots.policies.base import checked_action, numbers
+from strands_robots.policies.base import checked_action, is_velocity, numbers
 from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
@@ -588,6 +588,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             "policy": "" if task is None else task.policy_name,
             "step_count": 0 if task is None else task.step_count,
             "clamped_steps": 0 if task is None else task.clamped_steps,
+            "loop": {} if task is None else task.counts,
             "duration": 0.0 if task is None else round(task.elapsed_s, 3),
             "error": "" if task is None else task.error,
             **({} if self._settling is None else {"settling": self._settling.state}),

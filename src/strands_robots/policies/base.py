@@ -47,6 +47,17 @@ class Policy(Protocol):
         """Free the policy's resources. Called once, also after a failed reset."""
 
 
+@runtime_checkable
+class Paced(Protocol):
+    """Policy that plays chunks in time with the control loop."""
+
+    preparing: bool
+    """True until it has its first action: the duration of the task has not begun yet."""
+
+    def miss(self, ticks: int) -> None:
+        """Skip the actions of control steps that came too late to be made."""
+
+
 def follows_instruction(policy: Policy) -> bool:
     """Return False for a policy that moves by itself, whatever it was told."""
     return getattr(policy, "follows_instruction", True) is not False
@@ -75,6 +86,11 @@ def numbers(observation: Mapping[str, object]) -> dict[str, float]:
         if isinstance(scalar, int | float) and not isinstance(scalar, bool) and math.isfinite(scalar):
             finite[key] = float(scalar)
     return finite
+
+
+def is_velocity(key: str) -> bool:
+    """Return True for an action key that is a velocity."""
+    return key.endswith((".vel", "_vel", ".velocity"))
 
 
 def _plain(value: object) -> object:

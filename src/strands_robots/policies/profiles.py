@@ -56,6 +56,7 @@ class Profile:
         dataset: directory of the dataset that it was trained on, for what ``meta/info.json`` states.
         state: the robot's observation keys in the policy's order.
         action: the robot's action keys in the policy's order.
+        environment: observation keys of what is around the robot, in the policy's order.
         units: unit of the policy's numbers by key; the entry ``""`` is that of all others.
         rate: control steps a second at which the data was recorded; None where nothing states it.
         horizon: actions that are played of each answer; None for all.
@@ -75,6 +76,7 @@ class Profile:
     url: str = ""
     token_file: str = ""
     dataset: str = ""
+    environment: tuple[str, ...] = ()
     cameras: tuple[CameraMap, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     rate: float | None = None
@@ -98,7 +100,7 @@ class Profile:
 
         Args:
             options: the caller's.
-            hz: the robot's rate, which is that of a profile that states none.
+            hz: the robot's rate, at which it is controlled.
 
         Raises:
             ValidationError: an option that differs from the profile, or that is the profile's alone.
@@ -109,11 +111,10 @@ class Profile:
             "policy_port": address.port or 0,
             "pretrained_name_or_path": self.checkpoint,
         }
-        rate = min(self.rate or hz, hz)
         for option, value in options.items():
             if option == "n_steps" or (option == "policy_port" and value == 0):
                 continue
-            if option == "control_frequency" and value == rate:
+            if option == "control_frequency" and value == hz:
                 continue
             if option not in own:
                 raise ValidationError(f"{option} is set by the profile {self.name} alone.")
@@ -122,7 +123,7 @@ class Profile:
                     f"{option} must be {own[option]!r}, as in the profile {self.name}, not {shown(value)}."
                 )
         steps = {"n_steps": options["n_steps"]} if "n_steps" in options else {}
-        return {**steps, "control_frequency": rate}
+        return {**steps, "control_frequency": hz}
 
 
 def load_profiles(path: Path) -> dict[str, Profile]:
@@ -266,6 +267,7 @@ _ENTRIES: dict[str, Callable[[str, object], Any]] = {
     "cameras": _cameras,
     "state": _order,
     "action": _order,
+    "environment": _order,
     "units": _units,
     "rate": lambda name, value: number(name, value, low=0.1, high=RATE_MAX),
     "chunk": lambda name, value: whole(name, value, low=1, high=10_000),

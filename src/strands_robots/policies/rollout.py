@@ -20,6 +20,7 @@ from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.base import (
     Action,
+    Paced,
     Policy,
     PolicyError,
     Ranges,
@@ -28,6 +29,7 @@ from strands_robots.policies.base import (
     follows_instruction,
     numbers,
 )
+from strands_robots.policies.loop_counts import Counted
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
@@ -208,6 +210,8 @@ class Rollout:
         self.missed_ticks = 0
         self.clamped_steps = 0
         """Actions that the body's speed limit held back."""
+        self.out_of_range_steps = 0
+        """Actions with a target beyond the body's range, where it was put."""
         self._body = body
         self._policy = policy
         self._permit = permit
@@ -221,6 +225,7 @@ class Rollout:
         self._held_back: Action = {}
         self._stop_requested = threading.Event()
         self._begun = threading.Event()
+        self._paced = policy if isinstance(policy, Paced) else None
         self.follows_instruction = follows_instruction(policy)
         """False for a policy that moves by itself, whatever it was told."""
         self._started_at: float | None = None
@@ -246,6 +251,16 @@ class Rollout:
             return 0.0
         return (self._clock.now() if self._ended_at is None else self._ended_at) - self._started_at
 
+    @property
+    def counts(self) -> dict[str, float]:
+        """Figures of the loop, as status, events and recordings have them."""
+        own = {
+            "missed_ticks": self.missed_ticks,
+            "clamped_steps": self.clamped_steps,
+            "out_of_range_steps": self.out_of_range_steps,
+        }
+        return {**own, **(self._policy.counts() if isinstance(self._policy, Counted) else {})}
+
     def row(self) -> dict[str, Any]:
         """Return the rollout as a row of ``list_policies_running``."""
         return {
@@ -254,6 +269,7 @@ class Rollout:
             "policy": self.policy_name,
             "step": self.step_count,
             "elapsed_s": round(self.elapsed_s, 3),
+            **({"loop": self.counts} if isinstance(self._policy, Counted) else {}),
         }
 
     def not_begun(self, within: float = START_S) -> str:
@@ -351,7 +367,10 @@ class Rollout:
                     return "completed"
                 chunk.extend([actions] if isinstance(actions, Mapping) else actions)
             if chunk:
-                action = self._limited(checked_action(chunk.popleft(), bounds), observation)
+                wanted = chunk.popleft()
+                checked = checked_action(wanted, bounds)
+                self.out_of_range_steps += any(checked[key] != wanted[key] for key in checked)
+                action = self._limited(checked, observation)
                 sent = self._body.send_action(action, self._permit)
                 self.step_count += 1
                 self.clamped_steps += bool(self._held_back)
@@ -359,6 +378,9 @@ class Rollout:
             elif self._held_back:
                 # The policy waits for the end of an action that the speed limit has not let through yet.
                 self._body.send_action(self._limited(self._held_back, observation), self._permit)
+            if self._paced is not None and self._paced.preparing:
+                # The first inference is part of loading.
+                started, tick = self._clock.now(), 0
             tick = self._next(tick, started)
             self._clock.wait(started + tick * self._period, self._stop_requested)
         return "stopped"
@@ -377,6 +399,8 @@ class Rollout:
     def _next(self, tick: int, started: float) -> int:
         late = int((self._clock.now() - started) / self._period) - tick
         self.missed_ticks += max(late, 0)
+        if self._paced is not None and late > 0:
+            self._paced.miss(late)
         return tick + 1 + max(late, 0)
 
     def _observe(self) -> dict[str, Any]:
@@ -413,6 +437,7 @@ class Rollout:
                 clamped_steps=self.clamped_steps,
                 elapsed_s=self.elapsed_s,
                 follows_instruction=self.follows_instruction,
+                loop=self.counts if kind == "finished" else {},
                 **more,
             )
         )

@@ -164,4 +164,5 @@ class RobotRecording:
             self._take(f"{kind}Started", {"instruction": event.instruction, "policy_provider": event.policy, **robot})
         else:
             end = {"instruction": event.instruction, "steps": event.step, "duration": event.elapsed_s}
-            self._take(f"{kind}Complete", {**end, "state": event.state, "error": event.error, **robot})
+            loop = {"loop": dict(event.loop)} if event.loop else {}
+            self._take(f"{kind}Complete", {**end, "state": event.state, "error": event.error, **loop, **robot})

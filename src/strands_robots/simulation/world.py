@@ -649,6 +649,7 @@ def _row(rollout: Rollout) -> dict[str, Any]:
         "state": rollout.state,
         "error": rollout.error,
         "clamped_steps": rollout.clamped_steps,
+        "loop": rollout.counts,
     }
 
 
