@@ -63,7 +63,12 @@ def test_the_view_keeps_the_last_joints_and_task() -> None:
 
 def test_each_change_is_one_line_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     idle = event("stateUpdate", running_policies={})
-    print_changes(Screen(), iter([idle, idle, event("policyStarted", instruction="a", policy_provider="mock"), idle]))
+    print_changes(
+        Screen(),
+        "arm-1",
+        "idle",
+        iter([idle, idle, event("policyStarted", instruction="a", policy_provider="mock"), idle]),
+    )
     assert capsys.readouterr().out.splitlines() == ["arm-1: idle", "arm-1: started 'a' with mock", "arm-1: idle"]
 
 
@@ -85,12 +90,13 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 @pytest.mark.parametrize(
-    ("name", "beats", "after"), [("stateUpdate", False, 3.0), ("tick", False, 15.0), ("", True, 15.0), ("", False, 6.0)]
+    ("name", "beats", "every", "after"),
+    [("", True, 1.0, 3.0), ("stateUpdate", False, 1.0, 3.0), ("tick", False, 5.0, 15.0), ("", False, 5.0, 6.0)],
 )
 def test_device_that_misses_three_beats_is_silent_and_exit_3(
-    clock: Clock, name: str, beats: bool, after: float
+    clock: Clock, name: str, beats: bool, every: float, after: float
 ) -> None:
-    signs = SignsOfLife(lambda: 100.0 if beats else None)
+    signs = SignsOfLife(lambda: 100.0 if beats else None, lambda: every)
     if name:
         signs.take(event(name))
     ages = []
@@ -100,6 +106,14 @@ def test_device_that_misses_three_beats_is_silent_and_exit_3(
     assert failure.value.code is Exit.SILENT
     assert ages[-1] == pytest.approx(after, abs=0.2)
     assert clock.now == pytest.approx(100 + after, abs=0.2)
+
+
+def test_view_starts_with_the_task_of_the_status() -> None:
+    view = DeviceView("arm-1", {})
+    view.take_state({"task_status": "running", "instruction": "wave", "step_count": 3})
+    assert view.task == "running: 'wave', step 3"
+    view.take_state({"joints": {"pan": 0.5}})
+    assert view.task == "running: 'wave', step 3"
 
 
 def test_everything_that_has_arrived_is_in_the_next_redraw(clock: Clock) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+import threading
 import time
-from collections.abc import Callable, Coroutine
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -16,10 +17,9 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from strands_robots.device_connect import base_driver
 from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
-from strands_robots.device_connect.telemetry import paced, step_limiter
+from strands_robots.device_connect.telemetry import step_limiter
 from strands_robots.envelope import error, success
 from strands_robots.safety.approval import Grants, state_dir
 from strands_robots.utils import ValidationError
@@ -197,30 +197,52 @@ async def test_a_faster_loop_is_told_at_50_hz(robot: ToyRobot) -> None:
         assert abs(len(bench.of("streamStep")) - passing) <= 3
 
 
-async def test_state_is_told_ten_times_a_second_while_busy_and_once_while_idle(
-    robot: ToyRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rates: list[Callable[[], float]] = []
-
-    def noted(hz: Callable[[], float], *more: Any) -> Coroutine[Any, Any, None]:
-        rates.append(hz)
-        return paced(hz, *more)
-
-    monkeypatch.setattr(base_driver, "paced", noted)
+async def test_state_is_told_when_it_changes_at_most_ten_times_a_second(robot: ToyRobot) -> None:
     async with DriverBench(drive(robot)) as bench:
-        (rate,) = rates
-        assert rate() == 1.0
+        await bench.until(lambda: bench.of("stateUpdate"))
         began = time.monotonic()
         await bench.call("execute", instruction="wave", duration=300.0)
         await bench.until(lambda: sum(e["task_status"] == "running" for e in bench.of("stateUpdate")) >= 8)
-        assert rate() == 10.0
-        # Besides its beat it is told at connecting and when the task is asked for and has begun.
-        assert len(bench.of("stateUpdate")) <= (time.monotonic() - began) * 10.0 + 4
         await bench.call("stop")
-        await bench.until(lambda: bench.of("stateUpdate")[-1]["task_status"] == "stopped" and rate() == 1.0)
-        told, since = len(bench.of("stateUpdate")), time.monotonic()
-        await bench.until(lambda: len(bench.of("stateUpdate")) >= told + 2)
-        assert len(bench.of("stateUpdate")) - told <= time.monotonic() - since + 4
+        await bench.until(lambda: bench.of("stateUpdate")[-1]["task_status"] == "stopped")
+        told = bench.of("stateUpdate")
+        assert len(told) <= (time.monotonic() - began) * 10.0 + 2
+        assert all(one != other for one, other in pairwise(told))
+
+
+async def test_idle_robot_is_told_once_and_read_on_one_worker(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.until(lambda: bench.of("stateUpdate"))
+        looks: list[str] = []
+        robot.before["get_task_status"] = lambda: looks.append(threading.current_thread().name)
+        await bench.until(lambda: len(looks) >= 2)
+        assert len(bench.of("stateUpdate")) == 1
+
+
+async def test_task_that_a_foreign_robot_starts_by_itself_is_told() -> None:
+    class Foreign:
+        tool_name_str, status = "foreign", "idle"
+
+        def start_task(self, instruction: str, **_: Any) -> Any:
+            return success("started")
+
+        def stop_task(self) -> Any:
+            return success("stopped", stopped=True)
+
+        def get_task_status(self) -> Any:
+            return {"task_status": self.status}
+
+        def get_features(self) -> Any:
+            return success("none")
+
+    foreign = Foreign()
+    async with DriverBench(drive(foreign)) as bench:
+        await bench.until(lambda: bench.of("stateUpdate"))
+        foreign.status = "running"
+        await bench.until(lambda: bench.of("taskStarted"))
+        foreign.status = "completed"
+        await bench.until(lambda: bench.of("taskComplete"))
+        assert [each["task_status"] for each in bench.of("stateUpdate")] == ["idle", "running", "completed"]
 
 
 async def test_no_event_carries_a_number_that_json_cannot(robot: ToyRobot) -> None:

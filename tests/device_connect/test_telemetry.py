@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.device_connect import telemetry
-from strands_robots.device_connect.telemetry import CATCH_UP, RolloutPump, numbers, paced, step_limiter
+from strands_robots.device_connect.telemetry import CATCH_UP, RolloutPump, numbers, step_limiter
 
 
 class Clock:
@@ -109,41 +108,6 @@ def test_observer_never_raises_after_the_loop_is_gone() -> None:
         return RolloutPump(_nothing, 50.0)
 
     asyncio.run(make()).observe(event("started"))
-
-
-async def test_paced_keeps_its_rate_and_skips_missed_turns() -> None:
-    beats: list[float] = []
-
-    async def act() -> None:
-        beats.append(time.monotonic())
-        if len(beats) == 5:
-            await asyncio.sleep(0.2)
-
-    began = time.monotonic()
-    task = asyncio.create_task(paced(lambda: 50.0, act))
-    await until(lambda: len(beats) >= 25)
-    task.cancel()
-    # However late the machine is: no more than fit into its time without the hold-up, the first and the one after it.
-    assert len(beats) <= (beats[-1] - began - 0.2) * 50.0 + 2.01
-
-
-async def test_paced_wakes_at_once_and_always_honours_a_cancel() -> None:
-    beats = 0
-
-    async def act() -> None:
-        nonlocal beats
-        beats += 1
-
-    wake = asyncio.Event()
-    task = asyncio.create_task(paced(lambda: 0.1, act, wake))
-    await until(lambda: beats == 1)
-    wake.set()
-    # At its own beat of 0.1 Hz it would come after 10 s.
-    await until(lambda: beats == 2, within=8)
-    wake.set()
-    task.cancel()
-    await asyncio.wait({task}, timeout=20)
-    assert task.done()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, True, "1", None, [1.0], np.zeros(3), {"position": math.nan}])

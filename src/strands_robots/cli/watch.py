@@ -27,10 +27,12 @@ if TYPE_CHECKING:
 REDRAW_S = 0.07
 """Seconds between two redraws."""
 
-STATE_EVERY_S, HEARTBEAT_EVERY_S = 1.0, 5.0
-"""Seconds between two states of our robots, and between two heartbeats of any device."""
-
 MISSED_BEATS = 3
+"""Beats that are missing in a row when a device counts as silent."""
+
+LATE_S = 2.0
+"""Age in seconds of the last sign of life that is shown in red: our robots give one a second."""
+
 FIRST_SIGN_S = 6.0
 """Seconds in which any live device has sent a first heartbeat."""
 
@@ -69,7 +71,7 @@ def watch(
         limits: dict[str, Range] = {}
         with contextlib.suppress(CliError):  # a device without getFeatures is drawn without its limits
             limits = joint_limits(call_device(fleet, device, "getFeatures", {}, 3.0))
-        signs = SignsOfLife(lambda: fleet.last_heartbeat(device))
+        signs = SignsOfLife(lambda: fleet.last_heartbeat(device), lambda: fleet.beats_every(device))
         with fleet.subscription(device, signs.take):
             frames = follow(signs, longest, device)
             if screen.machine:
@@ -79,26 +81,31 @@ def watch(
             elif screen.live:
                 _draw_live(screen, _present_state(fleet, device, limits), frames)
             else:
-                print_changes(screen, (event for events, _ in frames for event in events))
+                now = _present_state(fleet, device, limits).task
+                print_changes(screen, device, now, (event for events, _ in frames for event in events))
 
 
 class SignsOfLife:
     """Events of one device as they arrive, and the age of its last sign of life.
 
     Args:
-        last_heartbeat: time of the device's last heartbeat in monotonic seconds, or None.
+        last_heartbeat: returns the time of its last heartbeat, or beat that named it, in monotonic seconds, or None.
+        beats_every: returns the seconds between two of those.
     """
 
-    def __init__(self, last_heartbeat: Callable[[], float | None] = lambda: None) -> None:
+    def __init__(
+        self,
+        last_heartbeat: Callable[[], float | None] = lambda: None,
+        beats_every: Callable[[], float] = lambda: 5.0,
+    ) -> None:
         self._last_heartbeat = last_heartbeat
+        self._beats_every = beats_every
         self._events: deque[DeviceEvent] = deque(maxlen=EVENTS_MAX)
         self._began = time.monotonic()
         self._event_at: float | None = None
-        self._reports_state = False
 
     def take(self, event: DeviceEvent) -> None:
         """Keep an event; on the client's thread."""
-        self._reports_state |= event.name == "stateUpdate"
         self._event_at = time.monotonic()
         self._events.append(event)
 
@@ -117,7 +124,7 @@ class SignsOfLife:
         """True when three beats in a row are missing."""
         if self._event_at is None and self._last_heartbeat() is None:
             return self.age_s > FIRST_SIGN_S
-        return self.age_s > MISSED_BEATS * (STATE_EVERY_S if self._reports_state else HEARTBEAT_EVERY_S)
+        return self.age_s > MISSED_BEATS * self._beats_every()
 
 
 class DeviceView:
@@ -131,6 +138,7 @@ class DeviceView:
 
     def take_state(self, state: Mapping[str, Any]) -> None:
         """Update from an answer to getState or getStatus."""
+        self.task = describe_state(state) or self.task
         robots = state.get("robots")
         if isinstance(state.get("joints"), Mapping):
             self._joints[""] = state["joints"]
@@ -148,7 +156,7 @@ class DeviceView:
 
     def draw(self, age_s: float = 0.0) -> RenderableType:
         """Return the device, its task, the age of its last sign of life, and its joints."""
-        late = "bold red" if age_s > 2 * STATE_EVERY_S else "bright_black"
+        late = "bold red" if age_s > LATE_S else "bright_black"
         parts: list[Any] = [
             label(f"{self.device}: {self.task}", "bold"),
             label(f"last heard {age_s:.1f} s ago", late),
@@ -172,8 +180,11 @@ def describe_task(event: DeviceEvent) -> str:
         return f"{state}: {facts.get('instruction', '')!r} after {steps} steps"
     if event.name == "emergencyStop":
         return f"EMERGENCY STOP: {facts.get('reason', '')}"
-    if event.name != "stateUpdate":
-        return ""
+    return describe_state(facts) if event.name == "stateUpdate" else ""
+
+
+def describe_state(facts: Mapping[str, Any]) -> str:
+    """Return the task in a ``stateUpdate`` or an answer to getStatus, or ""."""
     running = facts.get("running_policies")
     if isinstance(running, Mapping):
         tasks = [
@@ -202,9 +213,10 @@ def follow(signs: SignsOfLife, longest: float | None, device: str) -> Iterator[F
         time.sleep(min(REDRAW_S, max(0.0, ends - time.monotonic())))
 
 
-def print_changes(screen: Screen, events: Iterator[DeviceEvent]) -> None:
-    """Print one line for each change of the task."""
-    last = ""
+def print_changes(screen: Screen, device: str, now: str, events: Iterator[DeviceEvent]) -> None:
+    """Print the present task, and one line for each change of it."""
+    screen.say(f"{device}: {now}")
+    last = now
     for event in events:
         task = describe_task(event)
         if task and task != last:

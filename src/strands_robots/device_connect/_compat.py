@@ -23,7 +23,8 @@ from device_connect_edge.messaging.exceptions import AuthenticationError, Messag
 from .. import settings
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
-from .presence import PresenceView
+from .beat import Beating, beat_of
+from .presence import PresenceView, presence_builder
 
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""
@@ -113,6 +114,22 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._loop: asyncio.AbstractEventLoop | None = None
         self._running: asyncio.Task[Any] | None = None
         self._lost_at: float | None = None
+        self.lives: Callable[[], bool] = lambda: True
+        """Says whether the robot behind the device can be read; the beat leaves it out while it cannot."""
+
+    @property
+    def _d2d_announcer(self) -> Any:
+        return self._announcer
+
+    @_d2d_announcer.setter
+    def _d2d_announcer(self, announcer: Any) -> None:
+        # The framework encodes the whole description for each message.
+        self._announcer = announcer
+        if announcer is not None:
+            build = presence_builder(
+                announcer._device_id, announcer._capabilities, announcer._identity, announcer._status
+            )
+            announcer._build_payload = build
 
     def _warn_if_predicate_extra_missing(self) -> None:
         """Log the framework's start-up line about an optional package at DEBUG only."""
@@ -242,7 +259,13 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
     async def _heartbeat_loop(self) -> None:
         # The last thing the framework starts: from here on the device is callable and announced.
         self._ready.set()
-        await super()._heartbeat_loop()
+        beat = beat_of(self.link)
+        beating = Beating(self.device_id, self.messaging, self.lives, self._heartbeat_provider or dict)
+        beat.join(beating)
+        try:
+            await super()._heartbeat_loop()
+        finally:
+            beat.leave(beating)
 
     async def _event_dispatch_loop(self) -> None:
         """Send events in order; the stock loop repeats a refused event for ever."""

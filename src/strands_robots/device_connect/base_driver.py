@@ -9,11 +9,11 @@ from __future__ import annotations
 import asyncio
 import inspect
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
 from device_connect_edge.drivers import DeviceDriver
@@ -25,7 +25,8 @@ from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
 from strands_robots.device_connect._compat import Labels, emit, observed, on, rpc
 from strands_robots.device_connect.safety_registration import SafetyRegistration
-from strands_robots.device_connect.telemetry import RolloutPump, paced
+from strands_robots.device_connect.state_reports import report_changes, sweep
+from strands_robots.device_connect.telemetry import RolloutPump
 from strands_robots.envelope import Envelope, error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
@@ -40,6 +41,8 @@ from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.utils import ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 START_DEADLINE_S = 10.0
 """Seconds in which a robot has to have started a motion; after that the motion is void."""
@@ -155,7 +158,8 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         self.runtime: Any = None
         self.activity = Activity()
         self._looked_once = False
-        self.changed = asyncio.Event()
+        self._changed: list[asyncio.Event] = []
+        self._looking = 0
         self._rolling: set[str] = set()
         self._watchers: list[asyncio.Task[None]] = []
         self._unsubscribe: Unsubscribe | None = None
@@ -199,7 +203,7 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
         if moves and result.refusal is None:
             logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))
-            self.changed.set()
+            self.wake()
         return enveloped(verb.name, result.result)
 
     def authorize(self, command: Command, arguments: Arguments) -> None:
@@ -389,6 +393,11 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         activity = self.activity if self._looked_once else self._look_now()
         return DeviceStatus(**_status_fields(activity))
 
+    @property
+    def lives(self) -> bool:
+        """False while the robot cannot be read."""
+        return not self.activity.fault
+
     def heartbeat(self) -> dict[str, Any]:
         """Return what every heartbeat carries besides the id and the time."""
         return {**_status_fields(self.activity), "state": jsonable(self.activity.facts)}
@@ -422,25 +431,74 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
         """Start telling the state; the robot manages its own hardware connection."""
         if self.runtime is None or self._watchers:
             return
-        self.changed = asyncio.Event()
         if not self._looked_once:
             await self.read_activity()
         pump = RolloutPump(self._on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
         subscribe = partial(self.robot.subscribe, pump.observe)
         self._unsubscribe = await called(self.pipeline.shares.read, subscribe, READ_DEADLINE_S)
         self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
+        sweep(settings.number("STRANDS_DC_STATE_HZ")).add(self)
         if self.pipeline.leases is not None:
             self._end_control = self.pipeline.leases.observe(self._on_control)
 
     def watches(self) -> list[Any]:
         """Return the coroutines that run while the device is connected."""
-        idle, busy = settings.number("STRANDS_DC_STATE_HZ"), settings.number("STRANDS_DC_STATE_BUSY_HZ")
-        # A robot may tell that a rollout began before its own status says so.
-        return [paced(lambda: busy if self.activity.busy or self._rolling else idle, self._tell_state, self.changed)]
+        busy_hz = settings.number("STRANDS_DC_STATE_BUSY_HZ")
+        return [self.reporting(self._look, self.tell, self.same, busy_hz, settings.number("STRANDS_DC_STATE_HZ"))]
+
+    def reporting(
+        self,
+        look: Callable[[], Awaitable[T | None]],
+        tell: Callable[[T], Awaitable[None]],
+        same: Callable[[T, T], bool],
+        busy_hz: float,
+        moving_hz: float,
+    ) -> Coroutine[Any, Any, None]:
+        """Return a watch that tells a state whenever it changed.
+
+        Args:
+            look: reads the state; None when it cannot be read.
+            tell: emits it.
+            same: returns True for two states of which the second one need not be told.
+            busy_hz: looks a second while something runs.
+            moving_hz: the same while nothing runs and the state changes nevertheless.
+        """
+        idle_hz, changed = settings.number("STRANDS_DC_STATE_HZ"), asyncio.Event()
+        self._changed.append(changed)
+
+        def rate(moved: bool) -> float:
+            # A robot may tell that a rollout began before its own status says so.
+            if self.activity.busy or self._rolling:
+                return busy_hz
+            # A quiet robot is looked at by the sweep.
+            return moving_hz if moved else idle_hz if self.activity.fault else 0.0
+
+        return report_changes(look, tell, rate=rate, changed=changed, most_hz=busy_hz, same=same)
+
+    @property
+    def quiet(self) -> bool:
+        """True while the robot does nothing and is not being looked at."""
+        return not (self.activity.busy or self._rolling or self.activity.fault or self._looking)
+
+    def unchanged(self) -> bool:
+        """Look at the robot, on a worker; False when its state is another one."""
+        return self.same(self.glance(), self.activity)
+
+    def same(self, one: Activity, other: Activity) -> bool:
+        """Return True for two states of which the second one need not be told."""
+        return one == other
+
+    def wake(self) -> None:
+        """Look at the robot at once; on the loop."""
+        for changed in self._changed:
+            changed.set()
 
     async def disconnect(self) -> None:
         """Stop telling the state; the robot manages its own shutdown."""
         watchers, self._watchers = self._watchers, []
+        if watchers:
+            sweep(settings.number("STRANDS_DC_STATE_HZ")).remove(self)
+        self._changed = []
         for watcher in watchers:
             watcher.cancel()
         await asyncio.gather(*watchers, return_exceptions=True)
@@ -472,14 +530,14 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             self._rolling.discard(event.robot)
         await self.tell_rollout(event)
         if event.kind != "step":
-            self.changed.set()
+            self.wake()
 
-    async def _tell_state(self) -> None:
+    async def _look(self) -> Activity | None:
         activity = await self.refresh()
-        if not activity.fault:
-            await self.tell(activity)
+        return None if activity.fault else activity
 
     async def _looked(self) -> Activity:
+        self._looking += 1
         try:
             return await called(self.pipeline.shares.read, self.glance, READ_DEADLINE_S)
         except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
@@ -487,6 +545,8 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             if fault != self.activity.fault:
                 logger.warning("%s: its state cannot be read: %s", self.peer_id, fault)
             return Activity(self.activity.busy, self.activity.facts, fault)
+        finally:
+            self._looking -= 1
 
     def _look_now(self) -> Activity:
         try:

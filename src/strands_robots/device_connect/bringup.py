@@ -147,6 +147,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     )
     if isinstance(driver, RobotDriver):
         runtime.set_heartbeat_provider(driver.heartbeat)
+        runtime.lives = lambda: driver.lives
     task = asyncio.create_task(_live(runtime, registration), name=f"device {name}")
     try:
         await runtime.wait_ready(bringup_timeout)

@@ -126,8 +126,15 @@ class FleetClient:
         return self._found.known
 
     def last_heartbeat(self, device: str) -> float | None:
-        """Return the monotonic time of a device's last heartbeat; None before the first."""
+        """Return the monotonic time of a device's last heartbeat; None before the first.
+
+        The beat of its process counts as one.
+        """
         return self._found.last_heartbeat(device)
+
+    def beats_every(self, device: str) -> float:
+        """Return the seconds between two heartbeats, or beats, of a device."""
+        return self._found.beats_every(device)
 
     def call(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0

@@ -20,6 +20,7 @@ from device_connect_edge.messaging.exceptions import MessagingError
 
 from strands_robots import settings
 from strands_robots.device_connect.backends.base import Backend
+from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
 from strands_robots.errors import StrandsRobotsError
 
 logger = logging.getLogger(__name__)
@@ -45,6 +46,9 @@ REGISTRY_S = 0.4
 
 HEARTBEATS_S = 6.0
 """Seconds in which every live device sends a heartbeat; the framework's default is one in 5 s."""
+
+BEATS_MAX = 4096
+"""Devices whose last heartbeat is kept; the longest silent one makes place."""
 
 DESCRIBE_S = 1.0
 """Seconds in which a device describes itself when asked."""
@@ -110,6 +114,7 @@ class Discovery:
         self._listed_at: float | None = None
         self._described: dict[str, Peer] = {}
         self._beats: dict[str, float] = {}
+        self._named: set[str] = set()
         self._listens_since = 0.0
         self._changed_at = 0.0
         self._found: Found = lambda peer: None
@@ -120,8 +125,15 @@ class Discovery:
         return tuple(sorted(self._present))
 
     def last_heartbeat(self, name: str) -> float | None:
-        """Return the monotonic time of a device's last heartbeat; None before the first."""
+        """Return the monotonic time of a device's last heartbeat; None before the first.
+
+        The beat of its process counts as one.
+        """
         return self._beats.get(name)
+
+    def beats_every(self, name: str) -> float:
+        """Return the seconds between two heartbeats, or beats, of a device."""
+        return BEAT_S if name in self._named else HEARTBEAT_S
 
     async def start(self) -> None:
         """Receive presence and heartbeats from now on."""
@@ -270,12 +282,26 @@ class Discovery:
         if presence.get("departing"):
             self._present.pop(name, None)
             self._beats.pop(name, None)
+            self._named.discard(name)
         else:
             peer = self._present[name] = Peer.of(presence)
             self._found(peer)
 
     async def _on_heartbeat(self, data: bytes, subject: str, reply: str | None) -> None:
-        self._beats[parts(subject)[2]] = time.monotonic()
+        own, now = parts(subject)[2], time.monotonic()
+        named = named_in(data)
+        if self._messaging.link.identified:
+            # Access rules guard the topic of one device, so a beat proves the life of that one only.
+            named = [each for each in named if each == own]
+        for name in (own, *named):
+            # Taken out and put in again, so that the longest silent ones are dropped first.
+            self._beats.pop(name, None)
+            self._beats[name] = now
+        self._named.update(named)
+        while len(self._beats) > BEATS_MAX:
+            silent = next(iter(self._beats))
+            del self._beats[silent]
+            self._named.discard(silent)
 
 
 def parts(subject: str) -> list[str]:

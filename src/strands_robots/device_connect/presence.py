@@ -8,7 +8,9 @@ their number. Here the devices of one loop and one link share a collector, which
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import json
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from device_connect_edge.discovery import PresenceCollector
@@ -26,6 +28,30 @@ POLL_S = 0.02
 
 OnPeer = Callable[[str], Any]
 Presence = dict[str, Any]
+
+
+def presence_builder(
+    device_id: str, capabilities: Presence, identity: Presence, status: Mapping[str, Any]
+) -> Callable[[], bytes]:
+    """Return a builder of presence messages that encodes the description once.
+
+    Args:
+        device_id: whose presence.
+        capabilities, identity: the description, which stays as it is.
+        status: read anew for each message.
+    """
+    described = json.dumps({"device_id": device_id, "capabilities": capabilities, "identity": identity})[:-1]
+
+    def build() -> bytes:
+        now = time.time()
+        changing = {
+            "status": {**status, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(now))},
+            "ts": now,
+            "d2d": True,
+        }
+        return f"{described}, {json.dumps(changing)[1:]}".encode()
+
+    return build
 
 
 class _SharedCollector:

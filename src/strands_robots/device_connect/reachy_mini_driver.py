@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
@@ -26,6 +27,9 @@ from strands_robots.utils import flag
 logger = logging.getLogger(__name__)
 
 UNAVAILABLE = "unavailable"
+
+FRESH_S = 1.0
+"""Age in seconds below which joints count as fresh; a state is told when they cease to be."""
 
 
 class ReachyMiniDriver(RobotDriver):
@@ -147,7 +151,7 @@ class ReachyMiniDriver(RobotDriver):
     async def stateUpdate(
         self, moving: str = "", link: str = "", motor_mode: str = "", data_age_s: float = 0.0
     ) -> None:
-        """Activity of the robot, at a steady rate while it is available.
+        """Activity of the robot, told when it changes while it is available.
 
         Args:
             moving: Which motion runs, empty for none
@@ -164,6 +168,15 @@ class ReachyMiniDriver(RobotDriver):
         told = {key: facts[key] for key in ("moving", "link", "motor_mode")}
         return Activity(bool(facts["moving"]), {**told, "data_age_s": facts["data_age_s"] or 0.0}, facts["unavailable"])
 
+    def same(self, one: Activity, other: Activity) -> bool:
+        """Return True for two states that differ only in the age of fresh joints."""
+
+        def told(activity: Activity) -> Activity:
+            fresh = activity.facts.get("data_age_s", FRESH_S) < FRESH_S
+            return replace(activity, facts={**activity.facts, "data_age_s": fresh})
+
+        return told(one) == told(other)
+
     async def tell(self, activity: Activity) -> None:
         """Emit ``stateUpdate``."""
         await self.stateUpdate(**activity.facts)
@@ -174,4 +187,4 @@ class ReachyMiniDriver(RobotDriver):
             await self.motionComplete(
                 name=event.instruction, state=event.state, detail=event.error, duration=round(event.elapsed_s, 3)
             )
-            self.changed.set()
+            self.wake()

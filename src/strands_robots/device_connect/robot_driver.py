@@ -110,7 +110,7 @@ class RobotDeviceDriver(RobotDriver):
 
     @emit()
     async def stateUpdate(self, task_status: str = "", instruction: str = "", step_count: int = 0) -> None:
-        """Activity of the robot, at a steady rate.
+        """Activity of the robot, told when it changes.
 
         Args:
             task_status: State of the current or last task

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import eq
 from typing import Any, ClassVar, Optional
 
 from device_connect_edge.types import DeviceIdentity
@@ -11,7 +12,7 @@ from strands_robots import settings
 from strands_robots.contract import Haltable, RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
-from strands_robots.device_connect.telemetry import numbers, paced
+from strands_robots.device_connect.telemetry import numbers
 from strands_robots.envelope import Envelope, fields_of
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
@@ -19,6 +20,9 @@ from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import WORLD_VERBS, WorldStop, robot_stop, served_world, world_stop_answer
 from strands_robots.serving.verbs import Verb
+
+Observed = tuple[float, int, dict[str, dict[str, float]]]
+"""Simulated time, physics steps, and the joints of each robot."""
 
 
 class SimulationDeviceDriver(RobotDriver):
@@ -107,7 +111,7 @@ class SimulationDeviceDriver(RobotDriver):
         step_count: int = 0,
         running_policies: Optional[dict[str, Any]] = None,  # noqa: UP045 - the framework reads no `X | None`
     ) -> None:
-        """State of the simulation, told at a steady rate.
+        """State of the simulation, told when it changes.
 
         Args:
             sim_time: Simulated time in seconds
@@ -123,7 +127,7 @@ class SimulationDeviceDriver(RobotDriver):
         step_count: int = 0,
         joints: Optional[dict[str, float]] = None,  # noqa: UP045 - the framework reads no `X | None`
     ) -> None:
-        """Joint positions of one robot, told at a steady rate.
+        """Joint positions of one robot, told when they change.
 
         Args:
             robot_name: The simulated robot
@@ -164,26 +168,28 @@ class SimulationDeviceDriver(RobotDriver):
             },
         )
 
+    def unchanged(self) -> bool:
+        """Look at the world, on a worker; False when its state or a joint is another one."""
+        observed = self._observed
+        return super().unchanged() and self._observed == observed
+
     def watches(self) -> list[Any]:
         """State as every robot, and observations besides."""
         hz = settings.number("STRANDS_DC_OBSERVATION_HZ")
-        return [*super().watches(), paced(lambda: hz, self._tell_observations)]
+        return [*super().watches(), self.reporting(self._look_at_joints, self._tell_observations, eq, hz, hz)]
 
     async def tell(self, activity: Activity) -> None:
         """Emit ``stateUpdate``."""
         await self.stateUpdate(**activity.facts)
 
-    async def _tell_observations(self) -> None:
+    async def _look_at_joints(self) -> Observed | None:
         activity = await self.refresh()
-        if activity.fault:
-            return
-        for name, joints in self._observed.items():
-            await self.observationUpdate(
-                robot_name=name,
-                sim_time=activity.facts["sim_time"],
-                step_count=activity.facts["step_count"],
-                joints=joints,
-            )
+        return None if activity.fault else (activity.facts["sim_time"], activity.facts["step_count"], self._observed)
+
+    async def _tell_observations(self, observed: Observed) -> None:
+        sim_time, step_count, robots = observed
+        for name, joints in robots.items():
+            await self.observationUpdate(robot_name=name, sim_time=sim_time, step_count=step_count, joints=joints)
 
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit ``policyStarted``, ``streamStep`` or ``policyComplete``."""

@@ -1,4 +1,4 @@
-"""Telemetry of a device: the events of a rollout, and periodic updates."""
+"""Telemetry of a device: the events of a rollout."""
 
 from __future__ import annotations
 
@@ -84,27 +84,3 @@ class RolloutPump:
                 if dropped:
                     logger.warning("%d streamStep events were dropped: the event loop is behind.", dropped)
                 await self._deliver(event)
-
-
-async def paced(hz: Callable[[], float], act: Callable[[], Awaitable[None]], wake: asyncio.Event | None = None) -> None:
-    """Await ``act`` ``hz()`` times a second, and at once when ``wake`` is set.
-
-    Ends when cancelled. A late turn is followed on time, and missed turns are left out.
-    """
-    loop = asyncio.get_running_loop()
-    due = loop.time()
-    while True:
-        await act()
-        now = loop.time()
-        due = max(due + 1.0 / hz(), now)
-        if wake is None:
-            await asyncio.sleep(due - now)
-            continue
-        try:
-            # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the event.
-            async with asyncio.timeout(due - now):
-                await wake.wait()
-        except TimeoutError:
-            continue
-        wake.clear()
-        due = loop.time()

@@ -106,6 +106,32 @@ def test_no_presence_is_parsed_until_a_device_asks(serve: Any, monkeypatch: pyte
     assert parsed
 
 
+def test_one_beat_names_the_devices_of_the_process_and_bare_heartbeats_go_on(link: LinkConfig, serve: Any) -> None:
+    names = [f"arm-{number}" for number in range(5)]
+    for name in names:
+        serve(Idle(name), name)
+    with FleetClient(link, "tester") as fleet:
+        eventually(lambda: all(fleet.beats_every(name) == 1.0 for name in names), what="a beat that names all five")
+        first = fleet.last_heartbeat("arm-4")
+        assert first is not None
+        eventually(lambda: (fleet.last_heartbeat("arm-4") or first) > first, what="the next beat")
+
+
+def test_device_that_cannot_be_read_is_not_in_the_beat(link: LinkConfig, serve: Any) -> None:
+    failing = Idle("arm-2")
+    serve(Idle("arm-1"), "arm-1")
+    runtime = serve(failing, "arm-2")
+
+    def fail() -> Envelope:
+        raise OSError("bus is gone")
+
+    failing.get_task_status = fail  # type: ignore[method-assign]
+    eventually(lambda: not runtime.lives(), what="its fault")
+    with FleetClient(link, "tester") as fleet:
+        eventually(lambda: fleet.beats_every("arm-1") == 1.0, what="a beat")
+        assert fleet.beats_every("arm-2") == 5.0
+
+
 def test_device_waits_for_one_that_comes_later(serve: Any) -> None:
     first = serve(Idle("arm-1"), "arm-1")
     waiting = asyncio.run_coroutine_threadsafe(
