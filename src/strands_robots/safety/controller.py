@@ -23,6 +23,7 @@ from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, Renew
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import REASON_MAX, new_epoch, signed_bytes
 from strands_robots.safety.statements import Proof, Purpose
+from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError, device_id, number
 
 logger = logging.getLogger(__name__)
@@ -153,6 +154,7 @@ class SafetyController:
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
         self._link = make_link()
+        self._end_short_turns = shorten_turns()
         self._link.open((VERDICT,), self._receive, self._link_changed)
 
     @property
@@ -260,6 +262,7 @@ class SafetyController:
         if self._check_in is not None:
             self._check_in.join(2.0)
         self._link.close()
+        self._end_short_turns()
 
     def _send(self, run: _Running) -> None:
         """Send the stop, issued now and pressed at its press."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import logging
 import secrets
-import sys
 import threading
 import time
 import uuid
@@ -24,6 +23,7 @@ from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import RobotReport, StopOrder, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -36,10 +36,6 @@ ANSWER_AGAIN_S = 0.01
 REFUSAL_INTERVAL_S = 10.0
 SOURCES_MAX = 256
 """Sources remembered; past it the oldest is forgotten or all new ones share an entry, so that names take no memory."""
-
-SWITCH_S = 0.0005
-"""Longest time in seconds that a busy Python thread may keep the interpreter from the stop's threads while the listener
-runs; Python's own default is ten times that, and a stop wakes three threads."""
 
 BUCKETS = 64
 BUCKET_CAPACITY = 16
@@ -309,7 +305,7 @@ class EstopListener:
         self._repeated: dict[Hashable, bytes] = {}
         self._queue: FairQueue | None = None
         self._thread: threading.Thread | None = None
-        self._switch_s = sys.getswitchinterval()
+        self._end_short_turns: Callable[[], None] = lambda: None
 
     @property
     def registrations(self) -> tuple[ListenerRegistration, ...]:
@@ -352,7 +348,7 @@ class EstopListener:
         if last_of_link:
             registration.link.close()
         if events is not None:
-            sys.setswitchinterval(self._switch_s)
+            self._end_short_turns()
             events.close()
         if thread is not None and thread is not threading.current_thread():
             thread.join(2.0)
@@ -396,8 +392,7 @@ class EstopListener:
                 "The source of an emergency stop is what it says it is: DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not set, "
                 "and only a broker's access rules can vouch for it."
             )
-        self._switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(min(self._switch_s, SWITCH_S))
+        self._end_short_turns = shorten_turns()
         self._queue = FairQueue()
         self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)
         self._thread.start()

@@ -1,0 +1,58 @@
+"""Turns of the interpreter while stops may come or go."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Iterator
+
+import pytest
+
+from strands_robots.safety.controller import SafetyController
+from strands_robots.safety.estop_listener import OnEvent, OnState
+from strands_robots.safety.turns import SWITCH_S, shorten_turns
+
+
+@pytest.fixture(autouse=True)
+def interval_of_python() -> Iterator[None]:
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.005)
+    yield
+    sys.setswitchinterval(before)
+
+
+class NoLink:
+    """A link that is down."""
+
+    up = False
+
+    def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None: ...
+
+    def publish(self, source: str, event: str, payload: bytes) -> bool:
+        return False
+
+    def close(self) -> None: ...
+
+
+def test_turns_are_short_until_the_last_of_their_users_has_ended() -> None:
+    first, second = shorten_turns(), shorten_turns()
+    first()
+    first()
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+    second()
+    assert sys.getswitchinterval() == pytest.approx(0.005)
+
+
+def test_turns_that_are_shorter_already_stay() -> None:
+    sys.setswitchinterval(0.0001)
+    end = shorten_turns()
+    assert sys.getswitchinterval() == pytest.approx(0.0001, rel=0.05)
+    end()
+    assert sys.getswitchinterval() == pytest.approx(0.0001, rel=0.05)
+
+
+def test_open_safety_controller_has_short_turns() -> None:
+    controller = SafetyController("safety-1", NoLink)
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+    controller.close()
+    controller.close()
+    assert sys.getswitchinterval() == pytest.approx(0.005)
