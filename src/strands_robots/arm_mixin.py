@@ -18,7 +18,7 @@ from strands_robots.safety.gate import Permit, answered
 from strands_robots.utils import ValidationError, choice, identifier, missing_extra, number, shown
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
-    from strands_robots.kinematics.arm import Arm
+    from strands_robots.kinematics.arm import Arm, ArmState
     from strands_robots.kinematics.grasp import Held, SeenObject
     from strands_robots.kinematics.motion import Motion
     from strands_robots.kinematics.moves import Start
@@ -40,13 +40,18 @@ MOTION = "motion"
 PlanMotion = Callable[["Start"], "Motion"]
 
 
-@dataclass(frozen=True)
+@dataclass
 class ArmTask:
-    """One motion, running or ended."""
+    """One motion, running or ended.
+
+    Attributes:
+        outcome: how it ended, once it was asked for; it stays as it was then.
+    """
 
     task_id: str
     rollout: Rollout
     motion: Motion
+    outcome: dict[str, Any] | None = None
 
 
 def motion_rollout(body: Body, motion: Motion, permit: Permit, hz: float, observers: RolloutObservers) -> Rollout:
@@ -322,10 +327,25 @@ class ArmMixin:
         task.rollout.join(number("seconds", seconds, low=0, high=WAIT_S))
         return self._result(task)
 
-    def last_motion(self, robot_name: str = "") -> dict[str, Any] | None:
-        """Return the outcome of a body's last motion, None before the first."""
-        task = self._tasks.get(self.body(robot_name).name)
-        return None if task is None else self._outcome(task)
+    def outcome_of(self, rollout: Rollout | None) -> dict[str, Any] | None:
+        """Return how a rollout ended, and of a motion what it reached.
+
+        It was measured at the end and reads no bus. None while it runs, and before the first one.
+        """
+        if rollout is None or rollout.running:
+            return None
+        task = self._tasks.get(rollout.robot)
+        if task is not None and task.rollout is rollout:
+            return self._outcome(task)
+        why = rollout.error or ("it is done" if rollout.state == "completed" else "it was stopped")
+        return {
+            "task_status": rollout.state,
+            "instruction": rollout.instruction,
+            "policy": rollout.policy_name,
+            "step_count": rollout.step_count,
+            "duration": round(rollout.elapsed_s, 3),
+            "why": why,
+        }
 
     @cached_property
     def _tasks(self) -> dict[str, ArmTask]:
@@ -393,11 +413,18 @@ class ArmMixin:
 
     def _outcome(self, task: ArmTask) -> dict[str, Any]:
         """Return what was asked, what was reached, and why the motion ended."""
+        if task.rollout.running:
+            return self._measured(task, running=True)
+        if task.outcome is None:
+            task.outcome = self._measured(task, running=False)
+        return task.outcome
+
+    def _measured(self, task: ArmTask, *, running: bool) -> dict[str, Any]:
         rollout, motion = task.rollout, task.motion
-        running, state = rollout.running, rollout.state
+        state = rollout.state
         reached, error_mm = self._reached(motion)
         why = "it is under way"
-        holding = None if running else self._holding(rollout.robot, motion.arm)
+        holding = None if running else self._holding(rollout.robot, motion.arm, motion.state)
         if not running:
             why = rollout.error or "it was stopped"
             if state == "completed":
@@ -430,15 +457,19 @@ class ArmMixin:
         offset = pose.position - motion.goal
         return reached, round(1000 * float(offset @ offset) ** 0.5, 2)
 
-    def _holding(self, name: str, arm: Arm) -> bool | None:
-        """Return what the jaw tells, None while it moves or was told otherwise since."""
+    def _holding(self, name: str, arm: Arm, state: ArmState | None = None) -> bool | None:
+        """Return what the jaw tells, None while it moves or was told otherwise since.
+
+        Args:
+            state: what was observed last; read anew without it.
+        """
         task = next((each for each in reversed(self._recent) if self._gripped(each, name)), None)
         if task is None or task.motion.told is None or arm.jaw is None or task.rollout.running:
             return None
         told = self.targets(name).get(arm.jaw.commanded)
         if told is None or not arm.jaw.says(told, task.motion.told):
             return None
-        return arm.holding(arm.state(_observed(self.body(name))[1]), task.motion.told)
+        return arm.holding(state or arm.state(_observed(self.body(name))[1]), task.motion.told)
 
     @staticmethod
     def _gripped(task: ArmTask, name: str) -> bool:

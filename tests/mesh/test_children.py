@@ -16,6 +16,7 @@ from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.presence import DESCRIBE_S
 from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.serving.workers import shares_of
+from strands_robots.simulation import Simulation
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
 
@@ -275,3 +276,24 @@ def test_a_world_of_one_robot_is_one_peer(peers: Fleet) -> None:
     assert mesh.children is not None
     mesh.children.refresh()
     assert set(console.peers_by_id) == {"sim-1"}
+
+
+def test_each_arm_of_a_world_moves_by_its_own_name(peers: Fleet) -> None:
+    world = Simulation()
+    for name in ("left", "right"):
+        assert world.add_robot(name, "so100")["status"] == "success"
+    peers.join(world, "sim-1", "sim")
+    console = peers.join(None, "console")
+    eventually(lambda: {"sim-1__left", "sim-1__right"} <= set(console.peers_by_id))
+    still = world.body("left").targets
+    move = {"action": "moveJoints", "joints": {"shoulder_pan": 10.0}, "speed": 1.0, "picture": "right/wrist"}
+    moved = console.send("sim-1__right", move, timeout=30)["result"]
+    assert moved["task_status"] == "completed", moved
+    assert moved["picture"]["camera"] == "right/wrist"
+    assert world.body("left").targets == still
+    other = console.send("sim-1__right", {**move, "robot_name": "left"}, timeout=30)["result"]
+    assert "robot_name must be right" in other["reason"]
+    status = console.send("sim-1__right", {"action": "status"}, timeout=20)["result"]
+    assert status["outcomes"]["right"]["task_id"] == moved["task_id"]
+    assert console.send("sim-1__left", {"action": "status"}, timeout=20)["result"]["outcomes"] == {}
+    world.cleanup()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ from fixtures.toy_robots import ToyRobot
 from strands_robots.contract import adapt
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS
 from strands_robots.serving.verbs import Kind
+from strands_robots.simulation import Simulation
 from strands_robots.utils import ValidationError
 
 
@@ -28,7 +31,8 @@ def test_joints_must_be_degrees_by_name(joints: Any) -> None:
 
 def test_approach_may_be_left_out_and_the_other_options_have_defaults() -> None:
     checked = ARM_MOTION_VERBS["moveTo"].checked({"x": 0, "y": 0, "z": 0.1})
-    assert checked == {"x": 0.0, "y": 0.0, "z": 0.1, "approach": None, "speed": 0.5, "wait": True, "lease_id": ""}
+    options = {"approach": None, "speed": 0.5, "wait": True, "picture": "", "lease_id": ""}
+    assert checked == {"x": 0.0, "y": 0.0, "z": 0.1, **options}
 
 
 def test_a_world_names_the_robot_besides() -> None:
@@ -46,3 +50,48 @@ def test_robot_without_an_arm_says_so() -> None:
     assert verb.run is not None
     answer: Any = verb.run(adapt(ToyRobot()), {})
     assert answer["reason"] == "This robot has no arm whose motions can be planned here."
+
+
+@pytest.fixture
+def world() -> Iterator[Simulation]:
+    simulation = Simulation()
+    assert simulation.add_robot("arm", "so100")["status"] == "success"
+    yield simulation
+    simulation.cleanup()
+
+
+def run(world: Simulation, name: str, **arguments: Any) -> dict[str, Any]:
+    verb = WORLD_MOTION_VERBS[name]
+    assert verb.run is not None
+    checked = verb.checked(arguments)
+    answer = verb.run(world, {key: value for key, value in checked.items() if key != "lease_id"})
+    assert isinstance(answer, dict)
+    return answer
+
+
+@pytest.mark.parametrize("camera", ["wrist", "arm/wrist", "table"])
+def test_answer_of_a_motion_brings_the_picture_that_was_asked_for(world: Simulation, camera: str) -> None:
+    answer = run(world, "moveJoints", joints={"shoulder_pan": 5.0}, speed=1.0, picture=camera)
+    assert answer["task_status"] == "completed"
+    picture = answer["picture"]
+    assert picture["camera"].endswith(camera)
+    assert (picture["width"], picture["height"], picture["format"]) == (640, 480, "jpeg")
+    assert base64.b64decode(picture["jpeg"])[:2] == b"\xff\xd8"
+    assert "picture" not in run(world, "wait")
+
+
+def test_unknown_camera_is_refused_before_the_motion(world: Simulation) -> None:
+    before = world.body("arm").targets
+    answer = run(world, "moveJoints", joints={"shoulder_pan": 5.0}, picture="ceiling")
+    assert "camera must be one of front" in answer["reason"]
+    assert world.body("arm").targets == before
+
+
+def test_camera_that_fails_takes_nothing_from_the_result(world: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(camera: str, width: int, height: int) -> None:
+        raise OSError("unplugged")
+
+    monkeypatch.setattr(world, "camera_picture", broken)
+    answer = run(world, "moveJoints", joints={"shoulder_pan": 5.0}, speed=1.0, picture="front")
+    assert (answer["status"], answer["task_status"]) == ("success", "completed")
+    assert "unplugged" in answer["picture_error"]

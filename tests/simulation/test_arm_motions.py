@@ -83,7 +83,24 @@ def test_running_motion_is_told_by_its_task_and_waited_for(world: Simulation) ->
     assert "is driven by" in world.move_to(0.2, 0.0, 0.1)["reason"]
     assert world.wait_for(started["task_id"], 0.0)["task_status"] == "running"
     assert world.wait_for(started["task_id"])["task_status"] == "completed"
-    assert world.last_motion()["task_id"] == started["task_id"]  # type: ignore[index]
+    assert world.outcomes()["arm"]["task_id"] == started["task_id"]
+
+
+def test_status_has_the_outcome_of_the_last_motion_until_the_next_one(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert world.get_state()["outcomes"] == {}
+    world.move_to(0.25, 0.1, 0.06, speed=1.0)
+    monkeypatch.setattr(world.body("arm"), "get_joints", lambda: pytest.fail("a status reads no joints"))
+    outcome = world.get_state()["outcomes"]["arm"]
+    assert (outcome["task_status"], outcome["why"]) == ("completed", "it is done")
+    assert outcome["error_mm"] < 3.0
+    monkeypatch.undo()
+    world.start_policy("arm", "wave", "mock", 30.0)
+    assert world.get_state()["outcomes"] == {}
+    world.stop_policy("arm")
+    outcome = world.get_state()["outcomes"]["arm"]
+    assert (outcome["task_status"], outcome["instruction"], outcome["why"]) == ("stopped", "wave", "it was stopped")
 
 
 def test_stop_ends_a_motion_in_its_middle_and_the_answer_says_so(world: Simulation) -> None:

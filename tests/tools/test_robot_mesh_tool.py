@@ -117,6 +117,16 @@ def test_picture_is_an_image_block(fake: FakeNetwork, monkeypatch: pytest.Monkey
     assert "could not be decoded" in robot_mesh(action="picture", target="arm-1")["reason"]
 
 
+def test_picture_of_a_motion_is_an_image_block_of_its_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = {"camera": "table", "format": "jpeg", "jpeg": base64.b64encode(b"\xff\xd8x").decode()}
+    answer = success("moveTo completed.", error_mm=0.4) | {"picture": taken}
+    monkeypatch.setattr(networks, "network", lambda: SimpleNamespace(call=lambda *_: answer))
+    shown = robot_mesh(action="move", target="arm-1", arguments={"x": 0.2, "y": 0.0, "z": 0.1, "picture": "table"})
+    assert shown["content"][-1] == {"image": {"format": "jpeg", "source": {"bytes": b"\xff\xd8x"}}}
+    assert shown["error_mm"] == 0.4
+    assert "picture" not in shown
+
+
 def test_one_silent_robot_makes_a_stop_an_error_that_names_it() -> None:
     answer = combined_verdict({"a": success("ok", stopped=True), "b": error("no answer in 5 s", stopped=None)})
     assert answer["status"] == "error"

@@ -345,7 +345,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def get_task_status(self) -> Envelope:
         """``task_status`` (idle, running, completed, stopped, error), ``instruction``, ``policy``, ``step_count``,
-        ``duration`` (seconds it has taken) and ``error`` of the current or last task."""
+        ``duration`` (seconds it has taken), ``error`` and ``outcome`` of the current or last task."""
         fields = self._task_fields()
         return success(f"Task {fields['task_status']} after {fields['step_count']} steps.", **fields)
 
@@ -591,6 +591,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             "loop": {} if task is None else task.counts,
             "duration": 0.0 if task is None else round(task.elapsed_s, 3),
             "error": "" if task is None else task.error,
+            "outcome": self.outcome_of(task),
             **({} if self._settling is None else {"settling": self._settling.state}),
         }
 

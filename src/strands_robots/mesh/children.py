@@ -23,9 +23,12 @@ from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Declaration, TransportError, undeclare
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.peer_verbs import TELEOP_VERBS
+from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS
+from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import RobotStop
+from strands_robots.serving.verbs import Arguments, Verb
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)
@@ -53,6 +56,11 @@ class OneRobot:
 
     def stop_policy(self, robot_name: str) -> Envelope:
         return self._world.stop_policy(robot_name)
+
+    def outcomes(self) -> dict[str, Any]:
+        """Return how its last policy or motion ended, by its name."""
+        ended: dict[str, Any] = getattr(self._world, "outcomes", dict)()
+        return {name: ended[name] for name in ended if name == self.tool_name_str}
 
     def list_policies_running(self) -> list[dict[str, Any]]:
         return [row for row in self._world.list_policies_running() if row.get("robot") == self.tool_name_str]
@@ -220,6 +228,7 @@ class Children:
             own={
                 **self._own,
                 **parents,
+                **self._arm_verbs(name),
                 "status": status_of(robot, self._report),
                 "execute": execute_on(robot, parent),
             },
@@ -243,6 +252,23 @@ class Children:
         if session is not None:
             handles.append(transport.declare_token(topics.token(peer, session)))
         return child
+
+    def _arm_verbs(self, name: str) -> dict[str, Own]:
+        """Return the verbs of an arm and its cameras, which the world carries out."""
+
+        def carried_out(verb: Verb) -> Own:
+            own = verb.run
+            named = {"robot_name": name} if "robot_name" in verb.by_name else {}
+
+            def run(arguments: Arguments) -> object:
+                if arguments.get("robot_name", name) != name:
+                    return error(f"robot_name must be {name}, or be left out.")
+                return own(self._world, {**arguments, **named}) if own else None
+
+            return run
+
+        verbs = {verb: PEER_VERBS[verb] for verb in (*ARM_MOTION_VERBS, *PICTURE_VERBS)}
+        return {verb: carried_out(described) for verb, described in verbs.items()}
 
     def _ask_parent(self, name: str) -> Own:
         text = f"{name} is one robot of a world; ask {self._context.peer_id}."

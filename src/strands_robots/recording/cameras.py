@@ -101,6 +101,25 @@ def camera_list(robot: Any) -> list[str]:
     return [] if frames is None else [str(name) for name in frames()]
 
 
+def camera_named(robot: Any, camera: str) -> str:
+    """Return the full name of a camera, of which its last part is enough if unique.
+
+    Empty stands for the first one.
+
+    Raises:
+        ValidationError: the robot has no such camera, or none.
+    """
+    names = camera_list(robot)
+    if not names:
+        raise ValidationError("this robot has no camera.")
+    if not camera:
+        return names[0]
+    ends = [camera] if camera in names else [name for name in names if name.endswith(f"/{camera}")]
+    if len(ends) != 1:
+        raise ValidationError(f"camera must be one of {', '.join(names)}, not {shown(camera)}.")
+    return ends[0]
+
+
 def take_picture(robot: Any, camera: str, width: int, height: int) -> tuple[str, Any]:
     """Take one RGB picture of at most this size; return its camera and it.
 
@@ -111,12 +130,7 @@ def take_picture(robot: Any, camera: str, width: int, height: int) -> tuple[str,
         MissingExtraError: Pillow is not installed.
         Exception: what the camera raises.
     """
-    names = camera_list(robot)
-    if not names:
-        raise ValidationError("this robot has no camera.")
-    name = camera or names[0]
-    if name not in names:
-        raise ValidationError(f"camera must be one of {', '.join(names)}, not {shown(camera)}.")
+    name = camera_named(robot, camera)
     if _draws(robot):
         return name, robot.camera_picture(name, width, height)
     frames = frames_of(robot)

@@ -11,7 +11,9 @@ from typing import Any
 
 from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import Robot, body_of
-from strands_robots.envelope import Envelope, error
+from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.recording.cameras import camera_named
+from strands_robots.serving.picture_verbs import picture
 from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Check, Kind, Parameter, Verb, table
 from strands_robots.utils import ValidationError, flag, identifier, mapping, number, shown, text
 
@@ -77,8 +79,15 @@ WAIT = Parameter(
     flag,
     default=True,
 )
+PICTURE = Parameter(
+    "picture",
+    str,
+    "Camera whose picture the answer brings, as listCameras has it; empty for none",
+    _name,
+    default="",
+)
 PLACE = Parameter("place", str, "Name of a saved place; home is always there", identifier)
-RESULT = "task_id, task_status, asked, reached, error_mm, holding, duration, why"
+RESULT = "task_id, task_status, asked, reached, error_mm, holding, duration, why, picture"
 
 _DIRECTION = Parameter(
     "direction",
@@ -103,6 +112,29 @@ def of_arm(method: str) -> Callable[[Robot, Arguments], Envelope]:
     return run
 
 
+def _motion(method: str) -> Callable[[Robot, Arguments], Envelope]:
+    """Carry a motion out, and add the picture that was asked for to its answer."""
+    move = of_arm(method)
+
+    def run(robot: Robot, arguments: Arguments) -> Envelope:
+        given = dict(arguments)
+        camera = given.pop("picture", "")
+        if camera:
+            try:
+                camera = camera_named(robot, camera)
+            except ValidationError as refused:
+                return error(f"picture: {refused}")
+        answer = move(robot, given)
+        if not camera or "task_id" not in answer:
+            return answer
+        taken = picture(robot, camera)
+        if is_error(taken):
+            return {**answer, "picture_error": taken["reason"]}
+        return {**answer, "picture": {name: taken[name] for name in ("camera", "width", "height", "format", "jpeg")}}
+
+    return run
+
+
 _VERBS = (
     Verb(
         "getPose",
@@ -115,18 +147,18 @@ _VERBS = (
         "moveJoints",
         Kind.MOTION,
         "Move joints to positions; the way is checked for limits and contacts before anything moves.",
-        (Parameter("joints", dict, "Degrees by joint name; joints left out stay", _positions), SPEED, WAIT),
+        (Parameter("joints", dict, "Degrees by joint name; joints left out stay", _positions), SPEED, WAIT, PICTURE),
         returns=RESULT,
-        run=of_arm("move_joints"),
+        run=_motion("move_joints"),
         lasts=True,
     ),
     Verb(
         "moveTo",
         Kind.MOTION,
         "Move the tip of the gripper to a point; the way is checked for limits and contacts before anything moves.",
-        (*(_coordinate(axis) for axis in "xyz"), APPROACH, SPEED, WAIT),
+        (*(_coordinate(axis) for axis in "xyz"), APPROACH, SPEED, WAIT, PICTURE),
         returns=RESULT,
-        run=of_arm("move_to"),
+        run=_motion("move_to"),
         lasts=True,
     ),
     Verb(
@@ -139,27 +171,28 @@ _VERBS = (
             _DISTANCE,
             SPEED,
             WAIT,
+            PICTURE,
         ),
         returns=RESULT,
-        run=of_arm("move_by"),
+        run=_motion("move_by"),
         lasts=True,
     ),
     Verb(
         "setGripper",
         Kind.MOTION,
         "Open or close the gripper; holding says whether something is between the jaws.",
-        (Parameter("opening", float, "From 0 (closed) to 1 (open)", within(0, 1)), WAIT),
+        (Parameter("opening", float, "From 0 (closed) to 1 (open)", within(0, 1)), WAIT, PICTURE),
         returns=RESULT,
-        run=of_arm("set_gripper"),
+        run=_motion("set_gripper"),
         lasts=True,
     ),
     Verb(
         "goTo",
         Kind.MOTION,
         "Move to a place that was saved, or to home.",
-        (PLACE, SPEED, WAIT),
+        (PLACE, SPEED, WAIT, PICTURE),
         returns=RESULT,
-        run=of_arm("go_to"),
+        run=_motion("go_to"),
         lasts=True,
     ),
     Verb(
@@ -181,9 +214,10 @@ _VERBS = (
             APPROACH,
             SPEED,
             WAIT,
+            PICTURE,
         ),
         returns=RESULT,
-        run=of_arm("pick"),
+        run=_motion("pick"),
         lasts=True,
     ),
     Verb(
@@ -196,9 +230,10 @@ _VERBS = (
             APPROACH,
             SPEED,
             WAIT,
+            PICTURE,
         ),
         returns=RESULT,
-        run=of_arm("place"),
+        run=_motion("place"),
         lasts=True,
     ),
     Verb(
@@ -223,9 +258,10 @@ _VERBS = (
                 default="",
             ),
             Parameter("seconds", float, f"Longest wait, 0 to {WAIT_S:g}", within(0, WAIT_S), default=WAIT_S),
+            PICTURE,
         ),
         returns=RESULT,
-        run=of_arm("wait_for"),
+        run=_motion("wait_for"),
         lasts=True,
     ),
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from typing import Any
 
 from strands_robots.contract import Robot
 from strands_robots.envelope import Envelope, error, success
@@ -20,10 +19,13 @@ def _list(robot: Robot, arguments: Arguments) -> Envelope:
     return success(f"{len(names)} cameras: {', '.join(names) or 'none'}.", cameras=names)
 
 
-def _picture(robot: Any, arguments: Arguments) -> Envelope:
+def _get_picture(robot: Robot, arguments: Arguments) -> Envelope:
     # The mesh leaves out what was not given.
-    camera, width = arguments.get("camera", ""), arguments.get("width", WIDTH)
-    height = arguments.get("height", HEIGHT)
+    return picture(robot, arguments.get("camera", ""), arguments.get("width", WIDTH), arguments.get("height", HEIGHT))
+
+
+def picture(robot: Robot, camera: str, width: int = WIDTH, height: int = HEIGHT) -> Envelope:
+    """Return a picture as ``camera``, ``width``, ``height``, ``format``, ``jpeg``."""
     try:
         name, pixels = take_picture(robot, camera, width, height)
         encoded = jpeg(name, pixels)
@@ -61,7 +63,7 @@ PICTURE_VERBS = table(
                 Parameter("height", int, "Largest height in pixels, 16 to 1440", between(16, 1440), default=HEIGHT),
             ),
             returns="camera, width, height, format, jpeg",
-            run=_picture,
+            run=_get_picture,
         ),
     ]
 )

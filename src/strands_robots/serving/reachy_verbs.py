@@ -175,8 +175,8 @@ REACHY_VERBS = table(
         *CONTROL_VERBS.values(),
         _read(
             "getStatus",
-            "Read link, daemon state and version, motor mode, application, data age, motion and lockouts.",
-            lambda reachy, _: success("Reachy Mini.", **reachy.facts()),
+            "Read link, daemon state, version, motor mode, application, data age, motion, its outcome and lockouts.",
+            lambda reachy, _: reachy.get_task_status(),
         ),
         _read(
             "getDaemonStatus",

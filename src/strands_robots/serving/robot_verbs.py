@@ -208,8 +208,13 @@ def status(robot: Robot, arguments: Arguments) -> Envelope:
         task_status="running" if running else "idle",
         robots=robot.list_robots(),
         policies=running,
-        **({"failed_policies": robot.failed_policies()} if hasattr(robot, "failed_policies") else {}),
+        **{name: getattr(robot, name)() for name in ("failed_policies", "outcomes") if hasattr(robot, name)},
     )
+
+
+def _world_status(world: WorldRobot, arguments: Arguments) -> Envelope:
+    running = world.list_policies_running()
+    return {**world.get_state(), "task_status": "running" if running else "idle"}
 
 
 def start(robot: Robot, arguments: Arguments) -> Envelope:
@@ -332,8 +337,8 @@ ARM_VERBS = table(
         Verb(
             "getStatus",
             Kind.READ,
-            "Read what the robot is doing: task state, instruction and steps so far.",
-            returns="task_status, instruction, step_count, duration, locked, lockout, check_in",
+            "Read what the robot is doing, or how its last task or motion ended: state, instruction, steps, outcome.",
+            returns="task_status, instruction, step_count, duration, outcome, locked, lockout, check_in",
             method="get_task_status",
         ),
         GET_FEATURES,
@@ -364,9 +369,9 @@ WORLD_VERBS = table(
         Verb(
             "getStatus",
             Kind.READ,
-            "Read simulated time, physics steps, joints of every robot and the policies that run.",
-            returns="sim_time, step_count, robots, running_policies, locked, lockout, check_in",
-            method="get_state",
+            "Read simulated time, physics steps, joints, the policies that run and how the last ones ended.",
+            returns="task_status, sim_time, step_count, robots, running_policies, outcomes, locked, lockout, check_in",
+            run=_world_status,
         ),
         Verb("getFeatures", Kind.READ, "Read joints, actuators and cameras by robot.", method="get_features"),
         Verb(

@@ -274,7 +274,8 @@ class Simulation(ArmMixin, TeleopMixin):
         """Return the state of physics and of every robot.
 
         ``sim_time`` (s), ``step_count``, ``robots`` (name to joints in radians), ``running_policies`` (rows by robot),
-        ``failed_policies`` (reason by robot, until its next policy), ``real_time_factor`` and ``diverged``.
+        ``failed_policies`` (reason by robot, until its next policy), ``outcomes`` (how the last policy or motion of a
+        robot ended, until its next one), ``real_time_factor`` and ``diverged``.
         """
         snapshot = self.physics.snapshot
         robots = {name: snapshot.observation(parts) for name, parts in snapshot.stage.robots.items()}
@@ -285,6 +286,7 @@ class Simulation(ArmMixin, TeleopMixin):
             robots=robots,
             running_policies={row["robot"]: row for row in self.list_policies_running()},
             failed_policies=self.failed_policies(),
+            outcomes=self.outcomes(),
             real_time_factor=round(self._clock.real_time_factor, 4),
             diverged=self.physics.diverged,
         )
@@ -433,6 +435,11 @@ class Simulation(ArmMixin, TeleopMixin):
     def failed_policies(self) -> dict[str, str]:
         """Return why the last policy of a robot failed, by robot, until its next one."""
         return {name: rollout.error for name, rollout in list(self._rollouts.items()) if rollout.state == "error"}
+
+    def outcomes(self) -> dict[str, dict[str, Any]]:
+        """Return how the last rollout of each robot ended, until its next one."""
+        ended = {name: self.outcome_of(rollout) for name, rollout in list(self._rollouts.items())}
+        return {name: outcome for name, outcome in ended.items() if outcome is not None and name in self._bodies}
 
     def policy_facts(self, robot_name: str | None = None) -> RobotFacts:
         """Return what a policy is checked against; a rollout gets no pictures here."""

@@ -59,7 +59,8 @@ def robot_mesh(
         duration: Longest time the motion may take, in seconds, above 0 and at most 3600.
         verb: For call: the verb, such as getObjects, pick, drive or look. For move: moveTo (x, y, z in metres in the
             base frame, x forward), moveBy (dx, dy, dz, or direction and distance), moveJoints (joints in degrees),
-            setGripper (opening 0 closed to 1 open), goTo (place), pick (object) or place (x, y, or on).
+            setGripper (opening 0 closed to 1 open), goTo (place), pick (object) or place (x, y, or on). Each
+            takes picture, the camera whose picture its answer brings.
         arguments: The verb's arguments by name, such as {"x": 0.25, "y": 0.0, "z": 0.1} or {"camera": "table"}.
     """
     try:
@@ -96,7 +97,8 @@ def _one_of_world(target: str, arguments: object) -> tuple[str, ...]:
 
 def _with_image(answer: dict[str, Any]) -> dict[str, Any]:
     """Return an answer whose picture is an image block, as models take it."""
-    encoded = answer.get("jpeg")
+    taken = answer.get("picture")
+    encoded = taken.get("jpeg") if isinstance(taken, dict) else answer.get("jpeg")
     if not isinstance(encoded, str):
         return answer
     try:
@@ -104,4 +106,4 @@ def _with_image(answer: dict[str, Any]) -> dict[str, Any]:
     except ValueError:
         return error("The robot's picture could not be decoded.")
     content = [*answer.get("content", []), {"image": {"format": "jpeg", "source": {"bytes": image}}}]
-    return {**{name: value for name, value in answer.items() if name != "jpeg"}, "content": content}
+    return {**{name: value for name, value in answer.items() if name not in ("jpeg", "picture")}, "content": content}

@@ -47,6 +47,20 @@ def test_tip_goes_to_the_point_by_the_goals_on_the_bus(arm: Any, bus: FeetechBus
         assert all(abs(b - a) <= JOINT_SPEED_RAD_S * step + 0.0032 for a, b in itertools.pairwise(angles)), joint
 
 
+def test_status_after_a_motion_has_its_outcome_and_reads_no_bus(arm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = arm()
+    robot.set_gripper(0.0, wait=False)
+    robot.wait_for()
+    robot.move_to(0.25, 0.1, 0.08, speed=1.0, wait=False)
+    eventually(lambda: robot.get_task_status()["task_status"] == "completed", within=30.0)
+    monkeypatch.setattr(robot.device, "get_joints", lambda *_: pytest.fail("a status reads no bus"), raising=False)
+    monkeypatch.setattr(robot.device.bus, "sync_read", lambda *_, **__: pytest.fail("a status reads no bus"))
+    status = robot.get_task_status()
+    assert status["outcome"]["asked"].items() >= {"x": 0.25, "y": 0.1, "z": 0.08}.items()
+    assert status["outcome"]["error_mm"] < 5.0
+    assert (status["task_status"], status["outcome"]["why"]) == ("completed", "it is done")
+
+
 def test_pose_and_gripper_are_told_and_the_jaws_close(arm: Any) -> None:
     robot = arm()
     pose = robot.arm_pose()

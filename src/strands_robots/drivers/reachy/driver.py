@@ -513,13 +513,20 @@ class ReachyDriver:
             "unusable_frames": feed.unusable_frames,
         }
 
-    def _task(self) -> dict[str, str]:
+    def _task(self) -> dict[str, Any]:
         motion = self.motions.current
         if motion is None:
-            return {"task_status": "idle", "instruction": ""}
+            return {"task_status": "idle", "instruction": "", "outcome": None}
+        if motion.running:
+            return {"task_status": "running", "instruction": motion.name, "outcome": None}
         # A move whose end the daemon did not report has ended here.
-        state = motion.state if motion.state in AT_REST or motion.running else "error"
-        return {"task_status": "running" if motion.running else state, "instruction": motion.name}
+        state = motion.state if motion.state in AT_REST else "error"
+        why = motion.detail or ("it is done" if state == "completed" else f"its end is {motion.state}")
+        return {
+            "task_status": state,
+            "instruction": motion.name,
+            "outcome": {"task_status": state, "instruction": motion.name, "why": why},
+        }
 
     def _awake(self) -> str:
         joints = self.connection.feed.fresh_joints

@@ -68,8 +68,15 @@ class BaseMotion:
             instruction=self.instruction,
             step_count=self.sent,
             duration=round(self.elapsed_s, 3),
+            outcome=self._outcome(state),
             **self.status_fields(),
         )
+
+    def _outcome(self, state: str) -> dict[str, Any] | None:
+        if state == "running":
+            return None
+        why = "it was stopped" if self.answer is None else text_of(self.answer)
+        return {"task_status": state, "instruction": self.instruction, "duration": round(self.elapsed_s, 3), "why": why}
 
     def fail_to_begin(self, why: str, **fields: Any) -> Envelope:
         """End the motion before anything was sent; return the error to answer."""
