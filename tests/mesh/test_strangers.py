@@ -11,7 +11,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received, signed
 
-from strands_robots.mesh import registry, safety
+from strands_robots.mesh import commands, registry, safety
 from strands_robots.mesh.console_keys import INPUT, MOTION, ConsoleSigner
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputReceiver
@@ -92,6 +92,54 @@ def test_captured_command_moves_no_other_robot_and_counts_once(peers: Fleet, app
             as_console(peers, f"strands/{name}/cmd", captured[0])
     eventually(lambda: peers.events("wire_motion_refused"))
     assert (arm.started, other.started) == (["wave"], [])
+
+
+def captured_of(peers: Fleet, console: Mesh) -> dict[str, Any]:
+    """The start of arm-1 that its console sent and that was carried out."""
+    captured = received(peers, "strands/arm-1/cmd")
+    assert console.send("arm-1", START, timeout=20)["result"]["status"] == "success"
+    return dict(captured[0])
+
+
+def test_captured_command_does_not_count_again_after_a_restart(peers: Fleet, approved: None) -> None:
+    arm, console = fleet_of(peers)
+    captured = captured_of(peers, console)
+    peers.clock.pass_(1.0)
+    peers.meshes[0].close()
+    assert len(arm.started) == 1
+    peers.join(arm, "arm-1")
+    as_console(peers, "strands/arm-1/cmd", captured)
+    why = eventually(lambda: peers.events("wire_motion_refused"))[0]["reason"]
+    assert "before this peer started" in why
+    assert console.send("arm-1", START, timeout=20)["result"]["status"] == "success"
+    assert len(arm.started) == 2
+
+
+def test_captured_frame_does_not_count_again_after_a_restart(peers: Fleet) -> None:
+    arm, _ = fleet_of(peers)
+    frame = {"peer_id": "console", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1, "events": None}
+    captured = signed(peers, {**frame, "action": {"shoulder.pos": 1.0}})
+    peers.clock.pass_(1.0)
+    peers.meshes[0].close()
+    mesh = peers.join(arm, "arm-1")
+    assert mesh.input_refusal(captured) == "it was sent before this peer started, by its sender's clock"
+    later = {**frame, "t": peers.clock(), "action": {"shoulder.pos": 1.0}}
+    assert mesh.input_refusal(signed(peers, later)) is None
+
+
+def test_flood_of_unsigned_commands_lets_no_captured_one_count_again(
+    peers: Fleet, approved: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commands, "REPLAYS_MAX", 8)
+    arm, console = fleet_of(peers)
+    captured = captured_of(peers, console)
+    for number in range(20):
+        as_console(peers, "strands/arm-1/cmd", command(peers, number))
+        # One after another: what is more than the workers take at once is answered as busy.
+        eventually(lambda number=number: len(peers.events("wire_motion_refused")) > min(number, 4))  # type: ignore[misc]
+    as_console(peers, "strands/arm-1/cmd", captured)
+    assert console.send("arm-1", {"action": "status"}, timeout=20)["type"] == "response"
+    assert arm.started == ["wave"]
 
 
 def test_console_of_another_machine_moves_hardware_once_its_key_is_set(

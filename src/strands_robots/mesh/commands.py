@@ -42,6 +42,9 @@ HALT = "stop over the mesh"
 LOG_EVERY_S = 1.0
 REPLAY_S = wire.FRESH_S + wire.AHEAD_S
 REPLAYS_MAX = 4096
+PROVEN_MAX = 65_536
+"""Signed commands that a peer tells apart in the time in which they are fresh; beyond that it refuses."""
+
 
 TargetOf = Callable[[str], Haltable | None]
 """Gives what a stop means by a name, empty for all there is. Raises :class:`ValidationError` for an unknown name."""
@@ -58,6 +61,8 @@ class SenderCheck:
         self._context = context
         self._hardware = hardware
         self._replays = RecentKeys(REPLAY_S, REPLAYS_MAX, context.monotonic)
+        # Of its own, so that a flood of commands that prove nothing pushes no signed one out.
+        self._proven = RecentKeys(REPLAY_S, PROVEN_MAX, context.monotonic, displace=False)
 
     def __call__(self, command: Command, arguments: Arguments) -> None:
         """Raise :class:`Refused` where the sender may not."""
@@ -70,7 +75,7 @@ class SenderCheck:
             if not self._replays.first((request.sender_id, request.turn_id)):
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the turn was carried out before")
         if self._hardware and command.verb.kind is Kind.MOTION:
-            why = self._unproven(request)
+            why = self._unproven(request) or self._counted_before(request)
             if why is not None:
                 text = (
                     f"{command.verb.name} moves real hardware, and its sender cannot be attributed: {why}. A console "
@@ -88,6 +93,13 @@ class SenderCheck:
         if context.identity.required or certified is None:
             return certified or self._elsewhere(request)
         return context.consoles.refusal(request.body, MOTION) or self._elsewhere(request)
+
+    def _counted_before(self, request: wire.Request) -> str | None:
+        """Return the reason why a proven command may have been carried out, or None."""
+        if request.timestamp is None or self._context.predates(request.timestamp):
+            return "it was issued before this peer started, by its sender's clock; send it again"
+        first = self._proven.first((request.sender_id, request.turn_id))
+        return None if first else "it was carried out before, or too many signed commands came in a minute"
 
     def _elsewhere(self, request: wire.Request) -> str | None:
         return None if request.is_for(self._context.peer_id) else "it was signed for another peer"

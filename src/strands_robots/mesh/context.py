@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from strands_robots.mesh import wire
 from strands_robots.mesh.console_keys import ConsoleSigner, ConsoleTrust
 from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.registry import PeerRegistry
@@ -41,6 +42,19 @@ class Context:
     console: ConsoleSigner = field(default_factory=ConsoleSigner)
     consoles: ConsoleTrust = field(default_factory=ConsoleTrust)
     pacer: Pacer = field(default_factory=Pacer)
+    began: float = field(init=False)
+    _began_at: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.began, self._began_at = self.clock(), self.monotonic()
+
+    def predates(self, stamp: float) -> bool:
+        """True for a message that may have counted before this peer began.
+
+        Args:
+            stamp: wall-clock seconds of its sender. Once what was issued before is no longer fresh, all is false.
+        """
+        return stamp < self.began and self.monotonic() - self._began_at <= wire.FRESH_S + wire.AHEAD_S
 
     def running(self) -> bool:
         return self.transport is not None and self.transport.is_alive()

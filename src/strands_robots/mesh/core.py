@@ -478,6 +478,8 @@ class Mesh(SensorLoopsMixin):
             return why
         stream, sequence = (source, str(frame.get("device"))), wire.finite(frame.get("seq")) or 0.0
         newest = (wire.finite(frame.get("t")) or 0.0, sequence)
+        if self._context.predates(newest[0]):
+            return "it was sent before this peer started, by its sender's clock"
         if newest <= self._newest_input.get(stream, (0.0, -1.0)):
             return "it is no newer than the last one"
         self._newest_input[stream] = newest

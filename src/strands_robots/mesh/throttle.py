@@ -100,12 +100,19 @@ class TroubleLog:
 
 
 class RecentKeys:
-    """Recently used keys, bounded by age in seconds and by number; thread-safe."""
+    """Recently used keys, bounded by age in seconds and by number; thread-safe.
 
-    def __init__(self, seconds: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
+    Args:
+        displace: when it is full the oldest is forgotten; otherwise no new one is first.
+    """
+
+    def __init__(
+        self, seconds: float, most: int, clock: Callable[[], float] = time.monotonic, *, displace: bool = True
+    ) -> None:
         self._seconds = seconds
         self._most = most
         self._clock = clock
+        self._displace = displace
         self._used: dict[Hashable, float] = {}
         self._lock = threading.Lock()
 
@@ -115,7 +122,7 @@ class RecentKeys:
         with self._lock:
             while self._used and now - next(iter(self._used.values())) > self._seconds:
                 del self._used[next(iter(self._used))]
-            if key in self._used:
+            if key in self._used or (len(self._used) >= self._most and not self._displace):
                 return False
             while len(self._used) >= self._most:
                 del self._used[next(iter(self._used))]
