@@ -17,6 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -72,14 +73,29 @@ def read_audit_log(since: float | None = None) -> list[dict[str, Any]]:
 
 
 def audit_head() -> dict[str, Any] | None:
-    """Return the last record that this process wrote, for a witness; never waits."""
+    """Return the last record that this process wrote, for a witness; never waits.
+
+    Before its first record it is the last one on the disk, once that has been read: the first call has that done.
+    """
+    if _WRITER.last is None:
+        _WRITER.put(_journal_key(), threading.Event())
     return stated_head(_WRITER.last)
+
+
+def own_log_id() -> str:
+    """Return the name of this machine's audit, as its heads carry it."""
+    return _log_id(audit_directory())
+
+
+@lru_cache(maxsize=16)
+def _log_id(directory: Path) -> str:
+    return log_id(directory / NAME)
 
 
 def log_witness(witness: str, robot_id: str, head: object, *, signed: bool) -> None:
     """Record the head of another machine's audit, from a verdict of ``robot_id``."""
-    known, own = witnessed(head), _WRITER.last
-    if known is not None and (own is None or known.log != own.log):
+    known = witnessed(head)
+    if known is not None and known.log != own_log_id():
         facts = {"log": known.log, "count": known.count, "last": known.last}
         log_safety_event(WITNESS, robot_id, {**facts, "witness": witness, "signed": signed})
 
@@ -140,11 +156,11 @@ class _Pending:
         self.entries: deque[AuditEntry] = deque()
         self.waiting: list[threading.Event] = []
         self.failing = False
-        self.last: Anchor | None = None
+        self.last = self._last()
         self._reported = 0
 
     def _last(self) -> Anchor | None:
-        head = self.journal.written
+        head = self.journal.stored()
         return None if head is None else Anchor(head.log, head.count, head.last)
 
     def write(self) -> bool:

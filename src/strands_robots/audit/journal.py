@@ -120,6 +120,10 @@ class Journal:
         """Head after the last write of this object."""
         return self._head
 
+    def stored(self) -> Head | None:
+        """Return the head after the last write, of this object or any before it."""
+        return self._head or read_head(self._head_path, self._seal, log_id(self.path))
+
     def append(self, entries: Sequence[AuditEntry]) -> None:
         """Write every entry and return when all of them are on the disk.
 

@@ -243,6 +243,7 @@ class Mesh(SensorLoopsMixin):
             (topics.command(peer), self._commands.on_command),
             (topics.broadcast(), self._commands.on_command),
             (topics.responses(peer), self._requester.on_response),
+            (topics.check_in_answer("*"), self._safety.on_check_in_answer),
         ):
             self._handles.append(transport.declare_subscriber(key, receive))
         if self.robot is not None:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any
 
+from strands_robots.audit import audit_head, own_log_id
 from strands_robots.contract import Robot
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
@@ -25,16 +26,18 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
 from strands_robots.mesh.older_peers import SAFETY, SAFETY_S, Closings
 from strands_robots.mesh.rpc import Requester, stop_outcome
+from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import robot_identity
 from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch, signed_bytes
-from strands_robots.safety.peer_answers import with_lockout_statement
+from strands_robots.safety.peer_answers import enrolled_peers, record_heads, with_lockout_statement
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
-from strands_robots.safety.statements import Purpose
+from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Own
@@ -55,6 +58,8 @@ REPORT_S = 2.0
 """Seconds besides the halt deadline in which the plane reports, its lockout file included."""
 
 RECENT_MAX = 512
+HEADS_PER_S = 20
+"""Answers to check-ins that are read in a second; a flood of them costs no more."""
 
 RETRY_EVERY_S = SPACING_S
 RETRY_ANSWER_S = 1.0
@@ -285,6 +290,9 @@ class FleetSafety:
         self._context = context
         self._adapter = adapter
         self._requester = requester
+        self._witness, self._answers = HeadWitness(always=not robot), CheckInAnswers()
+        audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
+        self._heads = RecentKeys(1.0, HEADS_PER_S, displace=False)
         self._resumes = resumes
         self._robot = robot
         self._retry = EstopRetry(context, requester)
@@ -347,6 +355,7 @@ class FleetSafety:
             "peers_silent": len(silent),
         }
         self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
+        record_heads(context.peer_id, replies, roster)
         unreached = (roster | context.registry.seen_within(KNOWN_S)) - stopped - {context.peer_id}
         self._retry.begin(
             order.epoch,
@@ -630,6 +639,31 @@ class FleetSafety:
         why = self._adapter.check_in(source, body)
         if why is not None:
             context.audit("checkin_rejected", source, reason=why)
+            return
+        answer = self._answers.answer(context.peer_id, body.get("estop_id"), self._adapter.identity)
+        if answer is not None:
+            self._publish(topics.check_in_answer(context.peer_id), answer, "An answer to a check-in", logging.WARNING)
+
+    def on_check_in_answer(self, sample: Sample) -> None:
+        """Write down the head of a robot's audit, where this peer is one of its witnesses."""
+        context = self._context
+        if not self._heads.first((sample.key, sample.payload)):
+            return
+        try:
+            body = wire.decode(sample.payload, topics.BY_NAME["checkin_answer"].max_bytes)
+            source = identifier("device_id", body.get("device_id"))
+        except (wire.WireError, ValidationError) as exc:
+            context.audit("checkin_answer_rejected", reason=str(exc))
+            return
+        bound = context.registry.session_of(source)
+        if sample.key != topics.check_in_answer(source) or (bound is not None and bound != sample.session):
+            context.audit("checkin_answer_rejected", source, reason="the topic or the session is another peer's")
+            return
+        # A robot reads no file here: its stops arrive on this thread.
+        key = None if self._robot else (enrolled_peers() or {}).get(source)
+        proof = proof_of(Purpose.CHECK_IN_ANSWER, source, body, key)
+        if proof is not Proof.WRONG:
+            self._witness.receive(source, body, by=context.peer_id, proven=proof is Proof.SIGNED)
 
     def _signed(self, fields: dict[str, Any], purpose: Purpose, signing_key: Any) -> dict[str, Any]:
         """Return the fields with the time; with a key also signed."""

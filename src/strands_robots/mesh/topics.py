@@ -45,6 +45,7 @@ TABLE: tuple[Topic, ...] = (
     Topic("estop", "strands/safety/estop", 0, None, 4 * KIB, True, True, 1, True, True),
     Topic("resume", "strands/safety/resume", 0, None, 4 * KIB, True, True, 1, True, True),
     Topic("checkin", "strands/*/checkin", 0, None, 4 * KIB, True, True, 1, False, True),
+    Topic("checkin_answer", "strands/*/checkin/answer", 0, None, 4 * KIB, True, False, 1, False, True),
     Topic("broadcast", "strands/broadcast", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("cmd", "strands/*/cmd", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("response", "strands/*/response/**", 0, None, 1024 * KIB, True, True, 1, False, True),
@@ -88,6 +89,10 @@ def broadcast() -> str:
 
 def check_in(controller: str) -> str:
     return f"{ROOT}/{controller}/checkin"
+
+
+def check_in_answer(robot: str) -> str:
+    return f"{ROOT}/{robot}/checkin/answer"
 
 
 def response(requester: str, responder: str, turn: str) -> str:

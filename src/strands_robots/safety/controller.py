@@ -19,10 +19,20 @@ from typing import Any
 from strands_robots.audit import log_witness
 from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
-from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, VERDICT, RenewableLink, StopLink, notification
+from strands_robots.safety.estop_listener import (
+    CHECK_IN,
+    CHECK_IN_ANSWER,
+    ESTOP,
+    VERDICT,
+    FailureBudget,
+    RenewableLink,
+    StopLink,
+    notification,
+)
+from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import REASON_MAX, new_epoch, signed_bytes
-from strands_robots.safety.statements import Proof, Purpose
+from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError, device_id, number
 
@@ -153,9 +163,10 @@ class SafetyController:
         self._closing = threading.Event()
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
+        self._witness, self._heads = HeadWitness(always=True), FailureBudget()
         self._link = make_link()
         self._end_short_turns = shorten_turns()
-        self._link.open((VERDICT,), self._receive, self._link_changed)
+        self._link.open((VERDICT, CHECK_IN_ANSWER), self._receive, self._link_changed)
 
     @property
     def link_up(self) -> bool:
@@ -359,6 +370,9 @@ class SafetyController:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             logger.warning("An answer of %s is not to be read; it counts as none.", source)
             return
+        if event == CHECK_IN_ANSWER:
+            self._witness_head(source, params)
+            return
         with self._changed:
             run, ended = self._stops.get(estop_id) if isinstance(estop_id, str) else None, self._ended
             if run is None and ended is not None and ended.estop_id == estop_id and ended.knows(source):
@@ -366,6 +380,16 @@ class SafetyController:
             if run is not None:
                 run.receive(source, Received(params, run.since_press_ms(at), wall))
                 self._changed.notify_all()
+
+    def _witness_head(self, source: str, params: Any) -> None:
+        """Write down the head in an answer to a check-in; a flood is left out."""
+        now = time.monotonic()
+        if not isinstance(params, dict) or not self._heads.allows("", now):
+            return
+        self._heads.record("", now)
+        proof = proof_of(Purpose.CHECK_IN_ANSWER, source, params, self._keys.get(source))
+        if proof is not Proof.WRONG:
+            self._witness.receive(source, params, by=self.controller_id, proven=proof is Proof.SIGNED)
 
     def _link_changed(self, up: bool) -> None:
         with self._changed:

@@ -17,8 +17,9 @@ from collections import deque
 from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-from strands_robots.audit import audit_head, log_safety_event
+from strands_robots.audit import audit_head, log_safety_event, own_log_id
 from strands_robots.safety.checkin import CheckInRules
+from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import RobotReport, StopOrder, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
@@ -31,6 +32,7 @@ logger = logging.getLogger(__name__)
 ESTOP = "emergencyStop"
 VERDICT = "emergencyStopVerdict"
 CHECK_IN = "safetyCheckIn"
+CHECK_IN_ANSWER = "safetyCheckInAnswer"
 
 ANSWER_AGAIN_S = 0.01
 REFUSAL_INTERVAL_S = 10.0
@@ -300,6 +302,7 @@ class EstopListener:
         self._latch_answers = LatchAnswers()
         self._rules = StopRules(allow=(), keys=())
         self._check_ins = CheckInRules(self._rules)
+        self._witness, self._check_in_answers, self._heads = HeadWitness(), CheckInAnswers(), FailureBudget()
         self._answered: dict[tuple[str, str], float] = {}
         self._redundant: dict[tuple[str, str], None] = {}
         self._repeated: dict[Hashable, bytes] = {}
@@ -330,7 +333,7 @@ class EstopListener:
             link = next((each.link for each in self._registrations if each.key == key), None)
             if link is None:
                 link = make()
-                link.open((ESTOP, CHECK_IN), self.receive, lambda up: None)
+                link.open((ESTOP, CHECK_IN, CHECK_IN_ANSWER), self.receive, lambda up: None)
             registration = ListenerRegistration(self, robot_id, key, link, identity)
             self._registrations = (*self._registrations, registration)
             return registration
@@ -377,6 +380,13 @@ class EstopListener:
         events = self._queue
         if events is None:
             return
+        if event == CHECK_IN_ANSWER:
+            # Robots send these; so many a second, which a flood of them does not exceed.
+            now = time.monotonic()
+            if self._heads.allows("", now):
+                self._heads.record("", now)
+                events.put(event, source, payload, urgent=False)
+            return
         why = self._rules.source_refusal(source)
         if why is None:
             events.put(event, source, payload, urgent=event == ESTOP)
@@ -387,6 +397,7 @@ class EstopListener:
         self._rules = self._make_rules()
         self._rules.require_keys()
         self._check_ins = CheckInRules(self._rules)
+        audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
         if not self._rules.signed:
             logger.warning(
                 "The source of an emergency stop is what it says it is: DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not set, "
@@ -400,6 +411,10 @@ class EstopListener:
     def _run(self, events: FairQueue) -> None:
         while (received := events.get()) is not None:
             try:
+                if received.event == CHECK_IN_ANSWER:
+                    for first in self._registrations[:1]:
+                        self._witness.receive(received.source, params_of(received.payload), by=first.robot_id)
+                    continue
                 if received.event == CHECK_IN:
                     if self._check_in(received) and self._rules.signed:
                         events.vouch(received.source)
@@ -426,7 +441,16 @@ class EstopListener:
             return False
         self._plane.checkin.record(source, received.at)
         self._rules.compare_clock(source, params, received.at)
+        for first in self._registrations[:1]:  # the robots of a process share one audit
+            name = self._wire_id(first.robot_id)
+            answer = self._check_in_answers.answer(name, params.get("estop_id"), first.identity)
+            if answer is not None:
+                first.link.publish(name, CHECK_IN_ANSWER, notification(CHECK_IN_ANSWER, answer))
         return True
+
+    def _wire_id(self, robot_id: str) -> str:
+        entry = self._plane.robots.get(robot_id)
+        return entry.wire_id if entry else robot_id
 
     def _answer(self, report: RobotReport) -> None:
         key, now = (report.robot_id, report.epoch), time.monotonic()
@@ -443,8 +467,7 @@ class EstopListener:
         _bound(self._answered)
         for each in self._registrations:
             if each.robot_id == report.robot_id:
-                entry = self._plane.robots.get(report.robot_id)
-                device_id = entry.wire_id if entry else report.robot_id
+                device_id = self._wire_id(report.robot_id)
                 each.link.publish(device_id, VERDICT, self._verdict(report, device_id, each.identity))
 
     def _verdict(self, report: RobotReport, device_id: str, identity: SigningIdentity | None) -> bytes:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
+from strands_robots.audit import audit_head, log_witness
 from strands_robots.safety.identity import EnrolledKeys, KeyFileError, SigningIdentity
-from strands_robots.safety.statements import Purpose, distrust, signed
+from strands_robots.safety.statements import Proof, Purpose, distrust, proof_of, signed
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +24,8 @@ def with_stop_statement(
     """
     if identity is None:
         return dict(result)
-    statement = signed(identity, Purpose.STOP_VERDICT, peer_id, {"turn_id": turn_id, **_stated(result)})
+    fields = {"turn_id": turn_id, **_stated(result), "audit": audit_head()}
+    statement = signed(identity, Purpose.STOP_VERDICT, peer_id, fields)
     return {**result, "statement": statement}
 
 
@@ -52,6 +54,23 @@ def stop_distrust(reply: Mapping[str, Any], keys: Mapping[str, bytes] | None) ->
     answer = result if isinstance(result, Mapping) else {}
     answered = {"turn_id": reply.get("turn_id"), **_stated(answer)}
     return distrust(Purpose.STOP_VERDICT, name, answer.get("statement"), keys.get(name), answered)
+
+
+def record_heads(witness: str, replies: Iterable[Mapping[str, Any]], expected: Collection[str]) -> None:
+    """Write the audits' heads in answers to ``stop`` into our own audit.
+
+    Args:
+        witness: the peer that asked.
+        expected: peers whose answer counts without an enrolled key.
+    """
+    keys = enrolled_peers() or {}
+    for reply in replies:
+        name, result = str(reply.get("responder_id")), reply.get("result")
+        statement = result.get("statement") if isinstance(result, Mapping) else None
+        if isinstance(statement, Mapping) and (name in keys or name in expected):
+            proof = proof_of(Purpose.STOP_VERDICT, name, statement, keys.get(name))
+            if proof is not Proof.WRONG:
+                log_witness(witness, name, statement.get("audit"), signed=proof is Proof.SIGNED)
 
 
 def lockout_distrust(name: str, facts: Mapping[str, Any], epochs: list[str], keys: Mapping[str, bytes] | None) -> str:

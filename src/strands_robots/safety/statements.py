@@ -23,6 +23,7 @@ class Purpose(StrEnum):
 
     EMERGENCY_STOP = "emergency-stop"
     CHECK_IN = "check-in"
+    CHECK_IN_ANSWER = "check-in-answer"
     STOP_VERDICT = "stop-verdict"
     LOCKOUT_STATE = "lockout-state"
     RESUME_ANSWER = "resume-answer"
