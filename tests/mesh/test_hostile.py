@@ -166,6 +166,11 @@ def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
         "strands/safety/estop": {"peer_id": 5, "t": now, "estop_id": "a" * 32, "source_zid": "ff"},
         "strands/safety/resume": {"peer_id": "x", "t": now, "assertion": assertion, "source_zid": "ff"},
         "strands/console/checkin": {"peer_id": "console", "t": now, "nonce": "1" * 32},
+        "strands/arm-9/checkin/answer": {
+            "device_id": "arm-9",
+            "estop_id": "1" * 32,
+            "audit": {"log": "a" * 32, "count": 1, "last": "b" * 64},
+        },
         "strands/lead/safety/event": {**common, "event": "emergency_stop"},
         "strands/lead/input/leader": {**common, "seq": 1, "action": {"j": 1.0}},
         "strands/lead/camera/front": {**common, "encoding": "jpeg", "data": "AAAA"},

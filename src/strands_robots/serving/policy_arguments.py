@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from functools import lru_cache
 
@@ -10,15 +9,14 @@ from strands_robots import settings
 from strands_robots.policies import provider_names
 from strands_robots.policies.profiles import profiles
 from strands_robots.safety.authorization import provider_refusal
+from strands_robots.serving.policy_hosts import policy_hosts
 from strands_robots.serving.verbs import Check
 from strands_robots.utils import ValidationError, identifier, number, shown, text
 
-POLICY_HOST_NOT_ALLOWED = "POLICY_HOST_NOT_ALLOWED"
 HF_REPO_NOT_ALLOWED = "HF_REPO_NOT_ALLOWED"
 POLICY_TYPE_NOT_ALLOWED = "POLICY_TYPE_NOT_ALLOWED"
 
 BUILT_IN_ORGS = frozenset({"nvidia", "huggingface", "lerobot"})
-LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 MOCK = "mock"
 PROVIDERS = frozenset({MOCK, "remote", "openpi", "lerobot_local", "lerobot"})
 FOREIGN_PROVIDERS = frozenset(
@@ -56,21 +54,6 @@ def registered_providers() -> tuple[str, ...]:
     return provider_names()
 
 
-def policy_host_refusal(host: str) -> str | None:
-    """Return why a server's host is not allowed, or None; names are not resolved."""
-    name = host.strip("[]").lower()
-    allow = settings.items("STRANDS_MESH_POLICY_HOST_ALLOW")
-    if name in LOOPBACK_NAMES or name in {entry.lower() for entry in allow}:
-        return None
-    try:
-        address = ipaddress.ip_address(name)
-    except ValueError:
-        address = None
-    if address is not None and (address.is_loopback or any(_within(address, entry) for entry in allow)):
-        return None
-    return f"policy_host must be loopback or listed in STRANDS_MESH_POLICY_HOST_ALLOW, not {shown(host)}."
-
-
 def known_provider(name: str, value: object) -> str:
     """Check that a provider is known here or listed, and allowed."""
     provider = identifier(name, value)
@@ -87,12 +70,8 @@ def known_provider(name: str, value: object) -> str:
 
 
 def policy_host(name: str, value: object) -> str:
-    """Check a host that :func:`policy_host_refusal` allows."""
-    host = text(name, value, longest=253)
-    refusal = policy_host_refusal(host)
-    if refusal is not None:
-        raise ValidationError(refusal, POLICY_HOST_NOT_ALLOWED)
-    return host
+    """Return the address of a policy server that callers may name."""
+    return policy_hosts().address(text(name, value, longest=253))
 
 
 def repository(name: str, value: object) -> str:
@@ -119,11 +98,3 @@ def vector(longest: int, *, exactly: bool = False) -> Check:
         return [number(name, entry, low=-1e6, high=1e6) for entry in value]
 
     return check
-
-
-def _within(address: ipaddress.IPv4Address | ipaddress.IPv6Address, entry: str) -> bool:
-    try:
-        network = ipaddress.ip_network(entry, strict=False)
-    except ValueError:
-        return False
-    return address.version == network.version and address in network
