@@ -645,7 +645,7 @@ class FleetSafety:
             self._publish(topics.check_in_answer(context.peer_id), answer, "An answer to a check-in", logging.WARNING)
 
     def on_check_in_answer(self, sample: Sample) -> None:
-        """Write down the head of a robot's audit, where this peer is one of its witnesses."""
+        """Write down the head of a robot's audit, if this peer is its witness."""
         context = self._context
         if not self._heads.first((sample.key, sample.payload)):
             return

@@ -32,7 +32,7 @@ CLAIMS_PER_MIN = 32
 
 
 class HeadWitness:
-    """The heads of other machines' audits, and which of them to write down. Thread-safe.
+    """Choice of other machines' audits whose heads are written down. Thread-safe.
 
     Args:
         always: write those of all audits, as a controller does, not only where this machine is chosen.
