@@ -13,8 +13,8 @@ from websockets.sync.server import ServerConnection, serve
 
 from strands_robots.policies.remote import RemotePolicy
 from strands_robots.serving import policy_hosts
+from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.policy_hosts import PolicyHosts
-from strands_robots.serving.robot_verbs import PEER_VERBS
 from strands_robots.utils import ValidationError
 
 NAME = "gpu-1.lan"
