@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.errors import StrandsRobotsError
@@ -78,10 +78,40 @@ def checked_action(action: object, ranges: Ranges) -> Action:
     return checked
 
 
+class Observation(Mapping[str, Any]):
+    """Numbers of a robot, and pictures that are drawn when they are first read.
+
+    Args:
+        joints: the numbers, by key.
+        pictures: draws each picture as it was when the numbers were read, by camera.
+    """
+
+    def __init__(self, joints: Mapping[str, float], pictures: Mapping[str, Callable[[], Any]]) -> None:
+        self.joints = dict(joints)
+        self._pictures = dict(pictures)
+        self._drawn: dict[str, Any] = {}
+
+    def __getitem__(self, key: str) -> Any:
+        if key in self.joints:
+            return self.joints[key]
+        if key not in self._drawn:
+            self._drawn[key] = self._pictures[key]()
+        return self._drawn[key]
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self.joints
+        yield from self._pictures
+
+    def __len__(self) -> int:
+        return len(self.joints) + len(self._pictures)
+
+
 def numbers(observation: Mapping[str, object]) -> dict[str, float]:
     """Return the finite numbers of an observation, without images, flags and text."""
     finite: dict[str, float] = {}
-    for key, value in observation.items():
+    # To look at the pictures would draw them.
+    plain = observation.joints if isinstance(observation, Observation) else observation
+    for key, value in plain.items():
         scalar = _plain(value)
         if isinstance(scalar, int | float) and not isinstance(scalar, bool) and math.isfinite(scalar):
             finite[key] = float(scalar)

@@ -95,7 +95,7 @@ class Body(Protocol):
     def speeds(self) -> Mapping[str, float]:
         """Greatest speed by action key, in its unit a second; only of bounded keys."""
 
-    def get_observation(self) -> dict[str, Any]:
+    def get_observation(self) -> Mapping[str, Any]:
         """Return the numbers and images that the body observes."""
 
     def get_joints(self) -> dict[str, float]:
@@ -403,7 +403,7 @@ class Rollout:
             self._paced.miss(late)
         return tick + 1 + max(late, 0)
 
-    def _observe(self) -> dict[str, Any]:
+    def _observe(self) -> Mapping[str, Any]:
         return self._body.get_observation() if self._policy.uses_cameras else dict(self._body.get_joints())
 
     def _hold(self, state: State) -> State:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,13 @@ Frames = Callable[[], Mapping[str, Any]]
 """Returns height x width x 3 arrays of uint8 by camera name."""
 
 
+Draw = Callable[[str], Any]
+"""Draws the picture of a camera of a simulated world."""
+
+STREAM_WIDTH, STREAM_HEIGHT = 320, 240
+"""Size of the pictures that a simulated world streams and records."""
+
+
 class LazyFrames(Mapping[str, Any]):
     """Pictures by camera name, each taken when read: a failure affects no other."""
 
@@ -44,18 +51,17 @@ class LazyFrames(Mapping[str, Any]):
 def frames_of(robot: Any) -> Frames | None:
     """Return a function that takes a picture with each camera, or None without any.
 
-    A robot's own ``camera_frames()`` comes first, then a simulation's ``render``, then the pictures in a device's
+    A robot's own ``camera_frames()`` comes first, then a simulation's drawing, then the pictures in a device's
     ``get_observation()``. A camera ``arm/wrist`` is called ``arm.wrist`` on the wire, which allows no slash.
     """
     body = body_of(robot)
-    own, render, observe = (getattr(body, verb, None) for verb in ("camera_frames", "render", "get_observation"))
+    own, observe = getattr(body, "camera_frames", None), getattr(body, "get_observation", None)
     if callable(own):
         frames: Frames = own
         return frames
-    if isinstance(robot, WorldRobot) and callable(render):
-        return lambda: LazyFrames(
-            {str(name).replace("/", "."): partial(render, name) for name in robot.get_features().get("cameras", ())}
-        )
+    draw = _drawing(robot)
+    if draw is not None:
+        return lambda: _drawn(draw, robot.get_features().get("cameras", ()))
     if callable(observe):
         return lambda: {str(name): value for name, value in observe().items() if getattr(value, "ndim", 0) == 3}
     return None
@@ -72,8 +78,8 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
     Raises:
         ValidationError: a simulated world has no camera of that name.
     """
-    render = getattr(robot, "render", None)
-    if not isinstance(robot, WorldRobot) or not callable(render):
+    draw = _drawing(robot)
+    if draw is None:
         frames = frames_of(robot)
         if frames is None or names is None:
             return frames
@@ -85,7 +91,21 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
     for name in wanted:
         if name not in known:
             raise ValidationError(f"camera must be one of {', '.join(known)}, not {shown(name)}.")
-    return lambda: LazyFrames({name.replace("/", "."): partial(render, name) for name in wanted})
+    return lambda: _drawn(draw, wanted)
+
+
+def _drawing(robot: Any) -> Draw | None:
+    """Return what draws a picture of a simulated world, None for a real robot."""
+    if not isinstance(robot, WorldRobot):
+        return None
+    draw, render = getattr(robot, "camera_picture", None), getattr(robot, "render", None)
+    if callable(draw):
+        return lambda name: draw(name, STREAM_WIDTH, STREAM_HEIGHT)
+    return render if callable(render) else None
+
+
+def _drawn(draw: Draw, names: Iterable[object]) -> LazyFrames:
+    return LazyFrames({str(name).replace("/", "."): partial(draw, str(name)) for name in names})
 
 
 def _selected(frames: Mapping[str, Any], names: Sequence[str]) -> LazyFrames:

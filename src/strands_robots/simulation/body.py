@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from strands_robots.kinematics.arm import Arm
 from strands_robots.kinematics.chain import Chain
-from strands_robots.policies.base import checked_speeds
+from strands_robots.policies.base import Observation, checked_speeds
 from strands_robots.safety.gate import Permit
 from strands_robots.simulation.catalog import ModelSource
 from strands_robots.simulation.engine import mujoco
@@ -22,6 +22,15 @@ from strands_robots.simulation.physics import Physics, Snapshot
 from strands_robots.simulation.stage import Actuator, RobotParts
 from strands_robots.utils import ValidationError, mapping, number, w_positive, yaw_of
 
+WORLD_CAMERAS = ("front", "table")
+"""Cameras of the world that every robot observes with, besides its own."""
+
+PICTURE = (480, 640, 3)
+"""Shape of a picture in an observation."""
+
+Draw = Callable[[Snapshot, str], Any]
+"""Draws the picture of a camera, by its full name."""
+
 PLANAR = 2
 """Sliding joints of one body that make it a mobile base; one alone is a rail, or an arm's first joint."""
 
@@ -29,13 +38,19 @@ PLANAR = 2
 class RobotBody:
     """One robot by joint and actuator name, without its prefix in the world.
 
-    A rollout or a teleoperation drives it. Every method raises :class:`ValidationError` once the robot was removed.
+    A rollout or a teleoperation drives it; ``draw`` makes the pictures of its observations. Every method raises :class:`ValidationError` once the robot was removed.
     """
 
     def __init__(
-        self, name: str, physics: Physics, clock: WorldClock, speed_limit: float | Mapping[str, float] | None = None
+        self,
+        name: str,
+        physics: Physics,
+        clock: WorldClock,
+        speed_limit: float | Mapping[str, float] | None = None,
+        draw: Draw | None = None,
     ) -> None:
         self.name = name
+        self._draw = draw
         self._physics = physics
         self._clock = clock
         self._speed_limit = speed_limit
@@ -53,7 +68,16 @@ class RobotBody:
     @property
     def observation_features(self) -> dict[str, Any]:
         """Type of each observation key."""
-        return dict.fromkeys(self.get_observation(), float)
+        return {**dict.fromkeys(self.get_joints(), float), **dict.fromkeys(self.cameras, PICTURE)}
+
+    @property
+    def cameras(self) -> dict[str, str]:
+        """Full name of each camera of an observation: its own, and two of the world."""
+        if self._draw is None:
+            return {}
+        _, parts = self._present()
+        own = {name.removeprefix(f"{self.name}/"): name for name in parts.cameras}
+        return {**{name: name for name in WORLD_CAMERAS}, **own}
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
@@ -91,13 +115,20 @@ class RobotBody:
         """Return the simulated time in seconds."""
         return self._physics.snapshot.time
 
-    def get_observation(self) -> dict[str, float]:
+    def get_joints(self) -> dict[str, float]:
         """Return joint positions (rad; m for a slide) and the pose of a free base."""
         snapshot, parts = self._present()
         return snapshot.observation(parts)
 
-    get_joints = get_observation
-    """An observation of a simulated robot holds numbers alone."""
+    def get_observation(self) -> Observation:
+        """Return the joints, and 640 x 480 pictures of :attr:`cameras` of that moment.
+
+        A picture is drawn when it is read, so that a loop that reads none costs no drawing.
+        """
+        snapshot, parts = self._present()
+        draw = self._draw
+        pictures = {} if draw is None else {key: partial(draw, snapshot, name) for key, name in self.cameras.items()}
+        return Observation(snapshot.observation(parts), pictures)
 
     def send_action(self, action: Mapping[str, float], permit: Permit | None = None) -> dict[str, float]:
         """Set targets, clamped to the actuators' ranges, and return them.

@@ -27,10 +27,10 @@ from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObserve
 from strands_robots.safety.gate import MotionGate, Waiting, answered
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.simulation import projection
-from strands_robots.simulation.body import RobotBody
+from strands_robots.simulation.body import PICTURE, RobotBody
 from strands_robots.simulation.objects import targets_of
 from strands_robots.simulation.pacing import WorldClock
-from strands_robots.simulation.physics import CHUNK, Physics
+from strands_robots.simulation.physics import CHUNK, Physics, Snapshot
 from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
 from strands_robots.simulation.rendering import (
     OVERVIEW,
@@ -45,7 +45,7 @@ from strands_robots.simulation.rendering import (
 )
 from strands_robots.simulation.stage import compile_stage, in_floor
 from strands_robots.teleop_mixin import TeleopMixin
-from strands_robots.utils import ValidationError, flag, identifier, number, shown, text, whole
+from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown, text, whole
 
 logger = logging.getLogger(__name__)
 
@@ -315,9 +315,11 @@ class Simulation(ArmMixin, TeleopMixin):
             timestep=stage.plan.timestep,
         )
 
-    def get_observation(self, robot_name: str | None = None) -> dict[str, float]:
-        """Return joint positions of one robot, as :meth:`RobotBody.get_observation`."""
-        return self.body(robot_name).get_observation()
+    def get_observation(self, robot_name: str | None = None, cameras: Iterable[str] = ()) -> dict[str, Any]:
+        """Return joint positions of one robot, and the pictures of some cameras."""
+        body = self.body(robot_name)
+        observed, names = body.get_observation(), [choice("cameras", each, tuple(body.cameras)) for each in cameras]
+        return {**observed.joints, **{name: observed[name] for name in names}}
 
     @answered
     def get_pose(self, robot_name: str | None = None) -> Envelope:
@@ -442,10 +444,11 @@ class Simulation(ArmMixin, TeleopMixin):
         return {name: outcome for name, outcome in ended.items() if outcome is not None and name in self._bodies}
 
     def policy_facts(self, robot_name: str | None = None) -> RobotFacts:
-        """Return what a policy is checked against; a rollout gets no pictures here."""
+        """Return what a policy is checked against."""
         body = self.body(robot_name)
         rate = settings.number("STRANDS_CONTROL_HZ")
-        return RobotFacts(body.name, body.get_observation(), list(body.bounds), body.joint_units, {}, rate)
+        pictures = dict.fromkeys(body.cameras, PICTURE)
+        return RobotFacts(body.name, body.get_joints(), list(body.bounds), body.joint_units, pictures, rate)
 
     def occupied(self, robot: str) -> str:
         """Name the rollout that drives this robot, for a refusal; empty without one."""
@@ -524,11 +527,19 @@ class Simulation(ArmMixin, TeleopMixin):
         return picture, how
 
     def camera_picture(self, camera: str, width: int, height: int) -> Picture:
-        """Draw a picture fast: by OpenGL, where that works, and without shadows."""
+        """Draw a picture fast: by OpenGL, where that works, and without shadows.
+
+        Policies, recordings, the networks and agents have their pictures from here.
+        """
+        self._require_open()
+        return self._draw(self.physics.snapshot, camera, *picture_size(width, height))
+
+    def _draw(self, snapshot: Snapshot, camera: str, width: int = PICTURE[1], height: int = PICTURE[0]) -> Picture:
         try:
-            return self.render(camera, width, height)
+            return self._renderer.render(snapshot, camera, width, height, quality=False)
         except RenderingError:
-            return self.project(camera, width, height)
+            data = snapshot.data()
+            return projection.draw(snapshot.stage, data, camera_view(snapshot.stage, data, camera), width, height)
 
     def view(self, camera: str = OVERVIEW) -> CameraView:
         """Return the present view of ``camera``, which puts world points into a picture."""
@@ -599,7 +610,8 @@ class Simulation(ArmMixin, TeleopMixin):
         """Compile ``plan`` and switch to it; nothing changes when it does not compile."""
         self.physics.replace(compile_stage(plan))
         self._bodies = {
-            r.name: self._bodies.get(r.name) or RobotBody(r.name, self.physics, self._clock, self._speed_limit)
+            r.name: self._bodies.get(r.name)
+            or RobotBody(r.name, self.physics, self._clock, self._speed_limit, self._draw)
             for r in plan.robots
         }
 
