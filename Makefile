@@ -1,4 +1,4 @@
-.PHONY: help demo test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next dds-security models
+.PHONY: help demo dashboard test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,6 +23,9 @@ demo:  ## An agent in another process has a simulated arm put a cube on a plate,
 
 serve: venv  ## Serve a simulated SO-100 on this machine (ROBOT=..., ARGS=...)
 	@$(BIN)/strands-robots serve $(or $(ROBOT),so100) $(ARGS)
+
+dashboard: venv  ## The operator's page in a browser, on four simulated robots
+	@$(BIN)/strands-robots dashboard --demo $(ARGS)
 
 test: venv  ## Everything that needs nothing but wheels
 	@$(BIN)/python -m pytest -m "not system" $(WORKERS) $(ARGS)

@@ -19,6 +19,7 @@ COMMANDS = {
     "resume": ("resume", "lockout", "grant"),
     "control": ("take",),
     "watch": ("watch",),
+    "dashboard": ("dashboard",),
     "teleop": ("teleop", "calibrate", "replay"),
     "record": ("record",),
     "policy": ("policy",),

@@ -75,7 +75,7 @@ def resume(
         found = ask_robots(fleet, wanted or lockable_robots(fleet), seconds)
         if not found:
             raise CliError(f"No robot answered. {describe(fleet.link)}", Exit.SILENT, devices={})
-        outcome = _resume_all(fleet, found, signer, seconds)
+        outcome = resume_robots(fleet, found, signer, seconds)
     _report(screen, outcome, THEN)
 
 
@@ -222,7 +222,11 @@ def _ask(fleet: FleetClient, name: str, seconds: float, key: bytes | None) -> Lo
         answer = call_device(fleet, name, "getStatus", {}, seconds)
     except CliError as failure:
         return LockoutReport(name, problem=failure.reason)
-    took_ms = (time.monotonic() - began) * 1000
+    return status_report(name, answer, (time.monotonic() - began) * 1000, key)
+
+
+def status_report(name: str, answer: Mapping[str, Any], took_ms: float, key: bytes | None) -> LockoutReport:
+    """Return the lockouts in an answer to getStatus; ``key`` is the enrolled one."""
     if "locked" not in answer:
         return LockoutReport(name, problem="it does not report lockouts", facts=answer, round_trip_ms=took_ms)
     rows = answer.get("lockout")
@@ -253,10 +257,10 @@ def _clear_locally(screen: Screen, wanted: list[str]) -> None:
     _report(screen, outcome, f"Recorded in the audit as cleared by {operator()}.")
 
 
-def _resume_all(
+def resume_robots(
     fleet: FleetClient, found: list[LockoutReport], signer: Any, seconds: float
 ) -> dict[str, tuple[bool, str]]:
-    """Sign and send a resume of every lockout; return each robot's answer."""
+    """Sign and send a resume of every lockout; return each robot's outcome."""
     keys = _enrolled(fleet)
     by_epoch: dict[str, list[str]] = {}
     for robot in found:

@@ -68,7 +68,7 @@ def _run(screen: DemoScreen, report: DemoReport, output: Path) -> None:
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415
     from strands_robots.simulation.tabletop import TABLETOP  # noqa: PLC0415
 
-    port = _free_port()
+    port = free_port()
     screen.head(f"Another process serves a simulated {ROBOT} at a table; this one is the agent, by a script")
     with ExitStack() as stack:
         key = stack.enter_context(demo_operator())
@@ -95,7 +95,7 @@ def _run(screen: DemoScreen, report: DemoReport, output: Path) -> None:
     screen.done(f"the gripper's path and an animation, replayed and {how}: {', '.join(map(str, files))}")
 
 
-def _free_port() -> int:
+def free_port() -> int:
     """Return a TCP port of 127.0.0.1 that is free at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

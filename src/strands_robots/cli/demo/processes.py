@@ -61,12 +61,13 @@ class RobotProcess:
 
 @contextmanager
 def served_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -> Iterator[RobotProcess]:
-    """Serve ``robot`` in a scene on 127.0.0.1 at ``port`` while the block runs.
+    """Serve ``robot`` in a scene, or without, at ``port`` while the block runs.
 
     Raises:
         CliError: it is not on the network within :data:`READY_S` seconds.
     """
-    where = ("--set", f"scene={scene}", "--peer-id", peer_id, "--port", str(port), "--tenant", tenant)
+    furnished = ("--set", f"scene={scene}") if scene else ()
+    where = (*furnished, "--peer-id", peer_id, "--port", str(port), "--tenant", tenant)
     process = subprocess.Popen(
         [sys.executable, "-m", "strands_robots.cli", "serve", robot, *where, "--json", "--until-stdin-closes"],
         stdin=subprocess.PIPE,

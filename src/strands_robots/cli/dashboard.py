@@ -1,0 +1,221 @@
+"""``dashboard``: every robot in a browser, and a STOP for all of them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import socket
+import threading
+import webbrowser
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from strands_robots import settings
+from strands_robots.cli.command import command
+from strands_robots.cli.keys import PassphraseFile, signing_key
+from strands_robots.cli.network import Network, mesh_peer, temporary_mesh_id
+from strands_robots.cli.output import CliError, Exit, Screen
+from strands_robots.safety.ed25519 import keygen
+from strands_robots.utils import device_id, missing_extra
+
+if TYPE_CHECKING:
+    from strands_robots.dashboard.feed import FleetFeed
+    from strands_robots.dashboard.fleet_model import FleetModel
+    from strands_robots.dashboard.listening import RemoteAddress
+    from strands_robots.dashboard.server import Dashboard
+
+PORT = 8800
+DEMO_ROBOTS = {"arm-1": "tabletop", "arm-2": "tabletop", "arm-3": "", "arm-4": ""}
+DEMO_TENANT = "dashboard-demo"
+START_S = 10.0
+POLL_S = 0.02
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    command(app, "dashboard", network=True)(dashboard)
+
+
+def dashboard(
+    screen: Screen,
+    network: Network,
+    *,
+    port: Annotated[int, typer.Option("--port", help="Port of the page; 0 for a free one.", min=0, max=65535)] = PORT,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open a browser.")] = False,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            "--listen", help="Also serve it at this address, with TLS, a token and a QR code.", metavar="ADDRESS"
+        ),
+    ] = None,
+    viewer: Annotated[bool, typer.Option("--viewer", help="Pages on this machine look and stop only.")] = False,
+    key: Annotated[
+        Path | None, typer.Option("--key", help="Sign stops with it; then only enrolled robots confirm one.")
+    ] = None,
+    operator_key: Annotated[
+        Path | None, typer.Option("--operator-key", help="Frees robots; its passphrase is asked for on the page.")
+    ] = None,
+    passphrase_file: PassphraseFile = None,
+    source: Annotated[str, typer.Option("--as", help="The caller and the source that robots see.")] = "dashboard",
+    meet: Annotated[
+        int | None, typer.Option("--meet", help="Loopback port where local robots meet.", min=1, max=65535)
+    ] = None,
+    with_mesh: Annotated[bool, typer.Option("--mesh", help="Also the robots of the native mesh.")] = False,
+    demo: Annotated[bool, typer.Option("--demo", help="Serve four simulated robots to try it with.")] = False,
+) -> None:
+    """Show every robot in a browser: watch, drive, stop; on 127.0.0.1 alone."""
+    source = device_id("--as", source)
+    if operator_key is not None and not operator_key.is_file():
+        raise CliError(f"--operator-key {operator_key} is no file.", Exit.USAGE)
+    if demo and (operator_key is not None or meet is not None or network != Network()):
+        raise CliError("--demo has robots, a network and an operator's key of its own.", Exit.USAGE)
+    signer = None if key is None else signing_key(key, passphrase_file)
+    try:
+        from strands_robots.dashboard.fleet_model import FleetModel  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.dashboard.listening import access_for, remote_address  # noqa: PLC0415 - as above
+        from strands_robots.dashboard.operator_key import OperatorKey  # noqa: PLC0415 - as above
+        from strands_robots.dashboard.server import Dashboard  # noqa: PLC0415 - as above
+    except ModuleNotFoundError as exc:
+        raise missing_extra("The page", "dashboard") from exc
+    with ExitStack() as stack:
+        if demo:
+            meet, operator_key = stack.enter_context(_demo_robots(screen))
+            network = replace(network, tenant=DEMO_TENANT)
+        sockets = [stack.enter_context(_bound("127.0.0.1", port))]
+        port = int(sockets[0].getsockname()[1])
+        remote = None if listen is None else remote_address(listen, port)
+        if remote is not None:
+            sockets.append(stack.enter_context(_bound(remote.host, port)))
+        model = FleetModel()
+        feeds = _feeds(stack, model, replace(network, port=meet), source, signer, with_mesh=with_mesh)
+        page = Dashboard(
+            model,
+            feeds,
+            access_for(port, remote, viewer=viewer),
+            OperatorKey(operator_key),
+            source=source,
+            signed=signer is not None,
+        )
+        stack.callback(page.close)
+        _serve(screen, page, sockets, remote, browser=not no_browser)
+
+
+def _feeds(
+    stack: ExitStack, model: FleetModel, network: Network, source: str, signer: Any, *, with_mesh: bool
+) -> list[FleetFeed]:
+    """Join the networks; they are left when the stack ends."""
+    from strands_robots.dashboard.device_connect_feed import DeviceConnectFeed  # noqa: PLC0415 - as above
+
+    feeds: list[FleetFeed] = [DeviceConnectFeed(model, stack.enter_context(network.fleet(source)), signer)]
+    if with_mesh:
+        from strands_robots.dashboard.mesh_feed import MeshFeed  # noqa: PLC0415 - as above
+
+        mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id(source), "controller"))
+        feeds.append(MeshFeed(model, mesh, signer))
+    return feeds
+
+
+@contextmanager
+def _bound(host: str, port: int) -> Iterator[socket.socket]:
+    """Bind a listening socket, closed at the end.
+
+    Raises:
+        CliError: the address is not of this machine, or its port is taken.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as bound:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            bound.bind((host, port))
+        except OSError as exc:
+            raise CliError(f"The page cannot be served at {host} port {port}: {exc.strerror}.") from exc
+        yield bound
+
+
+def _serve(
+    screen: Screen, page: Dashboard, sockets: list[socket.socket], remote: RemoteAddress | None, *, browser: bool
+) -> None:
+    """Serve until Ctrl-C or SIGTERM."""
+    from strands_robots.dashboard.server import QuietServer, configured  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.shutdown import StopSignal  # noqa: PLC0415 - as above
+
+    port = int(sockets[0].getsockname()[1])
+    app, url = page.app(), f"http://127.0.0.1:{port}/"
+    servers = [QuietServer(configured(app, "127.0.0.1", port))]
+    if remote is not None:
+        tls = {"ssl_certfile": str(remote.cert), "ssl_keyfile": str(remote.key), "lifespan": "off"}
+        servers.append(QuietServer(configured(app, remote.host, port, **tls)))
+
+    async def run() -> None:
+        await asyncio.gather(*(each.serve([bound]) for each, bound in zip(servers, sockets, strict=True)))
+
+    thread = threading.Thread(target=lambda: asyncio.run(run()), name="dashboard", daemon=True)
+    with StopSignal() as signals:
+        thread.start()
+        try:
+            while not all(each.started for each in servers) and thread.is_alive():
+                if signals.wait(POLL_S) is not None:
+                    return
+            _announce(screen, url, remote)
+            if browser and screen.live:
+                with contextlib.suppress(webbrowser.Error):  # the address is on the screen
+                    webbrowser.open(url)
+            while thread.is_alive() and signals.wait(0.2) is None:
+                pass
+        finally:
+            for each in servers:
+                each.should_exit = True
+            thread.join(START_S)
+    screen.say("The page is off. Robots that were stopped stay locked.")
+
+
+def _announce(screen: Screen, url: str, remote: RemoteAddress | None) -> None:
+    facts: dict[str, Any] = {"event": "serving", "url": url}
+    screen.say("The page is at")
+    screen.copyable(f"  {url}")
+    if remote is not None:
+        from strands_robots.dashboard.access import ROLES  # noqa: PLC0415 - as above
+        from strands_robots.dashboard.listening import qr_code  # noqa: PLC0415 - as above
+
+        facts |= {"remote": {role: remote.url(role) for role in ROLES}, "fingerprint": remote.fingerprint}
+        for role in ROLES:
+            screen.say(f"For a phone, as {role}:")
+            screen.copyable(f"  {remote.url(role)}")
+            for line in qr_code(remote.url(role)).splitlines():
+                screen.copyable(line)
+        screen.say("The browser asks about the certificate once. Its SHA-256 fingerprint:")
+        screen.copyable(f"  {remote.fingerprint}")
+    screen.data(facts)
+    screen.say("Space stops all robots. Ctrl-C here ends the page, not the robots.")
+
+
+@contextmanager
+def _demo_robots(screen: Screen) -> Iterator[tuple[int, Path]]:
+    """Serve the demo's robots with an operator's key; yield their port and the key."""
+    import tempfile  # noqa: PLC0415 - the demo only
+
+    from strands_robots.cli.demo import free_port  # noqa: PLC0415 - the demo only
+    from strands_robots.cli.demo.processes import served_robot  # noqa: PLC0415 - the demo only
+
+    passphrase = f"Demo-{secrets.token_hex(8)}"
+    with tempfile.TemporaryDirectory(prefix="strands-dashboard-") as folder, ExitStack() as stack:
+        key = Path(folder) / "operator.pem"
+        settings.put("STRANDS_MESH_RESUME_PUBLIC_KEY", keygen(key, passphrase))
+        settings.put("STRANDS_STATE_DIR", folder)
+        settings.put("STRANDS_MESH_AUDIT_DIR", "")
+        for name in ("DEVICE_CONNECT_ESTOP_ALLOW", "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS"):
+            settings.put(name, "")
+        settings.put("STRANDS_CHECKIN_TIMEOUT_S", "0")
+        port = free_port()
+        screen.say("Starting four simulated robots...")
+        for name, scene in DEMO_ROBOTS.items():
+            stack.enter_context(served_robot("so100", scene, name, port, DEMO_TENANT))
+        screen.data({"event": "demo", "passphrase": passphrase, "meet": port})
+        screen.say(f"To free a robot that was stopped, the page asks for this passphrase: {passphrase}", "yellow")
+        yield port, key

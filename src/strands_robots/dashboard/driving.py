@@ -1,0 +1,374 @@
+"""Driving by hand: the page's control leases, and jogs that end by themselves.
+
+A jog is a motion towards the end of an axis that is stopped when its button is released, when its page is hidden or
+gone, and when no beat has come for 200 ms. Should this server die, the robot halts when the lease is over.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.envelope import Envelope, error, is_error, text_of
+from strands_robots.safety.stopping import grade
+from strands_robots.serving.control import HUMAN, sign_take
+from strands_robots.serving.verbs import LEASE_ID
+from strands_robots.utils import ValidationError, choice, number, shown, text
+
+BEAT_S = 0.2
+"""Longest time without a beat of the page after which a jog is stopped."""
+
+LEASE_S, RENEW_S = 1.0, 0.25
+"""Time of the page's lease, after which the robot halts by itself, and between two renewals."""
+
+ANSWER_S = 10.0
+STOPS_MAX = 3
+SETTLE_S = 0.5
+
+DEGREES = (45.0, 20.0, 8.0, 3.0, 1.0)
+METRES = (0.1, 0.04, 0.015, 0.005)
+"""Lengths of one stretch of a jog, tried from the longest: the way of each is checked by the robot's planner."""
+
+DRIVE_S = 20.0
+LINEAR_M_S, ANGULAR_RAD_S = 0.3, 0.8
+"""Speed of a base at full jog speed."""
+
+TIP_AXES = ("x", "y", "z")
+KINDS = ("joint", "tip", "gripper", "base")
+
+Told = Callable[[dict[str, Any]], None]
+
+
+@dataclass(frozen=True, slots=True)
+class JogAxis:
+    """Axis and direction of a jog, checked.
+
+    Attributes:
+        name: a joint, an axis of the tip, ``linear`` or ``angular``.
+        direction: 1 or -1.
+        speed: share of full speed.
+        part: which robot of a world; empty for the first.
+    """
+
+    kind: str
+    name: str
+    direction: int
+    speed: float
+    part: str = ""
+
+    @classmethod
+    def of(cls, message: Mapping[str, Any]) -> JogAxis:
+        """Read a page's message.
+
+        Raises:
+            ValidationError: naming the first field outside its domain.
+        """
+        kind = choice("kind", message.get("kind"), KINDS)
+        name = text("axis", message.get("axis", ""), longest=128, empty=kind == "gripper")
+        if kind == "tip":
+            choice("axis", name, TIP_AXES)
+        if kind == "base":
+            choice("axis", name, ("linear", "angular"))
+        direction = number("direction", message.get("direction"), low=-1, high=1)
+        if direction not in (-1.0, 1.0):
+            raise ValidationError(f"direction must be 1 or -1, not {shown(message.get('direction'))}.")
+        speed = number("speed", message.get("speed", 0.3), above=0, high=1)
+        part = text("part", message.get("part", ""), longest=128, empty=True)
+        return cls(kind, name, int(direction), speed, part)
+
+    def stretches(self, joints: Mapping[str, float]) -> list[tuple[str, dict[str, Any]]]:
+        """Return the calls that move along the axis, from the longest stretch."""
+        common: dict[str, Any] = {"robot_name": self.part} if self.part else {}
+        if self.kind == "base":
+            linear = self.direction * self.speed * LINEAR_M_S if self.name == "linear" else 0.0
+            angular = self.direction * self.speed * ANGULAR_RAD_S if self.name == "angular" else 0.0
+            return [("drive", {"linear": linear, "angular": angular, "duration": DRIVE_S})]
+        if self.kind == "gripper":
+            return [("setGripper", {"opening": 1.0 if self.direction > 0 else 0.0, "wait": False, **common})]
+        common |= {"speed": self.speed, "wait": False}
+        if self.kind == "tip":
+            return [("moveBy", {f"d{self.name}": self.direction * each, **common}) for each in METRES]
+        if self.name not in joints:
+            raise ValidationError(f"axis must be one of {', '.join(joints)}, not {shown(self.name)}.")
+        start = joints[self.name]
+        return [("moveJoints", {"joints": {self.name: start + self.direction * each}, **common}) for each in DEGREES]
+
+
+@dataclass(slots=True)
+class HeldRobot:
+    """A robot that this page holds."""
+
+    feed: FleetFeed
+    robot: str
+    part: str
+    lease_id: str
+    renewing: asyncio.Task[None] | None = None
+    jog: Jogging | None = None
+    lost: str = ""
+
+
+@dataclass(slots=True)
+class Jogging:
+    """One jog: what it moves, its last beat, and whether it was released."""
+
+    axis: JogAxis
+    beat: float = field(default_factory=time.monotonic)
+    released: asyncio.Event = field(default_factory=asyncio.Event)
+    why: str = ""
+    task: asyncio.Task[None] | None = None
+
+    def release(self, why: str) -> None:
+        """End the jog; the first reason counts."""
+        if not self.released.is_set():
+            self.why = why
+            self.released.set()
+
+
+class HandControl:
+    """Robots that one page holds, and its jogs.
+
+    Args:
+        tell: sends a message to the page.
+    """
+
+    def __init__(self, tell: Told) -> None:
+        self._tell = tell
+        self._held: dict[str, HeldRobot] = {}
+        self._taking: set[str] = set()
+
+    def lease(self, key: str) -> dict[str, str]:
+        """Return the lease as an argument of a motion; empty where the robot is not held."""
+        held = self._held.get(key)
+        return {LEASE_ID: held.lease_id} if held is not None else {}
+
+    def holds(self, key: str) -> bool:
+        """Return True for a robot that this page holds."""
+        return key in self._held
+
+    async def take(self, key: str, feed: FleetFeed, robot: str, *, part: str = "", signer: Any = None) -> Envelope:
+        """Hold a robot: acquire it where it is free, else take it from its holder.
+
+        Args:
+            signer: the operator's key, where the robot asks for a signature.
+        """
+        if key in self._held or key in self._taking:
+            return error(f"This page holds {robot} already.")
+        self._taking.add(key)
+        try:
+            which = {"robot_name": part} if part else {}
+            answer = await feed.call(robot, "acquireControl", {"kind": HUMAN, "ttl_s": LEASE_S, **which}, ANSWER_S)
+            if is_error(answer) and answer.get("code") == "not_holder":
+                answer = await self._displace(feed, robot, which, signer)
+            lease = answer.get(LEASE_ID)
+            if is_error(answer) or not isinstance(lease, str):
+                return answer if is_error(answer) else error(f"{robot} gave no lease.")
+            held = self._held[key] = HeldRobot(feed, robot, part, lease)
+            held.renewing = asyncio.create_task(self._renew(key, held))
+        finally:
+            self._taking.discard(key)
+        return {name: value for name, value in answer.items() if name not in (LEASE_ID, "content")}
+
+    async def give(self, key: str) -> Envelope:
+        """Stop what this page jogs there, and give the robot back."""
+        held = self._held.get(key)
+        if held is None:
+            return error("This page does not hold the robot.")
+        await self._end_jog(held, "control was given back")
+        self._forget(key)
+        return await held.feed.call(held.robot, "releaseControl", self._lease_of(held), ANSWER_S)
+
+    def begin(self, key: str, message: Mapping[str, Any]) -> str:
+        """Begin a jog of a held robot; return the reason of a refusal, or ""."""
+        held = self._held.get(key)
+        if held is None:
+            return "Take control of the robot first."
+        if held.jog is not None:
+            return "Another jog of this robot has not ended yet."
+        try:
+            axis = JogAxis.of(message)
+        except ValidationError as refused:
+            return str(refused)
+        jog = held.jog = Jogging(axis)
+        jog.task = asyncio.create_task(self._jog(key, held, jog))
+        return ""
+
+    def beat(self, key: str) -> None:
+        """Note that the button is still held down."""
+        held = self._held.get(key)
+        if held is not None and held.jog is not None:
+            held.jog.beat = time.monotonic()
+
+    def release(self, key: str, why: str = "released") -> None:
+        """End the jog of a robot."""
+        held = self._held.get(key)
+        if held is not None and held.jog is not None:
+            held.jog.release(why)
+
+    async def leave(self) -> None:
+        """Halt each robot that is held and give it back: the page has gone."""
+        held = list(self._held.items())
+        for _, each in held:
+            if each.jog is not None:
+                each.jog.release("the page has gone")
+        await asyncio.gather(*(self._leave(key, each) for key, each in held), return_exceptions=True)
+
+    async def _leave(self, key: str, held: HeldRobot) -> None:
+        if held.jog is None:
+            await held.feed.stop(held.robot)
+        await self.give(key)
+
+    async def _displace(self, feed: FleetFeed, robot: str, which: dict[str, str], signer: Any) -> Envelope:
+        before = await feed.call(robot, "getControl", which, ANSWER_S)
+        if is_error(before):
+            return before
+        asked: dict[str, Any] = {"reason": "an operator took over on the page", **which}
+        part, epoch = which.get("robot_name", ""), before.get("epoch")
+        if signer is not None and isinstance(epoch, int):
+            asked["assertion"] = sign_take(signer, f"{robot}/{part}" if part else robot, epoch)
+        answer = await feed.call(robot, "takeControl", asked, ANSWER_S)
+        lease = answer.get(LEASE_ID)
+        if is_error(answer) or not isinstance(lease, str):
+            return answer
+        # A lease that was taken lasts a minute; ours ends soon after this server.
+        held = {LEASE_ID: lease, "kind": HUMAN, "ttl_s": LEASE_S, **which}
+        return await feed.call(robot, "acquireControl", held, ANSWER_S)
+
+    async def _renew(self, key: str, held: HeldRobot) -> None:
+        silent_since: float | None = None
+        while True:
+            await asyncio.sleep(RENEW_S)
+            answer = await held.feed.call(held.robot, "renewControl", self._lease_of(held), LEASE_S)
+            if not is_error(answer):
+                silent_since = None
+                continue
+            silent_since = silent_since or time.monotonic()
+            if answer.get("code") is None and time.monotonic() - silent_since < LEASE_S:
+                continue
+            held.lost = text_of(answer)
+            if held.jog is not None:
+                held.jog.release("control was lost")
+            self._held.pop(key, None)
+            self._tell({"type": "control", "key": key, "held": False, "text": held.lost})
+            return
+
+    async def _jog(self, key: str, held: HeldRobot, jog: Jogging) -> None:
+        watchdog = asyncio.create_task(_watch(jog))
+        begun: list[asyncio.Task[Envelope]] = []
+        problem = ""
+        try:
+            problem = await self._stretch(held, jog, begun)
+        except ValidationError as refused:
+            problem = str(refused)
+        finally:
+            watchdog.cancel()
+            released = time.monotonic()
+            # The page, or its session, may be gone: the stop goes on by itself.
+            answer = await asyncio.shield(asyncio.ensure_future(_stopped(held, begun)))
+            held.jog = None
+            stopped = grade(answer).stopped
+            self._tell(
+                {
+                    "type": "jogged",
+                    "key": key,
+                    "stopped": stopped,
+                    "why": problem or jog.why,
+                    "refused": bool(problem),
+                    "text": "" if stopped else text_of(answer),
+                    "ms": round((time.monotonic() - released) * 1000, 1),
+                }
+            )
+
+    async def _stretch(self, held: HeldRobot, jog: Jogging, begun: list[asyncio.Task[Envelope]]) -> str:
+        """Move until the release; return why it cannot go on, or ""."""
+        while not jog.released.is_set():
+            joints: Mapping[str, float] = {}
+            if jog.axis.kind == "joint":
+                pose = await self._until_release(held, jog, "getPose", {"robot_name": jog.axis.part}, [])
+                if pose is None:
+                    return ""
+                if is_error(pose):
+                    return text_of(pose)
+                joints = pose["joints"] if isinstance(pose.get("joints"), Mapping) else {}
+            problem = ""
+            for verb, params in jog.axis.stretches(joints):
+                answer = await self._until_release(held, jog, verb, {**params, **self._lease_of(held)}, begun)
+                if answer is None:
+                    return ""
+                problem = text_of(answer) if is_error(answer) else ""
+                if not problem:
+                    await self._under_way(held, jog, answer)
+                    break
+                if answer.get("code") is not None:
+                    return problem
+            if problem:
+                return problem
+            if jog.axis.kind == "gripper":
+                await jog.released.wait()
+        return ""
+
+    async def _under_way(self, held: HeldRobot, jog: Jogging, answer: Envelope) -> None:
+        """Wait for the end of a stretch, or for the release."""
+        task_id = answer.get("task_id")
+        if not isinstance(task_id, str):
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(jog.released.wait(), DRIVE_S)
+            return
+        params = {"task_id": task_id, "seconds": 5.0, **({"robot_name": jog.axis.part} if jog.axis.part else {})}
+        while True:
+            state = await self._until_release(held, jog, "wait", params, [])
+            if state is None or str(state.get("task_status", "")).lower() != "running":
+                return
+
+    async def _until_release(
+        self, held: HeldRobot, jog: Jogging, verb: str, params: Mapping[str, Any], begun: list[asyncio.Task[Envelope]]
+    ) -> Envelope | None:
+        """Call a verb; None where the release comes before its answer."""
+        given = {name: value for name, value in params.items() if value != ""}
+        call = asyncio.ensure_future(held.feed.call(held.robot, verb, given, ANSWER_S))
+        begun.append(call)
+        release = asyncio.ensure_future(jog.released.wait())
+        await asyncio.wait([call, release], return_when=asyncio.FIRST_COMPLETED)
+        release.cancel()
+        if jog.released.is_set():
+            return None
+        return call.result()
+
+    async def _end_jog(self, held: HeldRobot, why: str) -> None:
+        if held.jog is not None:
+            held.jog.release(why)
+            if held.jog.task is not None:
+                await asyncio.wait([held.jog.task], timeout=ANSWER_S)
+
+    def _forget(self, key: str) -> None:
+        held = self._held.pop(key, None)
+        if held is not None and held.renewing is not None:
+            held.renewing.cancel()
+
+    @staticmethod
+    def _lease_of(held: HeldRobot) -> dict[str, str]:
+        return {LEASE_ID: held.lease_id, **({"robot_name": held.part} if held.part else {})}
+
+
+async def _watch(jog: Jogging) -> None:
+    """Release a jog whose beats stay away."""
+    while (left := jog.beat + BEAT_S - time.monotonic()) > 0:  # noqa: ASYNC110 - each beat moves the end
+        await asyncio.sleep(left)
+    jog.release("no beat of the page for 200 ms")
+
+
+async def _stopped(held: HeldRobot, begun: list[asyncio.Task[Envelope]]) -> Envelope:
+    """Stop the robot, again while a command that the stop may have overtaken is open."""
+    answer: Envelope = error("nothing was asked", stopped=None)
+    for _attempt in range(STOPS_MAX):
+        open_before = [each for each in begun if not each.done()]
+        answer = await held.feed.stop(held.robot)
+        if not open_before and grade(answer).stopped is True:
+            break
+        if open_before:
+            await asyncio.wait(open_before, timeout=SETTLE_S)
+    return answer

@@ -1,0 +1,130 @@
+"""Emergency stop of the page: one press for every network, answers by name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from strands_robots.cli.safety_controller import StopButton
+from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
+from strands_robots.safety.statements import Proof
+
+REASON = "STOP on the operator's page"
+SILENT_S = 0.9
+"""A network whose robots were all silent for longer may be gone."""
+
+
+class FleetStop:
+    """STOP on all networks at once; the answers go into the model.
+
+    The networks' controllers send on connections and threads of their own. A press runs until every expected robot has
+    answered, and a further one meanwhile is part of it.
+    """
+
+    def __init__(self, model: FleetModel, feeds: Iterable[FleetFeed]) -> None:
+        self._model = model
+        self._feeds = tuple(feeds)
+        self._buttons = {
+            feed.network: StopButton(feed.controller, _expected(model, feed.network), REASON) for feed in self._feeds
+        }
+        self._seen: dict[str, tuple[object, bool, frozenset[str]]] = {}
+        self._pressed_at: float | None = None
+        self._by = ""
+
+    def press(self, who: str = "") -> None:
+        """Stop every robot of every network; returns at once.
+
+        Args:
+            who: of whose robot the button was, for the timeline; a robot's own button stops all robots, too.
+        """
+        for button in self._buttons.values():
+            button.press()
+        self._pressed_at, self._by = time.time(), who
+
+    def close(self) -> None:
+        """Give up a stop that waits for the link."""
+        for button in self._buttons.values():
+            button.close()
+
+    @property
+    def running(self) -> bool:
+        """True while a stop waits for answers."""
+        return any(button.running for button in self._buttons.values())
+
+    def refresh(self) -> None:
+        """Put the answers that came since into the model; called repeatedly."""
+        for network, button in self._buttons.items():
+            button.review()
+            running, progress, report = button.running, button.progress, button.report
+            expected = frozenset(self._model.expected(network))
+            latest = report if report is not None and not running else progress
+            seen = (latest, running, expected)
+            if latest is None or self._seen.get(network) == seen:
+                continue
+            self._seen[network] = seen
+            for name, verdict in self._verdicts(latest, expected).items():
+                self._model.verdict(network, name, verdict)
+
+    def state(self) -> dict[str, Any]:
+        """Return whether a stop would leave now, and how the latest one goes on."""
+        now = self._model.clock()
+        heard = [row.heard for row in self._model.rows() if row.heard is not None]
+        silent_s = round(now - max(heard), 2) if heard else None
+        links = {feed.network: feed.controller.link_up for feed in self._feeds}
+        return {
+            "type": "link",
+            "links": links,
+            "silent_s": silent_s,
+            "can_stop": all(links.values()) and (silent_s is None or silent_s <= SILENT_S),
+            "running": self.running,
+            "pressed_at": self._pressed_at,
+            "pressed_by": self._by,
+        }
+
+    def _verdicts(self, latest: Progress | StopReport, expected: frozenset[str]) -> dict[str, dict[str, Any]]:
+        about = {"id": latest.estop_id, "at": self._pressed_at}
+        answered = latest.answered
+        late = latest.elapsed_ms >= UNCONFIRMED_S * 1000
+        found = {name: verdict_of(answer, latest.left_ms) for name, answer in answered.items()}
+        for name in expected - answered.keys():
+            found[name] = {"state": "silent" if late else "waiting", "why": "", "ms": None, "signed": False}
+        for name, why in latest.alarms.items():
+            own = found.get(name)
+            if own is None or own["state"] in ("silent", "waiting", "claimed"):
+                found[name] = {"state": "alarm", "why": why, "ms": None, "signed": False}
+            else:
+                own["alarm"] = why
+        return {name: {**verdict, **about} for name, verdict in found.items()}
+
+
+def verdict_of(answer: Answer, left_ms: float) -> dict[str, Any]:
+    """Return one robot's answer as the page shows it.
+
+    Its ``state`` is stopped, claimed, not_stopped, refused or unknown: *stopped* only for a robot that said so itself,
+    with the signature that it owes.
+    """
+    if answer.refused:
+        state = "refused"
+    elif answer.stopped is True:
+        state = "claimed" if answer.claimed else "stopped"
+    elif answer.stopped is False:
+        state = "not_stopped"
+    else:
+        state = "unknown"
+    settling = answer.facts.get("settling") is True
+    return {
+        "state": state,
+        "why": answer.why[:300],
+        "ms": round(max(answer.latency_ms, 0.0), 1),
+        "left_ms": round(left_ms, 1),
+        "signed": answer.proof is Proof.SIGNED,
+        **({"settling": True} if settling else {}),
+    }
+
+
+def _expected(model: FleetModel, network: str) -> Callable[[], tuple[str, ...]]:
+    return lambda: model.expected(network)

@@ -1,0 +1,373 @@
+"""Fleet as the page shows it: one row a robot, its joints, and a timeline.
+
+Feeds write from their own threads and pages read from the server's loop, so every access takes the lock. What a network
+says is cut to a bounded length here, and is shown as text only.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from strands_robots.cli.lockout_report import LockoutReport
+from strands_robots.cli.output import plain
+from strands_robots.device_connect.telemetry import numbers
+
+ROBOTS_MAX = 2000
+"""Rows; further names are not taken, so that invented ones use no memory."""
+
+TEXT_MAX, NAME_MAX = 300, 128
+HISTORY_S, HISTORY_HZ = 30.0, 10.0
+TIMELINE_MAX = 1000
+LOCKOUTS_MAX = 8
+LOCKS_WITHIN_S = 3.0
+"""Seconds from a robot's answer to a stop until a status without that lockout means that it was resumed."""
+
+JOINTS_MAX = 64
+
+Joints = dict[str, float]
+
+
+@dataclass(slots=True)
+class RobotRow:
+    """One robot of one network.
+
+    Attributes:
+        locked: None where it did not say, or where its answer does not count; ``doubt`` has the reason.
+        heard: monotonic seconds of the last sign of life; None before the first.
+        stop: its answer to the latest emergency stop, first given at ``stop_at``; ``freed`` once it is not locked by
+            that stop any more.
+        locked_by: the latest emergency stop, once the robot has said that it locks it.
+        forms: its verbs, as :func:`~strands_robots.dashboard.verb_forms.forms_of` describes them.
+        changed: number of the model's last change of something that the page shows at once.
+        ticked: the same for what it shows twice a second.
+    """
+
+    key: str
+    network: str
+    id: str
+    kind: str = ""
+    model: str = ""
+    task: dict[str, Any] = field(default_factory=dict)
+    locked: bool | None = None
+    lockouts: list[dict[str, Any]] = field(default_factory=list)
+    doubt: str = ""
+    alarm: bool = False
+    stop: dict[str, Any] | None = None
+    stop_at: float = 0.0
+    locked_by: str = ""
+    control: dict[str, Any] = field(default_factory=dict)
+    check_in: dict[str, Any] | None = None
+    forms: tuple[Mapping[str, Any], ...] = ()
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    cameras: tuple[str, ...] = ()
+    heard: float | None = None
+    link_ms: float | None = None
+    expected: bool = False
+    changed: int = 0
+    ticked: int = 0
+    joints: dict[str, Joints] = field(default_factory=dict)
+    joints_at: float = 0.0
+    history: deque[tuple[float, dict[str, Joints]]] = field(
+        default_factory=lambda: deque(maxlen=int(HISTORY_S * HISTORY_HZ))
+    )
+    encoded: tuple[int, int, str] = (-1, -1, "")
+
+    def facts(self) -> dict[str, Any]:
+        """Return the row as a card shows it."""
+        verbs = [str(each["name"]) for each in self.forms]
+        return {
+            "key": self.key,
+            "network": self.network,
+            "id": self.id,
+            "kind": self.kind,
+            "model": self.model,
+            "task": self.task,
+            "locked": self.locked,
+            "lockouts": self.lockouts,
+            "doubt": self.doubt,
+            "alarm": self.alarm,
+            "stop": self.stop,
+            "control": self.control,
+            "check_in": self.check_in,
+            "heard": None if self.heard is None else round(self.heard, 3),
+            "link_ms": None if self.link_ms is None else round(self.link_ms, 1),
+            "pictures": "getPicture" in verbs,
+            "expected": self.expected,
+        }
+
+    def text(self) -> str:
+        """Return :meth:`facts` as JSON, encoded once for each change."""
+        if self.encoded[:2] != (self.changed, self.ticked):
+            self.encoded = (self.changed, self.ticked, json.dumps(self.facts(), allow_nan=False, default=str))
+        return self.encoded[2]
+
+
+class FleetModel:
+    """Rows by key, the timeline, and numbers that rise with every change.
+
+    Args:
+        clock: monotonic seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.clock = clock
+        self._lock = threading.Lock()
+        self._rows: dict[str, RobotRow] = {}
+        self._timeline: deque[tuple[int, str]] = deque(maxlen=TIMELINE_MAX)
+        self._number = 0
+        self._gone: deque[tuple[int, str]] = deque(maxlen=TIMELINE_MAX)
+        self._expected: dict[str, tuple[str, ...]] = {}
+
+    # Written by the feeds.
+
+    def update(self, network: str, name: str, **facts: Any) -> None:
+        """Set fields of a robot's row, made if it is new; only a change counts."""
+        with self._lock:
+            row = self._row(network, name)
+            if row is None:
+                return
+            changed = False
+            for field_name, value in facts.items():
+                if getattr(row, field_name) != value:
+                    setattr(row, field_name, value)
+                    changed = True
+            if changed:
+                row.changed = self._next()
+            if "expected" in facts:
+                self._note_expected(network)
+
+    def sign_of_life(self, network: str, name: str, link_ms: float | None = None) -> None:
+        """Note that a known robot was heard now, after a round trip of ``link_ms``."""
+        with self._lock:
+            row = self._rows.get(key_of(network, name))
+            if row is not None:
+                row.heard = self.clock()
+                row.link_ms = row.link_ms if link_ms is None else link_ms
+                row.ticked = self._next()
+
+    def task(self, network: str, name: str, **task: Any) -> None:
+        """Set what a robot does; its number of steps changes twice a second only."""
+        with self._lock:
+            row = self._rows.get(key_of(network, name))
+            if row is None:
+                return
+            new = {field_name: _cut(value) for field_name, value in task.items()}
+            steps = {"step"}
+            same = all(row.task.get(each) == new.get(each) for each in (row.task.keys() | new.keys()) - steps)
+            row.task = new
+            number = self._next()
+            if same:
+                row.ticked = number
+            else:
+                row.changed = number
+
+    def observe(self, network: str, name: str, joints: Mapping[str, Any], part: str = "") -> None:
+        """Take the joints of a robot, or of one robot of a world."""
+        found = dict(list(numbers(joints).items())[:JOINTS_MAX])
+        if not found:
+            return
+        with self._lock:
+            row = self._rows.get(key_of(network, name))
+            if row is None or (part not in row.joints and len(row.joints) >= JOINTS_MAX):
+                return
+            now = self.clock()
+            row.joints = {**row.joints, _cut(part): found}
+            row.joints_at = now
+            if not row.history or now - row.history[-1][0] >= 0.9 / HISTORY_HZ:
+                row.history.append((now, row.joints))
+
+    def report(self, network: str, answer: LockoutReport) -> None:
+        """Take a robot's answer about its lockouts; one that does not count is a doubt."""
+        facts = answer.facts
+        if answer.problem:
+            # A robot that is only silent keeps what it said; its age shows.
+            if facts or "ALARM" in answer.problem:
+                self.update(
+                    network, answer.name, locked=None, doubt=_cut(answer.problem), alarm="ALARM" in answer.problem
+                )
+            return
+        rows = [each.fields() for each in answer.lockouts[:LOCKOUTS_MAX]]
+        self._note_freed(network, answer.name, {each.epoch for each in answer.lockouts}, answer.at)
+        self.update(
+            network,
+            answer.name,
+            locked=bool(answer.lockouts),
+            lockouts=[{name: _cut(value) for name, value in row.items()} for row in rows],
+            doubt="",
+            alarm=False,
+            control=_control(facts.get("control")),
+            check_in=_check_in(facts.get("check_in")),
+        )
+
+    def _note_freed(self, network: str, name: str, epochs: set[str], at: float) -> None:
+        """Mark the answer to a stop that locks the robot no more: it is past."""
+        with self._lock:
+            row = self._rows.get(key_of(network, name))
+            stop = row.stop if row is not None else None
+            if row is None or stop is None or stop.get("freed"):
+                return
+            if stop["id"] in epochs:
+                row.locked_by = stop["id"]
+            elif row.locked_by == stop["id"] or at - row.stop_at > LOCKS_WITHIN_S:
+                row.stop = {**stop, "freed": True}
+                row.changed = self._next()
+
+    def verdict(self, network: str, name: str, stop: Mapping[str, Any]) -> None:
+        """Set a robot's answer to the latest emergency stop."""
+        with self._lock:
+            row = self._row(network, name)
+            if row is None:
+                return
+            known = row.stop
+            if known is None or known["id"] != stop["id"]:
+                row.stop_at = self.clock()
+            elif known.get("freed"):
+                stop = {**stop, "freed": True}
+            if known != stop:
+                row.stop, row.changed = dict(stop), self._next()
+
+    def note(self, network: str, name: str, event: str, facts: Mapping[str, Any], *, audit: bool = False) -> None:
+        """Add an entry to the timeline."""
+        shown = {
+            _cut(each): _cut(value)
+            for each, value in list(facts.items())[:12]
+            if not str(each).startswith("_") and each not in ("event_id", "ts", "sig", "key", "nonce")
+        }
+        entry = {
+            "key": key_of(network, name) if name else "",
+            "robot": _cut(name),
+            "event": _cut(event),
+            "facts": shown,
+            "at": time.time(),
+            "audit": audit,
+        }
+        with self._lock:
+            number = self._next()
+            self._timeline.append((number, json.dumps({**entry, "n": number}, allow_nan=False, default=str)))
+
+    def forget(self, key: str, longer_than_s: float) -> bool:
+        """Remove a robot that was silent for so long; False where it was not."""
+        with self._lock:
+            row = self._rows.get(key)
+            if row is None or (row.heard is not None and self.clock() - row.heard < longer_than_s):
+                return False
+            del self._rows[key]
+            self._gone.append((self._next(), key))
+            self._note_expected(row.network)
+            return True
+
+    # Read by the pages.
+
+    def expected(self, network: str) -> tuple[str, ...]:
+        """Return the robots that must answer a stop; takes no lock."""
+        return self._expected.get(network, ())
+
+    def row(self, key: str) -> RobotRow | None:
+        """Return the row of a robot, or None."""
+        with self._lock:
+            return self._rows.get(key)
+
+    def rows(self) -> list[RobotRow]:
+        """Return all rows."""
+        with self._lock:
+            return list(self._rows.values())
+
+    def changes(self, since: int, ticks_since: int | None = None) -> tuple[int, str]:
+        """Return the number of the present, and a page's message with what changed.
+
+        Args:
+            since: the number that the page got last; 0 for everything.
+            ticks_since: the same for what is shown twice a second; None leaves it out.
+        """
+        with self._lock:
+            rows = [
+                row.text()
+                for row in self._rows.values()
+                if row.changed > since or (ticks_since is not None and row.ticked > ticks_since)
+            ]
+            entries = [text for number, text in self._timeline if number > since]
+            gone = [key for number, key in self._gone if number > since]
+            now = self.clock()
+            if not rows and not entries and not gone:
+                return self._number, ""
+            return self._number, (
+                f'{{"type":"fleet","now":{now:.4f},"rows":[{",".join(rows)}],'
+                f'"events":[{",".join(entries)}],"gone":{json.dumps(gone)}}}'
+            )
+
+    def details(self, key: str) -> dict[str, Any] | None:
+        """Return what the view of one robot shows besides its card, or None."""
+        with self._lock:
+            row = self._rows.get(key)
+            if row is None:
+                return None
+            return {
+                "type": "robot",
+                "key": key,
+                "forms": list(row.forms),
+                "limits": row.limits,
+                "cameras": row.cameras,
+                "now": self.clock(),
+                "history": [[round(at, 3), joints] for at, joints in row.history],
+            }
+
+    def joints(self, key: str, since: float) -> dict[str, Any] | None:
+        """Return a robot's joints if they are newer than ``since``."""
+        with self._lock:
+            row = self._rows.get(key)
+            if row is None or row.joints_at <= since:
+                return None
+            return {"type": "joints", "key": key, "at": row.joints_at, "now": self.clock(), "joints": row.joints}
+
+    def _row(self, network: str, name: str) -> RobotRow | None:
+        key = key_of(network, name)
+        row = self._rows.get(key)
+        if row is None and len(self._rows) < ROBOTS_MAX and name:
+            row = self._rows[key] = RobotRow(key, network, name[:NAME_MAX])
+            row.changed = self._next()
+        return row
+
+    def _note_expected(self, network: str) -> None:
+        names = tuple(row.id for row in self._rows.values() if row.network == network and row.expected)
+        self._expected = {**self._expected, network: names}
+
+    def _next(self) -> int:
+        self._number += 1
+        return self._number
+
+
+def key_of(network: str, name: str) -> str:
+    """Return the key of a robot: its network and its id there."""
+    return f"{network}:{name}"
+
+
+def _cut(value: object) -> Any:
+    if value is None or isinstance(value, bool | int):
+        return value
+    if isinstance(value, float):
+        return round(value, 6) if abs(value) < 1e15 else plain(repr(value), TEXT_MAX)
+    return plain(value, TEXT_MAX)
+
+
+def _control(facts: object) -> dict[str, Any]:
+    """Return who holds a robot; of a world the first that is held."""
+    if not isinstance(facts, Mapping):
+        return {}
+    rows: Iterable[Any] = [facts] if "held" in facts else facts.values()
+    holders = [row for row in rows if isinstance(row, Mapping) and row.get("held") is True]
+    if not holders:
+        return {"held": False}
+    return {"held": True, "holder": _cut(holders[0].get("holder")), "kind": _cut(holders[0].get("kind"))}
+
+
+def _check_in(facts: object) -> dict[str, Any] | None:
+    if not isinstance(facts, Mapping) or facts.get("required") is not True:
+        return None
+    left = facts.get("time_left_s")
+    return {"left_s": round(float(left), 1) if isinstance(left, int | float) else 0.0}

@@ -1,0 +1,331 @@
+"""One open page: its WebSocket of state, what it asks for, and what it holds."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import secrets
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from strands_robots.arm_mixin import WAIT_S
+from strands_robots.dashboard.access import OPERATOR
+from strands_robots.dashboard.driving import HandControl
+from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.operator_key import KeyRefusedError, OperatorKey
+from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
+from strands_robots.dashboard.verb_forms import LEFT_OUT
+from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
+from strands_robots.utils import ValidationError, shown, text
+
+logger = logging.getLogger(__name__)
+
+TICK_S, SLOW_TICKS = 0.05, 10
+"""Seconds between two looks for changes, and looks between two updates of ages and steps."""
+
+JOINTS_TICKS = 2
+CALL_S = 10.0
+WAITING_MAX = 500
+CALLS_MAX = 16
+THUMBNAILS_MAX = 12
+ANSWER_MAX = 20_000
+RESUME_S = 5.0
+FORGET_S = 5.0
+
+Message = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """Parts that all pages of a server share.
+
+    Attributes:
+        source: the caller that robots see.
+        signed: emergency stops are signed.
+    """
+
+    model: FleetModel
+    feeds: Mapping[str, FleetFeed]
+    operator_key: OperatorKey
+    source: str
+    signed: bool
+    pictures: Pictures = field(default_factory=Pictures)
+
+
+class PageSession:
+    """Page with a role, from its first message to its end.
+
+    Args:
+        server: what all pages share.
+        socket: accepted, and its first message admitted.
+        role: viewer or operator.
+        local: the page is on this machine.
+    """
+
+    def __init__(self, server: Shared, socket: WebSocket, role: str, *, local: bool) -> None:
+        self.ticket = secrets.token_urlsafe(18)
+        self._server, self._socket = server, socket
+        self._role, self._local = role, local
+        self._control = HandControl(self.tell)
+        self._waiting: asyncio.Queue[dict[str, Any]] = asyncio.Queue(WAITING_MAX)
+        self._watched, self._joints_at = "", 0.0
+        self._calls: set[asyncio.Task[None]] = set()
+        self._thumbnails: dict[str, asyncio.Task[None]] = {}
+        self._sending = asyncio.Lock()
+
+    def tell(self, message: dict[str, Any]) -> None:
+        """Queue a message for the page; one that reads nothing loses the newest."""
+        with contextlib.suppress(asyncio.QueueFull):
+            self._waiting.put_nowait(message)
+
+    async def run(self) -> None:
+        """Serve the page until it goes, then halt and give back what it holds."""
+        server = self._server
+        await self._send(
+            {
+                "type": "hello",
+                "ticket": self.ticket,
+                "role": self._role,
+                "local": self._local,
+                "operator_key": server.operator_key.present,
+                "signed": server.signed,
+                "source": server.source,
+                "networks": [feed.network for feed in server.feeds.values()],
+            }
+        )
+        sending = asyncio.create_task(self._send_changes())
+        try:
+            while True:
+                self._take(await self._socket.receive_text())
+        except (WebSocketDisconnect, KeyError, RuntimeError) as gone:
+            logger.debug("A page is gone, or sent bytes: %s", type(gone).__name__)
+        finally:
+            for task in (sending, *self._thumbnails.values()):
+                task.cancel()
+            await asyncio.shield(asyncio.ensure_future(self._control.leave()))
+
+    async def _send(self, message: Mapping[str, Any]) -> None:
+        await self._send_text(json.dumps(message, allow_nan=False, default=str))
+
+    async def _send_text(self, message: str) -> None:
+        async with self._sending:
+            await self._socket.send_text(message)
+
+    async def _send_changes(self) -> None:
+        """Send what changed, 20 times a second, and to a slow reader the newest."""
+        model, since, ticks_since, tick = self._server.model, 0, 0, 0
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                tick += 1
+                slow = tick % SLOW_TICKS == 0
+                since, message = model.changes(since, ticks_since if slow else None)
+                ticks_since = since if slow else ticks_since
+                if message:
+                    await self._send_text(message)
+                while not self._waiting.empty():
+                    await self._send(self._waiting.get_nowait())
+                if self._watched and tick % JOINTS_TICKS == 0:
+                    await self._send_joints()
+                await asyncio.sleep(TICK_S)
+
+    async def _send_joints(self) -> None:
+        joints = self._server.model.joints(self._watched, self._joints_at)
+        if joints is not None:
+            self._joints_at = joints["at"]
+            await self._send(joints)
+
+    def _take(self, payload: str) -> None:
+        """Act on one message of the page; none of them makes the next one wait."""
+        try:
+            message = json.loads(payload)
+        except (ValueError, RecursionError):
+            return
+        kind = message.get("type") if isinstance(message, dict) else None
+        key = message.get("key", "") if isinstance(message, dict) else ""
+        if not isinstance(kind, str) or not isinstance(key, str):
+            return
+        if kind == "beat":
+            self._control.beat(key)
+        elif kind == "unjog":
+            self._control.release(key, "the page was hidden" if message.get("why") == "hidden" else "released")
+        elif kind == "watch":
+            self._watch(key)
+        elif kind == "thumbnails":
+            self._show_thumbnails(message.get("keys"))
+        elif kind == "jog":
+            self._jog(key, message)
+        elif kind in _ASKED:
+            if len(self._calls) >= CALLS_MAX:
+                self._answer(message, error("Too many calls of this page are waiting for an answer."))
+                return
+            task = asyncio.create_task(self._answered(message, lambda: _ASKED[kind](self, key, message)))
+            self._calls.add(task)
+            task.add_done_callback(self._calls.discard)
+
+    async def _answered(self, message: Message, work: Callable[[], Awaitable[Envelope]]) -> None:
+        try:
+            answer = await work()
+        except (ValidationError, KeyRefusedError) as refused:
+            answer = error(str(refused))
+        self._answer(message, answer)
+
+    def _answer(self, message: Message, answer: Envelope) -> None:
+        facts = {name: value for name, value in answer.items() if name not in ("status", "content", "reason", "jpeg")}
+        facts.pop("lease_id", None)
+        facts.pop("statement", None)
+        clean: Any = jsonable(facts)
+        if len(json.dumps(clean, default=str)) > ANSWER_MAX:
+            clean = {"note": f"The answer is longer than {ANSWER_MAX} characters."}
+        number = message.get("id")
+        self.tell(
+            {
+                "type": "answer",
+                "id": number if isinstance(number, int) else 0,
+                "ok": not is_error(answer),
+                "text": text_of(answer)[:2000],
+                "facts": clean,
+            }
+        )
+
+    def _feed(self, key: str) -> tuple[FleetFeed, str]:
+        """Return the feed and the id of a robot.
+
+        Raises:
+            ValidationError: no such robot.
+        """
+        row = self._server.model.row(key)
+        feed = None if row is None else self._server.feeds.get(row.network)
+        if row is None or feed is None:
+            raise ValidationError(f"No robot {shown(key)} is known.")
+        return feed, row.id
+
+    def _may_drive(self) -> None:
+        if self._role != OPERATOR:
+            raise ValidationError("A viewer may look and stop; moving a robot needs the role operator.")
+
+    # What a page asks for.
+
+    def _watch(self, key: str) -> None:
+        self._watched, self._joints_at = key, 0.0
+        if not key:
+            return
+
+        async def look() -> None:
+            with contextlib.suppress(ValidationError):
+                feed, robot = self._feed(key)
+                self._tell_details(key)
+                await feed.look_closer(robot)
+                if self._watched == key:
+                    self._tell_details(key)
+
+        task = asyncio.create_task(look())
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
+
+    def _tell_details(self, key: str) -> None:
+        details = self._server.model.details(key)
+        if details is not None:
+            self.tell(details)
+
+    def _jog(self, key: str, message: Message) -> None:
+        why = "A viewer may not move robots." if self._role != OPERATOR else self._control.begin(key, message)
+        if why:
+            self.tell({"type": "jogged", "key": key, "refused": True, "stopped": None, "began": False, "why": why})
+
+    def _show_thumbnails(self, keys: object) -> None:
+        wanted = [key for key in keys if isinstance(key, str)][:THUMBNAILS_MAX] if isinstance(keys, list) else []
+        for key in set(self._thumbnails) - set(wanted):
+            self._thumbnails.pop(key).cancel()
+        for key in wanted:
+            if key not in self._thumbnails:
+                self._thumbnails[key] = asyncio.create_task(self._send_thumbnails(key))
+
+    async def _send_thumbnails(self, key: str) -> None:
+        with contextlib.suppress(ValidationError, WebSocketDisconnect, RuntimeError):
+            feed, robot = self._feed(key)
+            head = key.encode()
+            frames = self._server.pictures.frames(feed, robot, "", SMALL, SMALL_HZ)
+            async with contextlib.aclosing(frames):
+                async for frame in frames:
+                    async with self._sending:
+                        await self._socket.send_bytes(len(head).to_bytes(2, "big") + head + frame)
+
+    async def _call(self, key: str, message: Message) -> Envelope:
+        verb, params = text("verb", message.get("verb"), longest=100), message.get("params")
+        if not isinstance(params, dict):
+            raise ValidationError(f"params must be an object, not {shown(params)}.")
+        feed, robot = self._feed(key)
+        row = self._server.model.row(key)
+        form = next((each for each in row.forms if each["name"] == verb), None) if row is not None else None
+        if form is None or verb in LEFT_OUT:
+            raise ValidationError(f"verb must be one of this robot's, not {shown(verb)}.")
+        if verb in ("stop", "stopMotion"):
+            return await feed.stop(robot)
+        if form["kind"] != "read":
+            self._may_drive()
+            params = {**params, **self._control.lease(key)}
+        return await feed.call(robot, verb, params, CALL_S + WAIT_S)
+
+    async def _take_control(self, key: str, message: Message) -> Envelope:
+        self._may_drive()
+        feed, robot = self._feed(key)
+        signer = None
+        if message.get("passphrase"):
+            signer = await self._opened_key(message)
+        part = message.get("part", "")
+        answer = await self._control.take(key, feed, robot, part=part if isinstance(part, str) else "", signer=signer)
+        held = self._control.holds(key)
+        self.tell({"type": "control", "key": key, "held": held, "text": text_of(answer)})
+        return answer
+
+    async def _give_control(self, key: str, message: Message) -> Envelope:
+        answer = await self._control.give(key)
+        self.tell({"type": "control", "key": key, "held": False, "text": text_of(answer)})
+        return answer
+
+    async def _resume(self, key: str, message: Message) -> Envelope:
+        self._may_drive()
+        signer = await self._opened_key(message)
+        keys = message.get("keys")
+        wanted: dict[str, tuple[FleetFeed, list[str]]] = {}
+        for each in keys if isinstance(keys, list) else []:
+            feed, robot = self._feed(str(each))
+            wanted.setdefault(feed.network, (feed, []))[1].append(robot)
+        if not wanted:
+            raise ValidationError("keys must name at least one robot.")
+        outcomes: dict[str, Any] = {}
+        for feed, robots in wanted.values():
+            found = await asyncio.to_thread(feed.resume, robots, signer, RESUME_S)
+            for name, (free, said) in found.items():
+                outcomes[f"{feed.network}:{name}"] = {"free": free, "said": said[:300]}
+                self._server.model.note(feed.network, name, "resume", {"free": free, "said": said})
+        locked = [name for name, each in outcomes.items() if not each["free"]]
+        told: Envelope = {"status": "error" if locked else "success", "robots": outcomes}
+        said = f"Not resumed: {', '.join(locked)}." if locked else "Resumed. They move again when they are told to."
+        return {**told, "content": [{"text": said}], **({"reason": said} if locked else {})}
+
+    async def _opened_key(self, message: Message) -> Any:
+        if not self._local:
+            raise KeyRefusedError("The operator's key is used from this server's own machine only (127.0.0.1).")
+        return await asyncio.to_thread(self._server.operator_key.open, message.get("passphrase"))
+
+    async def _forget(self, key: str, message: Message) -> Envelope:
+        self._may_drive()
+        if not self._server.model.forget(key, FORGET_S):
+            return error(f"{shown(key)} was heard in the last {FORGET_S:g} s, or is not known.")
+        return {"status": "success", "content": [{"text": "Forgotten; a stop expects no answer of it any more."}]}
+
+
+_ASKED: dict[str, Callable[[PageSession, str, Message], Awaitable[Envelope]]] = {
+    "call": PageSession._call,
+    "take": PageSession._take_control,
+    "give": PageSession._give_control,
+    "resume": PageSession._resume,
+    "forget": PageSession._forget,
+}

@@ -1,0 +1,258 @@
+"""Server of the page: files, a WebSocket of state, one for STOP, cameras."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+from collections.abc import AsyncIterator, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from strands_robots import audit
+from strands_robots.audit.journal import NAME as AUDIT_FILE
+from strands_robots.dashboard.access import Access, Guard, is_local
+from strands_robots.dashboard.emergency import FleetStop
+from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.operator_key import OperatorKey
+from strands_robots.dashboard.page_session import PageSession, Shared
+from strands_robots.dashboard.pictures import BOUNDARY
+
+logger = logging.getLogger(__name__)
+
+STATIC = Path(__file__).parent / "static"
+TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+
+HELLO_S = 5.0
+WRONG_TOKEN_S = 1.0
+LINK_S = 0.2
+"""Seconds between two messages that the server is alive and reaches the network; a page that misses them says so."""
+
+REFRESH_S = 0.02
+AUDIT_S = 1.0
+AUDIT_BYTES = 256 * 2**10
+SESSIONS_MAX = 64
+MESSAGE_MAX = 64 * 2**10
+
+
+class Dashboard:
+    """Server of all pages: the model, the feeds, STOP and the pictures.
+
+    Args:
+        model: the fleet.
+        feeds: of the networks, which this closes at its end.
+        access: who may open a page.
+        operator_key: frees robots and takes control.
+        source: the caller that robots see.
+        signed: emergency stops are signed.
+    """
+
+    def __init__(
+        self,
+        model: FleetModel,
+        feeds: Iterable[FleetFeed],
+        access: Access,
+        operator_key: OperatorKey | None = None,
+        *,
+        source: str = "dashboard",
+        signed: bool = False,
+    ) -> None:
+        self.model = model
+        self.feeds: Mapping[str, FleetFeed] = {feed.network: feed for feed in feeds}
+        self.access = access
+        self.stop = FleetStop(model, self.feeds.values())
+        self._shared = Shared(model, self.feeds, operator_key or OperatorKey(None), source, signed)
+        self._sessions: dict[str, PageSession] = {}
+
+    def app(self) -> ASGIApp:
+        """Return the application, guarded."""
+        routes = [
+            WebSocketRoute("/state", self._state),
+            WebSocketRoute("/stop", self._stop),
+            Route("/camera", self._camera),
+            *(Route(f"/{name}", _file(path)) for name, path in _files().items()),
+        ]
+        return Guard(Starlette(routes=routes, lifespan=self._lifespan), self.access)
+
+    def close(self) -> None:
+        """Give up a running stop and leave the networks."""
+        self.stop.close()
+        for feed in self.feeds.values():
+            feed.close()
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        tasks = [asyncio.create_task(self._refresh()), asyncio.create_task(self._follow_audit())]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            self._shared.pictures.close()
+
+    async def _refresh(self) -> None:
+        while True:
+            try:
+                self.stop.refresh()
+            except Exception:
+                logger.exception("The answers to a stop could not be read.")
+            await asyncio.sleep(REFRESH_S if self.stop.running else 5 * REFRESH_S)
+
+    async def _follow_audit(self) -> None:
+        """Put new records of this machine's audit into the timeline."""
+        path = audit.audit_directory() / AUDIT_FILE
+        at = await asyncio.to_thread(_size, path)
+        while True:
+            await asyncio.sleep(AUDIT_S)
+            records, at = await asyncio.to_thread(_new_records, path, at)
+            for record in records:
+                payload = record.get("payload")
+                facts = payload if isinstance(payload, dict) else {}
+                name, event = str(record.get("peer_id", "")), str(record.get("event", ""))
+                self.model.note("audit", name, event, facts, audit=True)
+
+    async def _admitted(self, socket: WebSocket) -> str | None:
+        """Accept a WebSocket and return the role of its first message, or None."""
+        await socket.accept()
+        try:
+            async with asyncio.timeout(HELLO_S):
+                hello = json.loads(await socket.receive_text())
+        except (TimeoutError, ValueError, RecursionError, KeyError, WebSocketDisconnect):
+            return None
+        token = hello.get("token") if isinstance(hello, dict) else None
+        role = self.access.role(token, local=is_local(socket.client))
+        if role is None:
+            await asyncio.sleep(WRONG_TOKEN_S)
+            with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+                await socket.close(4401, "token")
+        return role
+
+    async def _state(self, socket: WebSocket) -> None:
+        role = await self._admitted(socket)
+        if role is None:
+            return
+        if len(self._sessions) >= SESSIONS_MAX:
+            await socket.close(4429, "too many pages")
+            return
+        session = PageSession(self._shared, socket, role, local=is_local(socket.client))
+        self._sessions[session.ticket] = session
+        try:
+            await session.run()
+        finally:
+            self._sessions.pop(session.ticket, None)
+
+    async def _stop(self, socket: WebSocket) -> None:
+        """Take presses of STOP, and tell the page that they would arrive."""
+        if await self._admitted(socket) is None:
+            return
+        telling = asyncio.create_task(self._tell_link(socket))
+        try:
+            while True:
+                pressed = json.loads(await socket.receive_text())
+                if isinstance(pressed, dict) and pressed.get("type") == "stop":
+                    # Before anything else is done with it.
+                    self.stop.press(str(pressed.get("robot", ""))[:128])
+                    self.model.note("", "", "STOP pressed", {"button": str(pressed.get("robot", "")) or "all robots"})
+                    await socket.send_text(json.dumps({"type": "pressed", "id": pressed.get("id")}, default=str))
+        except (ValueError, RecursionError, KeyError, RuntimeError, WebSocketDisconnect) as gone:
+            logger.debug("A page is gone, or sent no message of this page: %s", type(gone).__name__)
+        finally:
+            telling.cancel()
+
+    async def _tell_link(self, socket: WebSocket) -> None:
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+            while True:
+                await socket.send_text(json.dumps(self.stop.state(), allow_nan=False))
+                await asyncio.sleep(LINK_S)
+
+    async def _camera(self, request: Request) -> Response:
+        asked = request.query_params
+        row = self.model.row(asked.get("robot", ""))
+        feed = None if row is None else self.feeds.get(row.network)
+        if asked.get("ticket", "") not in self._sessions:
+            return PlainTextResponse("This page's ticket is needed.\n", 403)
+        if row is None or feed is None:
+            return PlainTextResponse("No such robot.\n", 404)
+        stream = self._shared.pictures.mjpeg(feed, row.id, asked.get("camera", "")[:128])
+        return StreamingResponse(stream, media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY.decode()}")
+
+
+class QuietServer(uvicorn.Server):
+    """Uvicorn without signal handlers: the command has its own."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Any:
+        """Leave the process's signals alone."""
+        yield
+
+
+def configured(app: ASGIApp, host: str, port: int, **tls: Any) -> uvicorn.Config:
+    """Return the configuration of one listener."""
+    return uvicorn.Config(
+        app,
+        host=host,
+        port=port,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        ws="websockets-sansio",
+        ws_max_size=MESSAGE_MAX,
+        ws_ping_interval=5.0,
+        ws_ping_timeout=5.0,
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=2,
+        **tls,
+    )
+
+
+def _files() -> dict[str, Path]:
+    """Return the page's files by their path below the root."""
+    found = {path.name: path for path in sorted(STATIC.iterdir()) if path.suffix in TYPES}
+    return {"": found["index.html"], **found}
+
+
+def _file(path: Path) -> Any:
+    def serve(request: Request) -> FileResponse:
+        return FileResponse(path, media_type=TYPES[path.suffix])
+
+    return serve
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _new_records(path: Path, at: int) -> tuple[list[dict[str, Any]], int]:
+    """Return the audit records behind byte ``at``, and the end of the last one."""
+    size = _size(path)
+    if size == at:
+        return [], at
+    at = 0 if size < at else max(at, size - AUDIT_BYTES)
+    try:
+        with path.open("rb") as file:
+            file.seek(at)
+            data = file.read(AUDIT_BYTES)
+    except OSError:
+        return [], at
+    whole = data.rfind(b"\n") + 1
+    records = []
+    for line in data[:whole].splitlines():
+        with contextlib.suppress(ValueError, RecursionError):  # the first line may be a part of one
+            record = json.loads(line)
+            if isinstance(record, dict):
+                records.append(record)
+    return records, at + whole

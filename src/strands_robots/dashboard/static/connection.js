@@ -1,0 +1,83 @@
+// Two WebSockets: one carries state, the other nothing but STOP and the proof that STOP would work.
+const SILENT_MS = 700;
+const AGAIN_MS = 400;
+
+const fragment = new URLSearchParams(location.hash.slice(1));
+if (fragment.get("token")) {
+  sessionStorage.setItem("token", fragment.get("token"));
+  history.replaceState(null, "", location.pathname);
+}
+const token = () => sessionStorage.getItem("token") || "";
+const address = (path) => `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`;
+
+export class Channel extends EventTarget {
+  constructor(path) {
+    super();
+    this.path = path;
+    this.refused = false;
+    this.heardAt = 0;
+    this.connect();
+  }
+
+  get open() { return this.socket.readyState === WebSocket.OPEN; }
+
+  connect() {
+    const socket = this.socket = new WebSocket(address(this.path));
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => socket.send(JSON.stringify({ type: "hello", token: token() }));
+    socket.onmessage = (event) => {
+      if (socket !== this.socket) return;
+      this.heardAt = performance.now();
+      const data = typeof event.data === "string" ? JSON.parse(event.data) : event.data;
+      this.dispatchEvent(new CustomEvent(data instanceof ArrayBuffer ? "picture" : data.type, { detail: data }));
+    };
+    socket.onclose = (event) => {
+      if (socket !== this.socket) return;
+      this.refused = event.code === 4401;
+      this.dispatchEvent(new CustomEvent("lost"));
+      setTimeout(() => { if (socket === this.socket) this.connect(); }, this.refused ? 5000 : AGAIN_MS);
+    };
+  }
+
+  send(message) {
+    if (!this.open) return false;
+    this.socket.send(JSON.stringify(message));
+    return true;
+  }
+
+  // True while the server has been heard a moment ago; a server that hangs keeps its socket open.
+  get alive() { return this.open && performance.now() - this.heardAt < SILENT_MS; }
+
+  // A socket that is open and says nothing is given up, so that a new one is tried.
+  renew() {
+    const old = this.socket;
+    this.connect();
+    old.close();
+  }
+}
+
+export class State extends Channel {
+  constructor() {
+    super("/state");
+    this.number = 0;
+    this.waiting = new Map();
+    this.addEventListener("answer", ({ detail }) => {
+      const done = this.waiting.get(detail.id);
+      this.waiting.delete(detail.id);
+      if (done) done(detail);
+    });
+    this.addEventListener("lost", () => {
+      for (const done of this.waiting.values()) done(null);
+      this.waiting.clear();
+    });
+  }
+
+  // Resolves with the answer, or with null when the page was disconnected.
+  ask(message) {
+    const id = ++this.number;
+    return new Promise((resolve) => {
+      if (!this.send({ ...message, id })) { resolve(null); return; }
+      this.waiting.set(id, resolve);
+    });
+  }
+}

@@ -1,0 +1,35 @@
+// Elements are made from text and never from markup, so that a robot's name cannot be code.
+export function el(tag, attributes = {}, ...children) {
+  const node = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === undefined || value === null || value === false) continue;
+    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
+    else if (name === "text") node.textContent = value;
+    else node.setAttribute(name, value === true ? "" : String(value));
+  }
+  for (const child of children) if (child !== null && child !== undefined) node.append(child);
+  return node;
+}
+
+export function setText(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+export function setAttr(node, name, value) {
+  const text = String(value);
+  if (node.getAttribute(name) !== text) node.setAttribute(name, text);
+}
+
+export function typing(target) {
+  return target instanceof HTMLTextAreaElement ||
+    (target instanceof HTMLInputElement && !["button", "submit", "range"].includes(target.type));
+}
+
+let toastTimer = 0;
+export function toast(text, bad = false) {
+  const node = document.getElementById("toast");
+  node.textContent = text;
+  node.dataset.bad = bad ? "yes" : "no";
+  clearTimeout(toastTimer);
+  toastTimer = setTimeout(() => { node.textContent = ""; }, bad ? 15000 : 6000);
+}

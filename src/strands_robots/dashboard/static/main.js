@@ -1,0 +1,97 @@
+import { Channel, State } from "./connection.js";
+import { setText, typing } from "./dom.js";
+import { Fleet, FleetView } from "./fleet.js";
+import { Resume } from "./resume.js";
+import { RobotView } from "./robot.js";
+import { Stop } from "./stop.js";
+import { S } from "./strings.js";
+
+const fleet = new Fleet();
+// The way of STOP is opened first.
+const channel = new Channel("/stop");
+const stop = new Stop(channel, fleet);
+const state = new State();
+const view = new FleetView(fleet, state, (id) => stop.press(id));
+const robot = new RobotView(fleet, state, (id) => stop.press(id));
+const resume = new Resume(fleet, state);
+const main = document.getElementById("main");
+
+document.title = S.title;
+setText(document.getElementById("home"), S.title);
+
+// Space is STOP, wherever the focus is but in a text that is being typed.
+window.addEventListener("keydown", (event) => {
+  if (event.code !== "Space" || event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
+  event.preventDefault();
+  event.stopImmediatePropagation();
+  if (!event.repeat) stop.press("");
+}, true);
+window.addEventListener("keyup", (event) => {
+  // The browser would click the focused button when the key is released.
+  if (event.code === "Space" && !typing(event.target)) { event.preventDefault(); event.stopImmediatePropagation(); }
+}, true);
+window.addEventListener("keydown", (event) => { if (event.key === "Escape" && typing(event.target)) event.target.blur(); });
+
+const theme = document.getElementById("theme");
+setText(theme, "\u25D0");
+theme.setAttribute("aria-label", S.theme);
+theme.title = S.theme;
+if (localStorage.getItem("theme")) document.documentElement.dataset.theme = localStorage.getItem("theme");
+theme.addEventListener("click", () => {
+  const dark = document.documentElement.dataset.theme
+    ? document.documentElement.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  document.documentElement.dataset.theme = dark ? "light" : "dark";
+  localStorage.setItem("theme", document.documentElement.dataset.theme);
+});
+
+function route() {
+  const found = location.hash.match(/^#\/robot\/(.+)$/);
+  let key = "";
+  try { key = found ? decodeURIComponent(found[1]) : ""; } catch { key = ""; }
+  if (key) {
+    robot.open(key);
+    if (robot.node.parentNode !== main) { main.replaceChildren(robot.node); view.askThumbnails(); main.focus(); }
+  } else {
+    if (robot.key) robot.close();
+    if (view.node.parentNode !== main) { main.replaceChildren(view.node); view.asked = ""; view.askThumbnails(); }
+  }
+  draw();
+}
+
+let asked = false;
+function draw() {
+  if (asked) return;
+  asked = true;
+  requestAnimationFrame(() => {
+    asked = false;
+    if (robot.key) robot.draw(); else view.draw();
+    resume.draw();
+  });
+}
+
+state.addEventListener("hello", ({ detail }) => {
+  robot.hello = resume.hello = detail;
+  fleet.rows.clear();
+  fleet.events = [];
+  fleet.mine.clear();
+  view.order = null;
+  view.drawn.clear();
+  view.reconnected();
+  robot.cameras = "";
+  robot.watch();
+  draw();
+});
+state.addEventListener("fleet", ({ detail }) => { fleet.take(detail); stop.draw(); draw(); });
+state.addEventListener("picture", ({ detail }) => view.picture(detail));
+state.addEventListener("control", ({ detail }) => {
+  if (detail.held) fleet.mine.add(detail.key); else fleet.mine.delete(detail.key);
+  robot.control_changed(detail);
+  draw();
+});
+state.addEventListener("lost", () => { fleet.mine.clear(); draw(); });
+document.addEventListener("visibilitychange", () => view.askThumbnails());
+window.addEventListener("hashchange", route);
+// Ages grow also when nothing arrives.
+setInterval(draw, 250);
+setInterval(() => { if (state.open && state.heardAt && performance.now() - state.heardAt > 5000) state.renew(); }, 1000);
+route();

@@ -1,0 +1,42 @@
+// Resume stands far from STOP, in words and in place, and asks for the passphrase each time.
+import { el, setText, toast } from "./dom.js";
+import { S } from "./strings.js";
+
+export class Resume {
+  constructor(fleet, state) {
+    this.fleet = fleet;
+    this.state = state;
+    this.hello = null;
+    this.which = el("p");
+    this.hint = el("p");
+    this.passphrase = el("input", { id: "resume-passphrase", type: "password", autocomplete: "off" });
+    this.button = el("button", { type: "submit", text: S.resumeButton });
+    this.said = el("p", { class: "said", role: "status" });
+    this.form = el("form", { novalidate: true }, el("div", { class: "field" }, el("label", { for: "resume-passphrase", text: S.resumePassphrase }), this.passphrase), this.button);
+    this.form.addEventListener("submit", (event) => { event.preventDefault(); this.send(); });
+    this.node = el("details", { id: "resume" }, el("summary", { text: S.resumeTitle }), el("p", { text: S.resumeHint }), this.which, this.hint, this.form, this.said);
+    document.getElementById("resume-area").append(this.node);
+  }
+
+  locked() { return [...this.fleet.rows.values()].filter((row) => row.locked); }
+
+  draw() {
+    const locked = this.locked(), hello = this.hello;
+    this.node.parentNode.hidden = locked.length === 0 && !this.node.open;
+    setText(this.which, locked.length ? S.resumeWhich(locked.map((row) => row.id).slice(0, 40).join(", ")) : "");
+    const why = !hello ? "" : hello.role !== "operator" ? S.viewer : !hello.local ? S.resumeRemote : !hello.operator_key ? S.resumeNoKey : "";
+    setText(this.hint, why);
+    this.form.hidden = why !== "" || !hello;
+  }
+
+  async send() {
+    const passphrase = this.passphrase.value, keys = this.locked().map((row) => row.key);
+    this.passphrase.value = "";
+    setText(this.said, S.sending);
+    const answer = await this.state.ask({ type: "resume", keys, passphrase });
+    const text = answer ? answer.text : S.noAnswer;
+    setText(this.said, text);
+    this.said.dataset.tone = answer && answer.ok ? "good" : "bad";
+    toast(text, !(answer && answer.ok));
+  }
+}

@@ -1,0 +1,75 @@
+"""Forms of a robot's verbs, made from the descriptions of serving."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.peer_verbs import PEER_VERBS
+from strands_robots.serving.verbs import LEASE_ID, REQUIRED, Kind, Verb
+
+LEFT_OUT = frozenset({*CONTROL_VERBS, "resume", "ping", "teleop_status", "teleop_receive", "teleop_stop"})
+"""Verbs that the page has a control of its own for, or none."""
+
+FORMS_MAX, PARAMETERS_MAX, TEXT_MAX = 100, 40, 600
+
+_TYPES = {float: "number", int: "integer", bool: "boolean", str: "string", dict: "object", list: "array"}
+
+
+def forms_of(functions: Iterable[Mapping[str, Any]]) -> tuple[dict[str, Any], ...]:
+    """Return the forms of a device's functions, as it describes them on the network."""
+    forms = []
+    for each in list(functions)[:FORMS_MAX]:
+        schema = each.get("parameters")
+        schema = schema if isinstance(schema, Mapping) else {}
+        properties, required = schema.get("properties"), schema.get("required")
+        labels = each.get("labels")
+        reads = isinstance(labels, Mapping) and labels.get("direction") == "read"
+        rows = properties.items() if isinstance(properties, Mapping) else ()
+        needed = required if isinstance(required, list) else []
+        parameters = [_field(name, schema, name in needed) for name, schema in rows if isinstance(schema, Mapping)]
+        forms.append(_form(each.get("name"), "read" if reads else "motion", each.get("description"), parameters))
+    return tuple(form for form in forms if form["name"] not in LEFT_OUT)
+
+
+def peer_forms(verbs: Iterable[Verb] = tuple(PEER_VERBS.values())) -> tuple[dict[str, Any], ...]:
+    """Return the forms of a mesh peer, which has the same verbs as every other."""
+    forms = []
+    for verb in verbs:
+        parameters = [
+            _field(
+                each.name,
+                {
+                    "type": _TYPES.get(each.type, "string"),
+                    "description": each.meaning,
+                    **({} if each.default is REQUIRED else {"default": each.default}),
+                },
+                each.default is REQUIRED,
+            )
+            for each in verb.parameters
+        ]
+        kind = "read" if verb.kind is Kind.READ else "motion"
+        forms.append(_form(verb.name, kind, verb.summary, parameters))
+    return tuple(form for form in forms if form["name"] not in LEFT_OUT)
+
+
+def _form(name: object, kind: str, summary: object, parameters: list[dict[str, Any]]) -> dict[str, Any]:
+    given = [each for each in parameters if each["name"] != LEASE_ID][:PARAMETERS_MAX]
+    told = str(summary or "").strip().partition("\n")[0][:TEXT_MAX]
+    return {"name": str(name or "")[:100], "kind": kind, "summary": told, "parameters": given}
+
+
+def _field(name: object, schema: Mapping[str, Any], required: bool) -> dict[str, Any]:
+    default = schema.get("default")
+    if not isinstance(default, str | int | float | bool) or default != default:  # noqa: PLR0124 - NaN
+        default = None
+    elif isinstance(default, str):
+        default = default[:TEXT_MAX]
+    return {
+        "name": str(name)[:100],
+        "type": str(schema.get("type", "string"))[:20],
+        "meaning": str(schema.get("description", ""))[:TEXT_MAX],
+        "default": default,
+        "required": required,
+    }

@@ -1,0 +1,187 @@
+"""Driving by hand: leases, jogs, and every way in which a jog ends."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Any
+
+import pytest
+from fixtures.page_feed import PageFeed
+from fixtures.waiting import until
+
+from strands_robots.dashboard import driving
+from strands_robots.dashboard.driving import BEAT_S, HandControl, JogAxis
+from strands_robots.envelope import error, is_error, success
+from strands_robots.utils import ValidationError
+
+ARM, KEY = "arm-1", "dc:arm-1"
+JOG = {"kind": "joint", "axis": "pan", "direction": 1, "speed": 0.3}
+
+
+class Page:
+    """A page's control and what it was told."""
+
+    def __init__(self) -> None:
+        self.feed = PageFeed()
+        self.told: list[dict[str, Any]] = []
+        self.control = HandControl(self.told.append)
+
+    async def take(self, **more: Any) -> Any:
+        return await self.control.take(KEY, self.feed, ARM, **more)
+
+    async def jog(self, **changes: Any) -> None:
+        assert self.control.begin(KEY, {**JOG, **changes}) == ""
+
+    async def beating(self, until_done: Any) -> None:
+        while not until_done():
+            self.control.beat(KEY)
+            await asyncio.sleep(0.02)
+
+    def jogged(self) -> dict[str, Any] | None:
+        return next((each for each in self.told if each["type"] == "jogged"), None)
+
+
+@pytest.fixture
+async def page() -> Any:
+    made = Page()
+    yield made
+    await made.control.leave()
+
+
+async def test_free_robot_is_acquired_for_a_human_with_a_short_lease(page: Page) -> None:
+    assert not is_error(await page.take())
+    assert page.feed.asked("acquireControl") == [{"kind": "human", "ttl_s": driving.LEASE_S}]
+    assert page.control.lease(KEY) == {"lease_id": "lease-1"}
+    await until(lambda: page.feed.asked("renewControl"), what="the lease is renewed")
+
+
+async def test_secret_of_the_lease_is_not_told_to_the_page(page: Page) -> None:
+    assert "lease_id" not in str(await page.take())
+
+
+async def test_held_robot_is_taken_from_its_holder(page: Page) -> None:
+    page.feed.answers["acquireControl"] = [
+        error("agent-1 holds control", code="not_holder"),
+        success("yours", lease_id="lease-3"),
+    ]
+    assert not is_error(await page.take())
+    assert page.feed.asked("takeControl")[0]["reason"]
+    assert page.control.lease(KEY) == {"lease_id": "lease-3"}
+    assert page.feed.asked("acquireControl")[1]["lease_id"] == "lease-2"
+
+
+async def test_jog_needs_control(page: Page) -> None:
+    assert "Take control" in page.control.begin(KEY, JOG)
+    assert page.feed.calls == []
+
+
+async def test_jog_moves_with_the_lease_and_stops_when_it_is_released(page: Page) -> None:
+    await page.take()
+    await page.jog()
+    await page.beating(lambda: page.feed.asked("moveJoints"))
+    moved = page.feed.asked("moveJoints")[0]
+    assert (moved["joints"], moved["lease_id"], moved["wait"]) == ({"pan": 55.0}, "lease-1", False)
+    page.control.release(KEY)
+    await until(page.jogged)
+    told = page.jogged()
+    assert told is not None
+    assert (told["stopped"], told["why"]) == (True, "released")
+    assert page.feed.stops >= 1
+
+
+async def test_jog_without_a_beat_for_200_ms_is_stopped(page: Page) -> None:
+    await page.take()
+    began = time.monotonic()
+    await page.jog()
+    await until(lambda: page.feed.stops, what="the stop")
+    assert time.monotonic() - began >= BEAT_S * 0.9
+    await until(page.jogged)
+    told = page.jogged()
+    assert told is not None
+    assert "no beat" in told["why"]
+
+
+async def test_page_that_has_gone_stops_its_jog_and_gives_the_robot_back(page: Page) -> None:
+    await page.take()
+    await page.jog()
+    await page.beating(lambda: page.feed.asked("moveJoints"))
+    await page.control.leave()
+    assert page.feed.stops >= 1
+    assert page.feed.asked("releaseControl") == [{"lease_id": "lease-1"}]
+    assert not page.control.holds(KEY)
+
+
+async def test_page_that_has_gone_halts_what_it_held_even_without_a_jog(page: Page) -> None:
+    await page.take()
+    await page.control.leave()
+    assert page.feed.stops == 1
+
+
+async def test_command_that_the_stop_may_have_overtaken_is_stopped_again(page: Page) -> None:
+    await page.take()
+    page.feed.slow["moveJoints"] = asyncio.Event()
+    await page.jog()
+    await page.beating(lambda: page.feed.asked("moveJoints"))
+    page.control.release(KEY)
+    await until(lambda: page.feed.stops == 1)
+    page.feed.slow["moveJoints"].set()
+    await until(page.jogged)
+    assert page.feed.stops >= 2
+
+
+async def test_stop_that_is_not_confirmed_is_told_as_not_stopped(page: Page) -> None:
+    page.feed.stop_answer = error("no brakes", stopped=False)
+    await page.take()
+    await page.jog()
+    await until(page.jogged)
+    told = page.jogged()
+    assert told is not None
+    assert told["stopped"] is False and "no brakes" in told["text"]
+
+
+async def test_blocked_way_is_tried_in_shorter_stretches_and_then_refused(page: Page) -> None:
+    page.feed.answers["moveJoints"] = [error("pan must be at most 126")]
+    await page.take()
+    await page.jog()
+    await page.beating(page.jogged)
+    ways = [each["joints"]["pan"] - 10.0 for each in page.feed.asked("moveJoints")]
+    assert ways == list(driving.DEGREES)
+    told = page.jogged()
+    assert told is not None and told["refused"] and "126" in told["why"]
+
+
+async def test_lost_lease_ends_the_jog_and_is_told(page: Page) -> None:
+    await page.take()
+    await page.jog()
+    page.feed.answers["renewControl"] = [error("agent-1 has taken control", code="displaced")]
+    await page.beating(lambda: any(each["type"] == "control" for each in page.told))
+    await until(page.jogged)
+    assert not page.control.holds(KEY)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kind": "rocket"},
+        {"direction": 0},
+        {"direction": True},
+        {"direction": 0.5},
+        {"speed": 0},
+        {"speed": float("nan")},
+        {"speed": 2},
+        {"axis": 7},
+        {"kind": "tip", "axis": "w"},
+        {"kind": "base", "axis": "pan"},
+        {"part": 3},
+    ],
+)
+def test_jog_out_of_its_domain_is_refused_by_name(change: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="|".join(("kind", "direction", "speed", "axis", "part"))):
+        JogAxis.of({**JOG, **change})
+
+
+def test_base_is_driven_by_bounded_speeds() -> None:
+    axis = JogAxis.of({"kind": "base", "axis": "angular", "direction": -1, "speed": 1})
+    verb, params = axis.stretches({})[0]
+    assert (verb, params["linear"], params["angular"]) == ("drive", 0.0, -driving.ANGULAR_RAD_S)

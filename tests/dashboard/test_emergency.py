@@ -1,0 +1,136 @@
+"""Verdicts of the page's STOP: stopped is said only of a robot that said so itself."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.dashboard.emergency import FleetStop, verdict_of
+from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.statements import Proof
+
+
+def answer(name: str = "arm-1", stopped: bool | None = True, **more: Any) -> Answer:
+    return Answer(name, stopped, 9.0, more.pop("why", ""), **more)
+
+
+@pytest.mark.parametrize(
+    ("given", "state"),
+    [
+        (answer(), "stopped"),
+        (answer(proof=Proof.SIGNED, required=True), "stopped"),
+        (answer(required=True), "claimed"),
+        (answer(stopped=False, why="no brakes"), "not_stopped"),
+        (answer(stopped=False, required=True), "not_stopped"),
+        (answer(stopped=None), "unknown"),
+        (answer(stopped=None, why="resumed before"), "refused"),
+    ],
+)
+def test_answer_is_shown_as_what_it_proves(given: Answer, state: str) -> None:
+    assert verdict_of(given, 0.0)["state"] == state
+
+
+class Controller:
+    """Answers a stop with what the test gives."""
+
+    def __init__(self, report: StopReport) -> None:
+        self.link_up = True
+        self.controller_id = "dashboard"
+        self.report = report
+        self.expected: Collection[str] = ()
+
+    def press(self, estop_id: str) -> None:
+        """Nothing to note."""
+
+    def stop(self, expected: Collection[str], reason: str, *, estop_id: str, on_progress: Any) -> StopReport:
+        self.expected = expected
+        on_progress(
+            Progress(estop_id, self.report.answered, self.report.unanswered, True, 150.0, alarms=self.report.alarms)
+        )
+        return self.report
+
+    def review(self, report: StopReport) -> StopReport:
+        return self.report
+
+
+class Fed:
+    """A feed of which only the controller is used."""
+
+    network = "dc"
+
+    def __init__(self, controller: Controller) -> None:
+        self.controller = controller
+
+
+def stopped_by(report: StopReport, *names: str) -> tuple[FleetModel, FleetStop, Controller]:
+    model, controller = FleetModel(), Controller(report)
+    for name in names:
+        model.update("dc", name, expected=True)
+    stop = FleetStop(model, [Fed(controller)])  # type: ignore[list-item]
+    stop.press()
+    stop.close()
+    eventually(lambda: not stop.running, what="the stop's end")
+    stop.refresh()
+    return model, stop, controller
+
+
+def states(model: FleetModel) -> dict[str, str]:
+    return {row.id: row.stop["state"] for row in model.rows() if row.stop is not None}
+
+
+def test_every_robot_that_was_seen_must_answer() -> None:
+    names = ("arm-1", "arm-2")
+    report = StopReport("e" * 32, {each: answer(each) for each in names}, {}, {}, (), True, 20.0)
+    model, _, controller = stopped_by(report, *names)
+    assert set(controller.expected) == set(names)
+    assert states(model) == dict.fromkeys(names, "stopped")
+
+
+def test_refusing_robot_alarm_and_claim_are_each_shown_as_such() -> None:
+    report = StopReport(
+        "e" * 32,
+        {"arm-1": answer("arm-1")},
+        {"arm-2": answer("arm-2", stopped=False, why="no brakes"), "arm-5": answer("arm-5", stopped=None)},
+        {},
+        (),
+        True,
+        20.0,
+        claimed={"arm-3": answer("arm-3", required=True)},
+        alarms={"arm-4": "wrong key", "arm-1": "wrong key"},
+    )
+    model, _, _ = stopped_by(report, "arm-1", "arm-2", "arm-3", "arm-4", "arm-5")
+    assert states(model) == {
+        "arm-1": "stopped",
+        "arm-2": "not_stopped",
+        "arm-3": "claimed",
+        "arm-4": "alarm",
+        "arm-5": "unknown",
+    }
+    first = model.row("dc:arm-1")
+    assert first is not None and first.stop is not None
+    assert first.stop["alarm"] == "wrong key"
+
+
+def test_robot_that_finds_later_that_it_did_not_stop_turns_red() -> None:
+    report = StopReport("e" * 32, {"arm-1": answer("arm-1")}, {}, {}, (), True, 20.0)
+    model, stop, controller = stopped_by(report, "arm-1")
+    controller.report = StopReport("e" * 32, {}, {"arm-1": answer("arm-1", stopped=False)}, {}, (), True, 20.0)
+    stop.refresh()
+    assert states(model) == {"arm-1": "not_stopped"}
+
+
+def test_page_is_told_that_it_cannot_stop_when_the_link_is_down_or_all_robots_are_silent() -> None:
+    report = StopReport("e" * 32, {"arm-1": answer("arm-1")}, {}, {}, (), True, 20.0)
+    model, stop, controller = stopped_by(report, "arm-1")
+    model.sign_of_life("dc", "arm-1")
+    assert stop.state()["can_stop"] is True
+    controller.link_up = False
+    assert stop.state()["can_stop"] is False
+    controller.link_up = True
+    model.clock = lambda: 10e9
+    assert stop.state()["can_stop"] is False
