@@ -31,7 +31,7 @@ test: venv  ## Everything that needs nothing but wheels
 	@$(BIN)/python -m pytest -m "not system" $(WORKERS) $(ARGS)
 
 system:
-	@./scripts/system-packages.sh $(GL_PACKAGES) mosquitto iproute2
+	@./scripts/system-packages.sh $(GL_PACKAGES) mosquitto iproute2 chromium fonts-dejavu-core
 	@./scripts/reachy-daemon.sh 1.13.0
 	@./scripts/reachy-daemon.sh 1.4.1
 	@./scripts/real-arm.sh
@@ -40,6 +40,7 @@ system:
 	@./scripts/venv.sh .venv-bridge requirements/bridge.lock
 	@./scripts/rosbridge.sh
 	@./scripts/registry.sh
+	@./scripts/axe.sh
 	@./scripts/dds-peers.sh
 	@./scripts/dds-security.sh
 
