@@ -9,7 +9,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, ScriptedPeer
 
-from strands_robots.mesh import safety
+from strands_robots.mesh import estop_retry, safety
 from strands_robots.mesh.core import Mesh
 
 
@@ -75,8 +75,8 @@ def test_newcomer_is_not_stopped(peers: Fleet) -> None:
 def test_peer_in_reach_that_never_answers_is_given_up(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
-    monkeypatch.setattr(safety, "RETRY_ANSWER_S", 0.02)
+    monkeypatch.setattr(estop_retry, "RETRY_EVERY_S", 0.05)
+    monkeypatch.setattr(estop_retry, "RETRY_ANSWER_S", 0.02)
     console, ghost = peers.join(None, "console"), peers.stranger()
     heartbeat = {"robot_id": "ghost", "timestamp": peers.clock()}
     ghost.put("strands/ghost/presence", heartbeat)
@@ -88,18 +88,18 @@ def test_peer_in_reach_that_never_answers_is_given_up(
     peers.clock.pass_(1)
     ghost.put("strands/ghost/presence", {**heartbeat, "timestamp": peers.clock()})
     eventually(lambda: "is in reach and does not answer" in caplog.text)
-    assert len(requests) == safety.UNANSWERED_MAX
+    assert len(requests) == estop_retry.UNANSWERED_MAX
 
 
 def test_returning_peer_that_does_not_stop_is_logged_once_and_asked_until_it_stops(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
+    monkeypatch.setattr(estop_retry, "RETRY_EVERY_S", 0.05)
     _, _, arm = cut_off(peers)
     arm.stops = False
     peers.bus.partition(peers.transports["arm-1"], cut=False)
     peers.meet()
-    eventually(lambda: len(arm.halts) > safety.UNANSWERED_MAX, what="the stop is repeated")
+    eventually(lambda: len(arm.halts) > estop_retry.UNANSWERED_MAX, what="the stop is repeated")
     named = [line for line in caplog.records if line.levelname == "CRITICAL" and "did NOT stop" in line.getMessage()]
     assert len(named) == 1
     assert "the brake is stuck" in named[0].getMessage()
@@ -111,8 +111,8 @@ def test_returning_peer_that_does_not_stop_is_logged_once_and_asked_until_it_sto
 def test_error_reply_does_not_count_as_stopped(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(safety, "RETRY_EVERY_S", 0.05)
-    monkeypatch.setattr(safety, "RETRY_ANSWER_S", 20.0)
+    monkeypatch.setattr(estop_retry, "RETRY_EVERY_S", 0.05)
+    monkeypatch.setattr(estop_retry, "RETRY_ANSWER_S", 20.0)
     console = peers.join(None, "console")
     faulty = ScriptedPeer(peers, "faulty", 0.0, first={"type": "error", "error": "dispatch error"})
     peers.bus.partition(faulty.wire)

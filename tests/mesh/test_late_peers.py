@@ -13,6 +13,7 @@ from tests.mesh.peers import Fleet, received
 from strands_robots.mesh import core, late_peers, safety
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.resume_authority import keygen, load_signing_key
+from strands_robots.safety.identity import EnrolledKeys, robot_identity
 
 PASSPHRASE = "Correct-Horse-7-Battery"
 
@@ -52,6 +53,19 @@ def is_back(peers: Fleet, name: str) -> None:
 
 def test_robot_that_missed_the_stop_gets_it_from_another_when_the_console_is_gone(peers: Fleet) -> None:
     first, second = stopped_fleet(peers)
+    is_back(peers, "arm-2")
+    eventually(lambda: second.lockout_epoch == first.lockout_epoch)
+
+
+def test_unsigned_word_that_an_enrolled_robot_is_locked_keeps_no_stop_from_it(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    identity = robot_identity("arm-2")
+    assert identity is not None
+    EnrolledKeys().enroll({"arm-2": identity.public})
+    first, second = stopped_fleet(peers)
+    claimed = {"locked": True, "epochs": [first.lockout_epoch]}
+    monkeypatch.setattr(second._adapter, "announced", lambda peer_id: claimed)
     is_back(peers, "arm-2")
     eventually(lambda: second.lockout_epoch == first.lockout_epoch)
 

@@ -5,14 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from fixtures.mesh_robots import Arm
-from tests.mesh.peers import Fleet
+from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet, received
 
 from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.resume_mesh import ask_peers
 from strands_robots.cli.stop import exit_code, style_of
+from strands_robots.mesh import topics
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, robot_identity
-from strands_robots.safety.peer_answers import stop_distrust, with_stop_statement
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.peer_answers import (
+    ANNOUNCED_S,
+    LockoutAnnouncer,
+    lockout_distrust,
+    resume_distrust,
+    stop_distrust,
+    with_stop_statement,
+)
 
 STOP = {"action": "stop"}
 
@@ -81,3 +91,72 @@ def test_lockout_state_of_an_enrolled_peer_needs_its_signature(peers: Fleet) -> 
     enroll("arm-1", shown_by="arm-2")
     assert "ALARM" in asked().problem
     assert asked().lockouts == ()
+
+
+def test_announced_lockout_state_is_signed_in_presence_and_in_state(peers: Fleet) -> None:
+    arm = peers.join(Arm(), "arm-1")
+    states = received(peers, topics.state("arm-1"))
+    console = peers.join(None, "console")
+    enroll("arm-1")
+    keys = EnrolledKeys().load()
+    arm.emergency_stop()
+    epochs = [arm.lockout_epoch]
+
+    def distrusts(facts: Any) -> str:
+        return lockout_distrust("arm-1", facts, facts.get("epochs"), keys)
+
+    peers.meet()
+    assert console.peers_by_id["arm-1"]["epochs"] == epochs
+    row = console.peers_by_id["arm-1"]
+    assert distrusts(row) == ""
+    eventually(lambda: any(each.get("epochs") == epochs for each in states))
+    assert distrusts(states[-1]) == ""
+    assert "ALARM" in distrusts({**row, "locked": False, "epochs": []})
+    assert "only claimed" in distrusts({"locked": False, "epochs": []})
+
+
+def test_announced_state_is_signed_anew_when_it_changes_or_ages() -> None:
+    now = [0.0]
+    announcer = LockoutAnnouncer(robot_identity("arm-1"), lambda: now[0])
+    free, locked = {"locked": False, "epochs": []}, {"locked": True, "epochs": [new_epoch()]}
+    first = announcer.of("arm-1", free)
+    assert announcer.of("arm-1", free) is first
+    assert announcer.of("arm-1", locked)["statement"]["locked"] is True
+    assert announcer.of("arm-1", locked)["epochs"] == locked["epochs"]
+    at = announcer.of("arm-1", locked)["statement"]["t"]
+    now[0] = ANNOUNCED_S
+    assert announcer.of("arm-1", locked)["statement"]["t"] > at
+    assert LockoutAnnouncer(None).of("arm-1", free) == free
+
+
+def test_answer_to_a_resume_is_signed_for_its_assertion(peers: Fleet) -> None:
+    peers.join(Arm(), "arm-1")
+    console = peers.join(None, "console")
+    enroll("arm-1")
+    keys = EnrolledKeys().load()
+    wrong = [{"v": 1, "epoch": new_epoch(), "targets": ["arm-1"], "nonce": new_epoch()} for _ in range(2)]
+    answers = [console.send("arm-1", {"action": "resume", "assertion": each}, timeout=20)["result"] for each in wrong]
+    assert [each["status"] for each in answers] == ["error", "error"]
+    assert [resume_distrust("arm-1", *pair, keys) for pair in zip(wrong, answers, strict=True)] == ["", ""]
+    assert "ALARM" in resume_distrust("arm-1", wrong[0], answers[1], keys)
+    assert "ALARM" in resume_distrust("arm-1", wrong[0], {**answers[0], "status": "ok"}, keys)
+    assert "only claimed" in resume_distrust("arm-1", wrong[0], {"status": "ok"}, keys)
+    assert "only claimed" in resume_distrust("arm-1", wrong[0], answers[0], None)
+
+
+def test_robots_of_an_enrolled_world_answer_with_its_key(peers: Fleet) -> None:
+    peers.join(World("left", "right"), "sim-1", "sim")
+    console = peers.join(None, "console")
+    child = "sim-1__left"
+    eventually(lambda: child in console.peers_by_id)
+    enroll("sim-1")
+    keys = EnrolledKeys().load()
+    assert stop_distrust(console.send(child, STOP, 20), keys) == ""
+    row, status = console.peers_by_id[child], console.send(child, {"action": "status"}, 20)["result"]
+    assertion = {"nonce": new_epoch()}
+    resumed = console.send(child, {"action": "resume", "assertion": assertion}, 20)["result"]
+    assert [lockout_distrust(child, each, [], keys) for each in (row, status)] == ["", ""]
+    assert resume_distrust(child, assertion, resumed, keys) == ""
+    parent = console.send("sim-1", {"action": "status"}, 20)["result"]
+    assert "ALARM" in lockout_distrust(child, parent, [], keys), "the answer of one is none of another"
+    assert "only claimed" in stop_distrust({"responder_id": child, "turn_id": "t", "result": {"ok": True}}, keys)

@@ -16,6 +16,8 @@ from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, first_line, label, plain, table
 from strands_robots.envelope import is_error, text_of
+from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
+from strands_robots.safety.statements import ALARM
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.tools.networks import NativeMesh
 from strands_robots.utils import number
@@ -102,7 +104,10 @@ def _mesh_peers(screen: Screen, timeout: float) -> None:
     """List the mesh peers that announce themselves within ``timeout`` seconds."""
     with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
         time.sleep(timeout)
-        rows = [row for row in mesh.peers if row["reachable"]]
+        rows, keys = [row for row in mesh.peers if row["reachable"]], enrolled_peers()
+    for row in rows:
+        if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+            row["distrusted"] = why
     if not rows:
         raise CliError("No peer is on the mesh of this machine.", Exit.SILENT, peers=[])
     screen.data({"status": "success", "peers": rows})
@@ -114,6 +119,8 @@ def _mesh_status(row: Mapping[str, Any]) -> str | Text:
     """Return the task's state, or the lockout, or that emergency stops do not arrive."""
     if row.get("estop_unheard"):
         return label("CANNOT RECEIVE STOPS", "bold red")
+    if why := str(row.get("distrusted", "")):
+        return label(why, "bold red" if why.startswith(ALARM) else "yellow")
     return label("LOCKED", "bold red") if row.get("locked") is True else str(row.get("task_status", ""))
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.safety.lockout import OVERFLOW, Lockout
-from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
+from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust, resume_distrust
 from strands_robots.safety.resume import sign
 from strands_robots.utils import shown
 
@@ -111,4 +111,6 @@ def _ask(mesh: Mesh, name: str, seconds: float, keys: Mapping[str, bytes] | None
 def _send(mesh: Mesh, name: str, assertion: Mapping[str, Any], seconds: float) -> str:
     reply = mesh.send(name, {"action": "resume", "assertion": assertion}, seconds)
     result = reply.get("result")
-    return str(result.get("error", "")) if isinstance(result, Mapping) else str(reply.get("error") or "no answer")
+    if not isinstance(result, Mapping):
+        return str(reply.get("error") or "no answer")
+    return resume_distrust(name, assertion, result, enrolled_peers()) or str(result.get("error", ""))

@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from strands_robots.contract import Observer, Unsubscribe, WorldRobot
@@ -22,6 +23,7 @@ from strands_robots.mesh.safety import status_of
 from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Declaration, TransportError, undeclare
+from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS
@@ -136,10 +138,11 @@ class Children:
         context: the parent's.
         pipeline: the parent's, whose threads and pending commands the children share.
         kind: the parent's type.
-        safety: returns the parent's lockout, which holds its children as well; ``report`` returns all of it.
-        own: the verbs that the parent answers for its children.
+        safety: returns, for a child's id, the parent's lockout, which holds it as well; ``report`` returns all of it.
+        own: returns, for a child's id, the verbs that the parent answers for it.
         teleop: the parent's input streams, which may drive any of the robots.
         audit: makes the audit of a child.
+        robot_key: the parent's, which signs for its children as well.
     """
 
     def __init__(
@@ -149,11 +152,12 @@ class Children:
         pipeline: Pipeline,
         *,
         kind: str,
-        safety: Callable[[], Mapping[str, Any]],
-        report: Callable[[], Mapping[str, Any]],
-        own: Mapping[str, Own],
+        safety: Callable[[str], Mapping[str, Any]],
+        report: Callable[[str], Mapping[str, Any]],
+        own: Callable[[str], Mapping[str, Own]],
         teleop: TeleopReceivers,
         audit: Callable[[str], AuditThrottle],
+        robot_key: SigningIdentity | None = None,
     ) -> None:
         self._context = context
         self._world = world
@@ -163,6 +167,7 @@ class Children:
         self._own = own
         self._teleop = teleop
         self._audit = audit
+        self._robot_key = robot_key
         self._children: dict[str, _Child] = {}
         self._unnamed: set[str] = set()
         self._closed = threading.Event()
@@ -226,10 +231,10 @@ class Children:
             hardware=False,
             authorize=SenderCheck(context, hardware=False),
             own={
-                **self._own,
+                **self._own(peer),
                 **parents,
                 **self._arm_verbs(name),
-                "status": status_of(robot, self._report),
+                "status": status_of(robot, partial(self._report, peer)),
                 "execute": execute_on(robot, parent),
             },
             pending=self._pipeline.pending.of(name),
@@ -242,8 +247,9 @@ class Children:
             target_of=robot.stop_target,
             before_stop=self._teleop.void,
             after_stop=self._teleop.reap,
+            robot_key=self._robot_key,
         )
-        presence = PresencePublisher(context, self._kind, robot.facts, self._safety)
+        presence = PresencePublisher(context, self._kind, robot.facts, partial(self._safety, peer))
         handles: list[Declaration] = []
         child = _Child(context, presence, pipeline, handles, context.monotonic())
         handles.append(transport.declare_subscriber(topics.command(peer), server.on_command))

@@ -145,7 +145,7 @@ class Mesh(SensorLoopsMixin):
             "teleop_receive": self._teleop.receive,
             "teleop_stop": self._teleop.stop,
             "ping": lambda arguments: pong(context),
-            "resume": lambda arguments: self._safety.on_resume_command(arguments.get("assertion")),
+            "resume": self._resume_of(peer),
         }
         if robot is not None:
             own["status"] = status_of(robot, lambda: {**self._adapter.report(), **self._hearing.facts()})
@@ -165,7 +165,6 @@ class Mesh(SensorLoopsMixin):
         )
         self.children: Children | None = None
         if isinstance(robot, WorldRobot):
-            answered_here = {name: own[name] for name in ("ping", "resume")}
             self.children = Children(
                 context,
                 robot,
@@ -173,13 +172,17 @@ class Mesh(SensorLoopsMixin):
                 kind=self.peer_type,
                 safety=self._safety_facts,
                 report=self._adapter.report,
-                own=answered_here,
+                own=lambda child: {"ping": own["ping"], "resume": self._resume_of(child)},
+                robot_key=self._adapter.identity,
                 teleop=self._teleop,
                 audit=parts.recorder,
             )
 
-    def _safety_facts(self) -> dict[str, Any]:
-        return {**self._adapter.facts(), **self._hearing.facts()}
+    def _safety_facts(self, peer_id: str = "") -> dict[str, Any]:
+        return {**self._adapter.announced(peer_id), **self._hearing.facts()}
+
+    def _resume_of(self, peer_id: str) -> Own:
+        return lambda arguments: self._safety.on_resume_command(arguments.get("assertion"), peer_id)
 
     def _describe(self) -> dict[str, Any]:
         """Return the fields of presence: the robot's own, and the streams of this peer."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.mesh.context import Context
+from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
 
 logger = logging.getLogger(__name__)
 
@@ -91,7 +92,7 @@ class LatePeers:
             over = missing.locks and missing.epoch not in held
             if over or not missing.pending or self._context.monotonic() - missing.since > missing.lasts_s:
                 self._missing.pop(key, None)
-            elif now >= missing.due and (back := self._back(missing)):
+            elif now >= missing.due and (back := self._back(missing, enrolled_peers())):
                 missing.due = now + AGAIN_S + self._delay_s
                 for peer in back:
                     missing.pending[peer] += 1
@@ -132,7 +133,7 @@ class LatePeers:
     def _known(self) -> set[str]:
         return self._context.registry.seen_within(KNOWN_S)
 
-    def _back(self, missing: _Missing) -> list[str]:
+    def _back(self, missing: _Missing, keys: Mapping[str, bytes] | None) -> list[str]:
         """Return peers in reach that missed it; forget those that it reached."""
         back: list[str] = []
         passed = self._context.monotonic() - missing.since
@@ -140,16 +141,18 @@ class LatePeers:
             row = self._context.registry.get(peer)
             if row is None or not row["reachable"] or row["age"] > passed - SETTLE_S:
                 continue
-            if tries >= TRIES_MAX or self._reached(row, missing):
+            if tries >= TRIES_MAX or self._reached(row, missing, keys):
                 del missing.pending[peer]
             else:
                 back.append(peer)
         return back
 
     @staticmethod
-    def _reached(row: Mapping[str, Any], missing: _Missing) -> bool:
+    def _reached(row: Mapping[str, Any], missing: _Missing, keys: Mapping[str, bytes] | None) -> bool:
         epochs = row.get("epochs")
         if isinstance(epochs, list):
+            if lockout_distrust(str(row["peer_id"]), row, epochs, keys):
+                return False
             return (missing.epoch in epochs) is missing.locks
         # A peer that reports no lockout, such as one of the 0.5 releases, is told when it was away.
         return row["peer_id"] not in missing.absent

@@ -11,9 +11,8 @@ import contextlib
 import json
 import logging
 import secrets
-import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any
@@ -23,6 +22,7 @@ from strands_robots.contract import Robot
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
+from strands_robots.mesh.estop_retry import EstopRetry
 from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
 from strands_robots.mesh.older_peers import SAFETY, SAFETY_S, Closings
 from strands_robots.mesh.rpc import Requester, stop_outcome
@@ -34,17 +34,23 @@ from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import robot_identity
 from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch, signed_bytes
-from strands_robots.safety.peer_answers import enrolled_peers, record_heads, with_lockout_statement
+from strands_robots.safety.peer_answers import (
+    LockoutAnnouncer,
+    enrolled_peers,
+    record_heads,
+    with_lockout_statement,
+    with_resume_statement,
+)
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
 from strands_robots.safety.statements import Proof, Purpose, proof_of
-from strands_robots.safety.stopping import Outcome, StopVerdict, explain
+from strands_robots.safety.stopping import Outcome, StopVerdict
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Own
 from strands_robots.serving.robot_verbs import peer_stop_answer
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import Share, ShareFullError
-from strands_robots.utils import ValidationError, identifier, shown
+from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)
 
@@ -61,10 +67,8 @@ RECENT_MAX = 512
 HEADS_PER_S = 20
 """Answers to check-ins that are read in a second; a flood of them costs no more."""
 
-RETRY_EVERY_S = SPACING_S
-RETRY_ANSWER_S = 1.0
-UNANSWERED_MAX = 10
-"""Repeats to a peer that is in reach and does not answer; access rules may keep it from us."""
+STATUS_S = 1.0
+"""Seconds in which a peer in the field says whether it is locked."""
 
 ASK_S = 1.0
 """Seconds in which peers report the epochs that a resume is signed for."""
@@ -102,6 +106,7 @@ class SafetyAdapter:
         self._peer_id = peer_id
         self._robot = robot or NoRobot()
         self.identity = None if robot is None else robot_identity(peer_id)
+        self._announcer = LockoutAnnouncer(self.identity)
         self._key = key
         self._entry: Registered | None = None
         self._decision = StopRules()
@@ -130,14 +135,19 @@ class SafetyAdapter:
         epochs = self.epochs()
         return {"locked": bool(epochs), "epochs": list(epochs)}
 
+    def announced(self, peer_id: str = "") -> dict[str, Any]:
+        """Return :meth:`facts`, signed; of a robot of its world by its id."""
+        facts = self.facts()
+        return self._announcer.of(peer_id or self._peer_id, facts) if facts else {}
+
     def lockouts(self) -> list[dict[str, Any]]:
         """Return each lockout with its source, reason and time."""
         return [each.fields() for each in self._entry.latch.state.all] if self._entry is not None else []
 
-    def report(self) -> dict[str, Any]:
-        """Return the fields of ``status``: the lockouts and the check-in."""
+    def report(self, peer_id: str = "") -> dict[str, Any]:
+        """Return lockouts and check-in; of a robot of its world by its id."""
         check_in = self._plane.checkin.fields(time.monotonic())
-        facts = with_lockout_statement(self.identity, self._peer_id, self.facts())
+        facts = with_lockout_statement(self.identity, peer_id or self._peer_id, self.facts())
         return {**facts, "lockout": self.lockouts(), "check_in": check_in}
 
     def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
@@ -196,6 +206,17 @@ class SafetyAdapter:
         entry = self._entry
         return REJECTED if entry is None or is_error(entry.resume(assertion, "mesh")) else None
 
+    def answer_to_resume(self, assertion: object, peer_id: str = "") -> dict[str, Any]:
+        """Check an assertion and return the signed answer.
+
+        Args:
+            peer_id: the robot of its world that was asked, if one was.
+        """
+        rejected = self.resume(assertion)
+        result = {"status": "ok"} if rejected is None else {"status": "error", "error": rejected}
+        facts = {"device_id": peer_id or self._peer_id, **self.facts()}
+        return with_resume_statement(self.identity, peer_id or self._peer_id, assertion, result, facts)
+
     def close(self) -> None:
         """Take this peer's robot off the plane; twice is once."""
         entry, self._entry = self._entry, None
@@ -212,68 +233,6 @@ def status_of(robot: Robot, facts: Callable[[], Mapping[str, Any]]) -> Own:
         return {**answer, **facts()} if isinstance(answer, Mapping) else answer
 
     return status
-
-
-class EstopRetry:
-    """Repeats an emergency stop to the peers that missed it, until they stopped.
-
-    A link that parted, or a hub that hangs, loses what is published meanwhile, and Zenoh stores nothing for a peer
-    that comes back. So the issuer repeats the stop itself, for as long as it is locked by it.
-    """
-
-    def __init__(self, context: Context, requester: Requester) -> None:
-        self._context = context
-        self._requester = requester
-        self._over = threading.Event()
-
-    def begin(
-        self, epoch: str, missing: Iterable[str], locked: Callable[[], bool], publish: Callable[[], None]
-    ) -> None:
-        """Repeat the stop until ``missing`` have stopped or the lockout is over.
-
-        Args:
-            publish: publishes the stop's envelope once more.
-        """
-        self._over.set()  # a later stop is answered for an earlier one as well
-        over = self._over = threading.Event()
-        left = set(missing)
-        if left:
-            name = f"mesh-{self._context.peer_id}-estop-retry"
-            thread = threading.Thread(
-                target=self._run, args=(over, epoch, left, locked, publish), name=name, daemon=True
-            )
-            thread.start()
-
-    def _run(
-        self, over: threading.Event, epoch: str, left: set[str], locked: Callable[[], bool], publish: Callable[[], None]
-    ) -> None:
-        began, silences = self._context.monotonic(), Counter[str]()
-        logged: set[tuple[str, Outcome]] = set()
-        while left and not over.wait(RETRY_EVERY_S) and self._context.transport is not None and locked():
-            back = sorted(peer for peer in left if self._seen_since(began, peer))
-            if back:
-                publish()
-            for peer in back:
-                if over.is_set():
-                    return
-                reply: dict[str, Any] = self._requester.send(peer, {"action": "stop"}, RETRY_ANSWER_S)
-                outcome = stop_outcome(reply)
-                if outcome is Outcome.STOPPED:
-                    left.discard(peer)
-                    logger.warning("%s was out of reach and has answered emergency stop %s now.", peer, epoch)
-                elif outcome is Outcome.TIMED_OUT:
-                    silences[peer] += 1
-                    if silences[peer] >= UNANSWERED_MAX:
-                        left.discard(peer)
-                        logger.critical("%s is in reach and does not answer emergency stop %s.", peer, epoch)
-                elif (peer, outcome) not in logged:
-                    logged.add((peer, outcome))
-                    why = explain(reply.get("result")) if "result" in reply else shown(reply.get("error"))
-                    logger.critical("%s is in reach and did NOT stop on emergency stop %s: %s", peer, epoch, why)
-
-    def _seen_since(self, began: float, peer: str) -> bool:
-        row = self._context.registry.get(peer, self._context.monotonic() - began)
-        return row is not None and bool(row["reachable"])
 
 
 class FleetSafety:
@@ -298,7 +257,7 @@ class FleetSafety:
         self._retry = EstopRetry(context, requester)
         self._closings = Closings(
             f"mesh-{context.peer_id}-closing",
-            lambda peer: requester.send(peer, {"action": "status"}, RETRY_ANSWER_S).get("result"),
+            lambda peer: requester.send(peer, {"action": "status"}, STATUS_S).get("result"),
         )
         self.late = LatePeers(context, adapter.epochs)
         self._recent: deque[str] = deque(maxlen=RECENT_MAX)
@@ -538,14 +497,17 @@ class FleetSafety:
         held = [result.get("epochs") for result in results if isinstance(result, Mapping)]
         return [each for epochs in held if isinstance(epochs, list) for each in epochs if is_epoch(each)]
 
-    def on_resume_command(self, assertion: object) -> dict[str, Any]:
-        """Admit and relay a resume that came as a command, or return the one rejection."""
-        rejected = self._adapter.resume(assertion)
-        if rejected is not None:
-            return {"status": "error", "error": rejected}
-        self._relay(assertion)
-        self._note_admitted(assertion)
-        return {"status": "ok"}
+    def on_resume_command(self, assertion: object, peer_id: str = "") -> dict[str, Any]:
+        """Admit and relay a resume that came as a command, or return the one rejection.
+
+        Args:
+            peer_id: the robot of this peer's world that was asked, if one was.
+        """
+        answer = self._adapter.answer_to_resume(assertion, peer_id)
+        if answer["status"] == "ok":
+            self._relay(assertion)
+            self._note_admitted(assertion)
+        return answer
 
     def on_resume(self, sample: Sample) -> None:
         """Receive a relayed resume; one meant for others is not counted as refused."""

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from strands_robots.audit import audit_head, log_witness
 from strands_robots.safety.identity import EnrolledKeys, KeyFileError, SigningIdentity
+from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Proof, Purpose, distrust, proof_of, signed
 
 logger = logging.getLogger(__name__)
+
+ANNOUNCED_S = 10.0
+"""Seconds for which an announced lockout state is not signed anew while it stays the same."""
 
 UNUSABLE = "its answer is only claimed: the enrolled keys cannot be used"
 
@@ -37,6 +42,49 @@ def with_lockout_statement(identity: SigningIdentity | None, peer_id: str, facts
     return {**facts, "statement": signed(identity, Purpose.LOCKOUT_STATE, peer_id, fields)}
 
 
+def with_resume_statement(
+    identity: SigningIdentity | None,
+    peer_id: str,
+    assertion: object,
+    result: Mapping[str, Any],
+    facts: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return a peer's answer to a resume with its signed part, if it has a key.
+
+    The assertion's nonce is in it, so that a recorded answer fits no other one.
+    """
+    if identity is None:
+        return dict(result)
+    fields = {"status": result["status"], "nonce": _nonce_of(assertion), **facts}
+    return {**result, "statement": signed(identity, Purpose.RESUME_ANSWER, peer_id, fields)}
+
+
+class LockoutAnnouncer:
+    """The lockout state of a robot, as presence and ``state`` carry it.
+
+    Args:
+        identity: signs it; without one it is not signed.
+    """
+
+    def __init__(self, identity: SigningIdentity | None, clock: Callable[[], float] = time.monotonic) -> None:
+        self._identity = identity
+        self._clock = clock
+        self._latest: dict[str, tuple[float, dict[str, Any]]] = {}
+
+    def of(self, peer_id: str, facts: Mapping[str, Any]) -> dict[str, Any]:
+        """Return ``locked`` and ``epochs``, with a signed part if there is a key.
+
+        Args:
+            peer_id: the robot, or one of the robots of its world.
+        """
+        now = self._clock()
+        since, announced = self._latest.get(peer_id, (now, {}))
+        if now - since >= ANNOUNCED_S or any(announced.get(name) != value for name, value in facts.items()):
+            announced = with_lockout_statement(self._identity, peer_id, facts)
+            self._latest[peer_id] = now, announced
+        return announced
+
+
 def enrolled_peers() -> dict[str, bytes] | None:
     """Return the enrolled public keys by peer; None where they cannot be used."""
     try:
@@ -53,7 +101,7 @@ def stop_distrust(reply: Mapping[str, Any], keys: Mapping[str, bytes] | None) ->
     name, result = str(reply.get("responder_id")), reply.get("result")
     answer = result if isinstance(result, Mapping) else {}
     answered = {"turn_id": reply.get("turn_id"), **_stated(answer)}
-    return distrust(Purpose.STOP_VERDICT, name, answer.get("statement"), keys.get(name), answered)
+    return distrust(Purpose.STOP_VERDICT, name, answer.get("statement"), _key_of(name, keys), answered)
 
 
 def record_heads(witness: str, replies: Iterable[Mapping[str, Any]], expected: Collection[str]) -> None:
@@ -67,8 +115,9 @@ def record_heads(witness: str, replies: Iterable[Mapping[str, Any]], expected: C
     for reply in replies:
         name, result = str(reply.get("responder_id")), reply.get("result")
         statement = result.get("statement") if isinstance(result, Mapping) else None
-        if isinstance(statement, Mapping) and (name in keys or name in expected):
-            proof = proof_of(Purpose.STOP_VERDICT, name, statement, keys.get(name))
+        key = _key_of(name, keys)
+        if isinstance(statement, Mapping) and (key is not None or name in expected):
+            proof = proof_of(Purpose.STOP_VERDICT, name, statement, key)
             if proof is not Proof.WRONG:
                 log_witness(witness, name, statement.get("audit"), signed=proof is Proof.SIGNED)
 
@@ -78,7 +127,27 @@ def lockout_distrust(name: str, facts: Mapping[str, Any], epochs: list[str], key
     if keys is None:
         return UNUSABLE
     answered = {"locked": facts.get("locked"), "epochs": epochs}
-    return distrust(Purpose.LOCKOUT_STATE, name, facts.get("statement"), keys.get(name), answered)
+    return distrust(Purpose.LOCKOUT_STATE, name, facts.get("statement"), _key_of(name, keys), answered)
+
+
+def resume_distrust(
+    name: str, assertion: Mapping[str, Any], result: Mapping[str, Any], keys: Mapping[str, bytes] | None
+) -> str:
+    """Return the reason why an answer to a resume is not proven, or ""."""
+    if keys is None:
+        return UNUSABLE
+    answered = {"nonce": _nonce_of(assertion), "status": result.get("status")}
+    return distrust(Purpose.RESUME_ANSWER, name, result.get("statement"), _key_of(name, keys), answered)
+
+
+def _key_of(name: str, keys: Mapping[str, bytes]) -> bytes | None:
+    """Return the enrolled key of a peer; a robot of a world has the world's."""
+    return keys.get(name) or keys.get(name.rpartition("__")[0])
+
+
+def _nonce_of(assertion: object) -> str:
+    nonce = assertion.get("nonce") if isinstance(assertion, Mapping) else None
+    return str(nonce) if is_epoch(nonce) else ""
 
 
 def _stated(result: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Turns of Python's interpreter: short ones while this process sends or receives emergency stops."""
+"""Turns of Python's interpreter, short while emergency stops may come or go."""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ PLANAR = 2
 class RobotBody:
     """One robot by joint and actuator name, without its prefix in the world.
 
-    A rollout or a teleoperation drives it; ``draw`` makes the pictures of its observations. Every method raises :class:`ValidationError` once the robot was removed.
+    A rollout or a teleoperation drives it; ``draw`` makes the pictures of its observations. Every
+    method raises :class:`ValidationError` once the robot was removed.
     """
 
     def __init__(
