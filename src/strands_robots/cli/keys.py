@@ -1,4 +1,4 @@
-"""``keys resume|estop``: keys that free robots or sign their stops. ``mesh keys``: certificates of a mesh."""
+"""``keys``: keys that free robots or sign their stops, and MCP tokens. ``mesh keys``: certificates of a mesh."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ def register(app: typer.Typer) -> None:
     command(keys, "resume")(resume)
     command(keys, "estop")(estop)
     command(keys, "console")(console)
+    command(keys, "mcp")(mcp)
     app.add_typer(keys, name="keys")
     mesh = typer.Typer(no_args_is_help=True, help="The native mesh: certificates and access rules.")
     mesh_keys = typer.Typer(no_args_is_help=True, help="Certificates for a mesh that leaves this machine.")
@@ -62,6 +63,32 @@ def console(screen: Screen) -> None:
         "green",
     )
     screen.copyable(f"export STRANDS_MESH_CONSOLE_PUBLIC_KEYS={public}")
+
+
+def mcp(
+    screen: Screen,
+    *,
+    name: Annotated[str, typer.Argument(help="The caller that robots see.")],
+    read_only: Annotated[bool, typer.Option("--read-only", help="It reads and stops, and moves nothing.")] = False,
+    approves: Annotated[
+        bool, typer.Option("--approves", help="Its user's yes approves a motion of real hardware.")
+    ] = False,
+    revoke: Annotated[bool, typer.Option("--revoke", help="Remove the token of this name.")] = False,
+) -> None:
+    """Make a bearer token for a client of `mcp --http`, or revoke it."""
+    from strands_robots.mcp.tokens import Token, TokenFile  # noqa: PLC0415 - loaded when it is used
+
+    tokens = TokenFile()
+    if revoke:
+        if not _refusable(lambda: tokens.revoke(name)):
+            raise CliError(f"{name} has no token.", Exit.USAGE)
+        screen.data({"status": "success", "name": name, "revoked": True})
+        screen.say(f"{name} has no token any more.", "green")
+        return
+    text = _refusable(lambda: tokens.make(Token(name, read_only, approves)))
+    screen.data({"status": "success", "name": name, "token": text})
+    screen.say(f"The token of {name}; it is shown this once:", "green")
+    screen.copyable(text)
 
 
 def init(screen: Screen, folder: Folder = DEFAULT_FOLDER) -> None:

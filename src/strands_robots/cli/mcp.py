@@ -1,16 +1,18 @@
-"""``mcp``: all robots of a network for any MCP client, on stdin and stdout."""
+"""``mcp``: all robots of a network for any MCP client, on stdin and stdout or over HTTP."""
 
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from strands_robots.cli.command import command
 from strands_robots.cli.network import Network
-from strands_robots.cli.output import CliError, Screen
-from strands_robots.utils import device_id, install_line
+from strands_robots.cli.output import CliError, Exit, Screen
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.utils import device_id, install_line, port
 
 
 def register(app: typer.Typer) -> None:
@@ -24,13 +26,39 @@ def mcp(
     *,
     source: Annotated[str, typer.Option("--as", help="The caller that robots see.")] = "mcp",
     read_only: Annotated[bool, typer.Option("--read-only", help="Tools that read and stop, none that moves.")] = False,
+    http: Annotated[
+        str | None, typer.Option("--http", metavar="[HOST:]PORT", help="Serve HTTP there instead of stdin and stdout.")
+    ] = None,
+    http_cert: Annotated[Path | None, typer.Option("--http-cert", help="Certificate of the HTTP server (PEM).")] = None,
+    http_key: Annotated[Path | None, typer.Option("--http-key", help="Its private key (PEM).")] = None,
+    http_name: Annotated[
+        list[str] | None, typer.Option("--http-name", help="A host name by which clients reach it (repeat).")
+    ] = None,
 ) -> None:
-    """Serve all robots to an MCP client that starts this command (stdio)."""
+    """Serve all robots to MCP clients: to the one that starts this command, or over HTTP."""
     name = device_id("--as", source)
     try:
         from strands_robots.mcp.caller import Caller  # noqa: PLC0415 - loaded when it is used
         from strands_robots.mcp.server import serve_stdio  # noqa: PLC0415 - as above
     except ModuleNotFoundError as missing:
         raise CliError(f"The MCP server needs the extra mcp ({install_line('mcp')}): {missing}.") from missing
-    with network.fleet(name) as fleet:
-        asyncio.run(serve_stdio(Caller(fleet), read_only=read_only))
+    if http is None:
+        with network.fleet(name) as fleet:
+            asyncio.run(serve_stdio(Caller(fleet), read_only=read_only))
+        return
+    from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
+    from strands_robots.mcp.http import Address, serve_http  # noqa: PLC0415 - as above
+    from strands_robots.mcp.tokens import Token  # noqa: PLC0415 - as above
+
+    host, _, number = http.rpartition(":")
+    try:
+        at = port("--http", int(number))
+    except ValueError:
+        raise CliError(f"--http takes a port or HOST:PORT, not {http!r}.", Exit.USAGE) from None
+    address = Address(host.strip("[]") or "127.0.0.1", at, http_cert, http_key, tuple(http_name or ()))
+    link = network.link()
+    default = Token(name, read_only=read_only)
+    try:
+        asyncio.run(serve_http(lambda who: FleetClient(link, who), address, default=default, ready=screen.say))
+    except (StrandsRobotsError, OSError) as problem:
+        raise CliError(str(problem), Exit.USAGE) from problem

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+import time
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import anyio
@@ -28,19 +30,43 @@ STOPS_MAX = 3
 
 SETTLE_S = 0.5
 
+RENEWALS = 4
+"""Renewals of a lease in its time, while its client is there."""
 
-Held = tuple[str, str]
-"""A robot that is held: its id, and its name in a world; empty where it is no world."""
+RENEW_MAX_S = 5.0
+
+Target = tuple[str, str]
+"""A robot's id, and the name of one robot of its world or nothing."""
+
+
+@dataclass
+class _Held:
+    lease_id: str
+    ttl_s: float
+    live: bool = True
 
 
 class Caller:
-    """One client of the server: the connection of its name, and its leases."""
+    """One client of the server: the connection of its name, and its leases.
 
-    def __init__(self, fleet: FleetClient) -> None:
+    Args:
+        present: whether the client is there now; its leases are renewed as long as it is.
+    """
+
+    def __init__(self, fleet: FleetClient, present: Callable[[], bool] = lambda: True) -> None:
         self.fleet = fleet
-        self._leases: dict[Held, str] = {}
+        self._present = present
+        self._leases: dict[Target, _Held] = {}
+        self._first: dict[str, str] = {}
+        self._moving: set[_Halting] = set()
+        self._renewing: asyncio.Task[None] | None = None
+        self._used_at = time.monotonic()
         # An emergency stop is never behind another call.
         self._urgent = ThreadPoolExecutor(1, "mcp-estop")
+
+    def used(self) -> None:
+        """Note a call of the client; it is there, so its leases are renewed."""
+        self._used_at = time.monotonic()
 
     async def read(self, robot: str, verb: str, params: Mapping[str, Any] | None = None) -> Envelope:
         """Call a verb that moves nothing."""
@@ -54,31 +80,59 @@ class Caller:
 
         Without ``wait`` the lease has to be held, whose end halts the robot of a client that went away.
         """
-        held = self._meant(robot, str(params.get("robot_name", "")))
-        if not wait and held not in self._leases:
+        target = await self._target(robot, params)
+        if not wait and not self._holds(target):
             return _needs_lease()
-        async with _Halting(self, held) as motion:
-            answer = await motion.begin(verb, {**params, "wait": wait}, ANSWER_S + WAIT_S)
+        arguments = {**params, "wait": wait, **self._lease(target)}
+
+        async def to_the_end(motion: _Halting) -> Envelope:
+            answer = await motion.begin(verb, arguments, ANSWER_S + WAIT_S)
             while wait and str(answer.get("task_status", "")).lower() in RUNNING:
-                await self._renew(held)
-                task = {"task_id": answer.get("task_id", ""), **_named(held)}
+                task = {"task_id": answer.get("task_id", ""), **_named(params)}
                 answer = await self._call(robot, "wait", task, ANSWER_S + WAIT_S)
             return answer
 
+        return await self._halting(target, to_the_end)
+
     async def run_policy(self, robot: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
         """Run a policy, to its end with ``wait``; halted and refused as :meth:`move`."""
-        held = self._meant(robot, str(params.get("robot_name", "")))
-        if not wait and held not in self._leases:
+        target = await self._target(robot, params)
+        if not wait and not self._holds(target):
             return _needs_lease()
-        async with _Halting(self, held) as motion:
-            answer = await motion.begin("execute", params, ANSWER_S)
+
+        async def to_the_end(motion: _Halting) -> Envelope:
+            answer = await motion.begin("execute", {**params, **self._lease(target)}, ANSWER_S)
+            one = str(answer.get("robot_name") or params.get("robot_name") or "")
             while wait and not is_error(answer):
                 await asyncio.sleep(POLL_S)
-                await self._renew(held)
                 answer = await self._call(robot, "getStatus", {}, ANSWER_S)
-                if str(answer.get("task_status", "")).lower() not in RUNNING:
+                if not runs(answer, one):
                     break
             return answer
+
+        return await self._halting(target, to_the_end)
+
+    async def acquire(self, robot: str, ttl_s: float, robot_name: str) -> Envelope:
+        """Acquire the control lease; motions of this client carry it from then on."""
+        target = await self._target(robot, {"robot_name": robot_name}, leased=True)
+        params = {"kind": "agent", "ttl_s": ttl_s, **({"robot_name": robot_name} if robot_name else {})}
+        answer = await self.read(robot, "acquireControl", {**params, **self._lease(target)})
+        if not is_error(answer) and isinstance(answer.get(LEASE_ID), str):
+            self._leases[robot, str(answer.get("robot_name", target[1]))] = _Held(answer[LEASE_ID], ttl_s)
+            if self._renewing is None:
+                self._renewing = asyncio.ensure_future(self._renew())
+        # The secret stays here: a model has no use for it.
+        return _without_lease(answer)
+
+    async def release(self, robot: str, robot_name: str) -> Envelope:
+        """Give the control lease back."""
+        target = await self._target(robot, {"robot_name": robot_name})
+        if target not in self._leases:
+            return error(f"This client holds no lease of {robot}.")
+        params = {**self._lease(target), **({"robot_name": target[1]} if target[1] else {})}
+        answer = await self.read(robot, "releaseControl", params)
+        self._leases.pop(target, None)
+        return _without_lease(answer)
 
     async def stop(self, robot: str, robot_name: str = "") -> Envelope:
         """Stop a robot, or one of a world, without a lease or a wait."""
@@ -92,38 +146,64 @@ class Caller:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._urgent, stop_and_lock, self.fleet, reason)
 
-    async def acquire(self, robot: str, ttl_s: float, robot_name: str) -> Envelope:
-        """Acquire the control lease; motions of this client carry it from then on."""
-        held = (robot, robot_name)
-        params = {"kind": "agent", "ttl_s": ttl_s, **_named(held), **self._lease(self._meant(*held))}
-        answer = await self.read(robot, "acquireControl", params)
-        if not is_error(answer) and isinstance(answer.get(LEASE_ID), str):
-            self._leases[robot, str(answer.get("robot_name", ""))] = answer[LEASE_ID]
-        # The secret stays here: a model has no use for it.
-        return _without_lease(answer)
-
-    async def release(self, robot: str, robot_name: str) -> Envelope:
-        """Give the control lease back."""
-        held = self._meant(robot, robot_name)
-        if held not in self._leases:
-            return error(f"This client holds no lease of {'/'.join(filter(None, held))}.")
-        answer = await self.read(robot, "releaseControl", {**self._lease(held), **_named(held)})
-        self._leases.pop(held, None)
-        return _without_lease(answer)
-
     async def leave(self) -> None:
-        """Halt each robot that is held and release it: the client has gone away."""
+        """Halt what this client moves and holds, and release it: the client has gone away."""
+        if self._renewing is not None:
+            self._renewing.cancel()
+            self._renewing = None
         with anyio.CancelScope(shield=True):
-            await asyncio.gather(*(self._leave(held) for held in tuple(self._leases)))
+            held = tuple(self._leases)
+            await asyncio.gather(*(self.stop(*target) for target in {*held, *(each.target for each in self._moving)}))
+            await asyncio.gather(*(self.release(*target) for target in held))
+
+    def close(self) -> None:
+        """End the thread of the emergency stop."""
         self._urgent.shutdown(wait=False)
 
-    async def _leave(self, held: Held) -> None:
-        await self.stop(*held)
-        await self.release(*held)
+    def motion(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> asyncio.Task[Envelope]:
+        """Start the call that begins a motion."""
+        return asyncio.ensure_future(self._call(robot, verb, params, seconds))
 
-    async def _renew(self, held: Held) -> None:
-        if held in self._leases:
-            await self.read(held[0], "renewControl", {**self._lease(held), **_named(held)})
+    def watch(self, motion: _Halting, *, ended: bool) -> None:
+        """Keep a motion among those that :meth:`leave` halts."""
+        (self._moving.discard if ended else self._moving.add)(motion)
+
+    async def _halting(self, target: Target, work: Callable[[_Halting], Awaitable[Envelope]]) -> Envelope:
+        try:
+            async with _Halting(self, target) as motion:
+                return await work(motion)
+        except DeviceTimeoutError as exc:
+            return error(f"{exc} What the call began was told to stop.")
+
+    async def _renew(self) -> None:
+        renewed_at = time.monotonic()
+        while True:
+            times = [held.ttl_s for held in self._leases.values() if held.live]
+            await asyncio.sleep(min(*times, RENEW_MAX_S * RENEWALS, RENEW_MAX_S * RENEWALS) / RENEWALS)
+            if not self._present() and self._used_at < renewed_at:
+                continue
+            renewed_at = time.monotonic()
+            await asyncio.gather(*(self._renew_one(target) for target in tuple(self._leases)))
+
+    async def _renew_one(self, target: Target) -> None:
+        held = self._leases[target]
+        if held.live:
+            named = {"robot_name": target[1]} if target[1] else {}
+            answer = await self.read(target[0], "renewControl", {LEASE_ID: held.lease_id, **named})
+            # A motion carries it all the same: the robot's refusal says who has taken control.
+            held.live = answer.get("code") not in {"displaced", "lease_over", "not_holder"}
+
+    async def _target(self, robot: str, params: Mapping[str, Any], *, leased: bool = False) -> Target:
+        """Return the robot that is meant, of a world the first where none is named."""
+        name = params.get("robot_name", "")
+        if name or not (leased or any(each == robot for each, _ in self._leases)):
+            return robot, name
+        if robot not in self._first:
+            status = await self.read(robot, "getStatus")
+            names = status.get("robots")
+            if not is_error(status):
+                self._first[robot] = str(next(iter(names), "")) if isinstance(names, Mapping) else ""
+        return robot, self._first.get(robot, "")
 
     async def _call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
         try:
@@ -133,30 +213,26 @@ class Caller:
         except (CallRefusedError, ValidationError, MessagingError) as exc:
             return error(str(exc))
 
-    def _meant(self, robot: str, robot_name: str) -> Held:
-        """Return the robot of a world that a call without its name means."""
-        mine = [held for held in self._leases if held[0] == robot]
-        return mine[0] if not robot_name and len(mine) == 1 else (robot, robot_name)
+    def _holds(self, target: Target) -> bool:
+        held = self._leases.get(target)
+        return held is not None and held.live
 
-    def _lease(self, held: Held) -> dict[str, str]:
-        return {LEASE_ID: self._leases[held]} if held in self._leases else {}
-
-    def motion(self, held: Held, verb: str, params: Mapping[str, Any], seconds: float) -> asyncio.Task[Envelope]:
-        """Start the call that begins a motion, with the lease of the robot if it is held."""
-        return asyncio.ensure_future(
-            self._call(held[0], verb, {**params, **_named(held), **self._lease(held)}, seconds)
-        )
+    def _lease(self, target: Target) -> dict[str, str]:
+        held = self._leases.get(target)
+        return {} if held is None else {LEASE_ID: held.lease_id}
 
 
 class _Halting:
     """A block that halts the robot when its call is given up."""
 
-    def __init__(self, caller: Caller, held: Held) -> None:
-        self._caller, self._held = caller, held
+    def __init__(self, caller: Caller, target: Target) -> None:
+        self.target = target
+        self._caller = caller
         self._begun: asyncio.Task[Envelope] | None = None
 
     async def begin(self, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
-        self._begun = self._caller.motion(self._held, verb, params, seconds)
+        self._begun = self._caller.motion(self.target[0], verb, params, seconds)
+        self._caller.watch(self, ended=False)
         # The call goes on when its caller is cancelled: its answer says whether the stop came after the start.
         return await asyncio.shield(self._begun)
 
@@ -164,19 +240,34 @@ class _Halting:
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None or self._begun is None:
-            return
+        try:
+            if kind is not None and self._begun is not None:
+                await self._halt(self._begun)
+        finally:
+            self._caller.watch(self, ended=True)
+
+    async def _halt(self, begun: asyncio.Task[Envelope]) -> None:
         with anyio.CancelScope(shield=True):
             for _attempt in range(STOPS_MAX):
-                await self._caller.stop(*self._held)
+                answered = begun.done()
+                await self._caller.stop(*self.target)
                 # A stop may overtake the command that it is meant for, so one more follows until that is answered.
-                if (await asyncio.wait([self._begun], timeout=SETTLE_S))[0]:
+                if answered:
                     break
-            self._begun.cancel()
+                await asyncio.wait([begun], timeout=SETTLE_S)
+            begun.cancel()
 
 
-def _named(held: Held) -> dict[str, str]:
-    return {"robot_name": held[1]} if held[1] else {}
+def runs(status: Envelope, robot_name: str) -> bool:
+    """True while the robot, or the named robot of a world, runs a policy."""
+    policies = status.get("running_policies")
+    if isinstance(policies, Mapping):
+        return robot_name in policies if robot_name else bool(policies)
+    return str(status.get("task_status", "")).lower() in RUNNING
+
+
+def _named(params: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in params.items() if name == "robot_name"}
 
 
 def _without_lease(answer: Envelope) -> Envelope:

@@ -1,0 +1,52 @@
+"""What one client of the MCP server may do, and how its user is shown a picture."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from strands_robots.mcp.caller import Caller
+
+
+@dataclass(frozen=True)
+class Access:
+    """One client as the tools see it.
+
+    Attributes:
+        approves: whether the yes of the client's user is the operator's approval of a motion.
+        show_picture: makes a JPEG readable for that user and returns its address.
+    """
+
+    caller: Caller
+    approves: bool
+    show_picture: Callable[[bytes], str]
+
+
+AccessOf = Callable[[Any], Access]
+"""Returns the access of the client that sent a request."""
+
+
+class PictureFiles:
+    """Pictures that a user on this machine is shown, as files; the newest ones are kept."""
+
+    KEPT = 8
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="strands-robots-mcp-")
+        self._files: list[Path] = []
+
+    def show(self, jpeg: bytes) -> str:
+        """Write a picture; return its address."""
+        path = Path(tempfile.mkstemp(suffix=".jpg", dir=self._folder.name)[1])
+        path.write_bytes(jpeg)
+        self._files.append(path)
+        while len(self._files) > self.KEPT:
+            self._files.pop(0).unlink(missing_ok=True)
+        return path.as_uri()
+
+    def close(self) -> None:
+        """Remove the files."""
+        self._folder.cleanup()

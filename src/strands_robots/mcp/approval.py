@@ -1,0 +1,192 @@
+"""Approval of a motion of real hardware by the user of an MCP client.
+
+The robot refuses a motion that its operator has not approved. A client that can ask its user (elicitation) is then
+given the question: what will move, how far, how fast, and a picture. A yes issues a one-shot grant on this machine,
+as ``strands-robots grant`` does, and the motion is tried once more.
+"""
+
+# mypy: disable-error-code="misc"
+from __future__ import annotations
+
+import base64
+import json
+import math
+import secrets
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from mcp.server.mcpserver import Context
+from mcp.types import (
+    CallToolResult,
+    ElicitRequest,
+    ElicitRequestFormParams,
+    ElicitResult,
+    ImageContent,
+    InputRequiredResult,
+)
+from pydantic import BaseModel, Field
+
+from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.mcp.access import Access
+from strands_robots.mcp.results import jpeg_of, result
+from strands_robots.safety.approval import Approval, Grants, state_dir
+from strands_robots.safety.state_files import StateFileError
+from strands_robots.utils import ValidationError
+
+GRANT_S = 15.0
+"""Seconds for which the grant of a yes is good: the motion is begun at once."""
+
+ASKED_S = 300.0
+"""Seconds in which a question is answered."""
+
+ASKED_MAX = 64
+FULL_SPEED = "2 rad/s a joint"
+KEY = "approval"
+WITHOUT_PARTS = "2026-07-28"
+"""The first revision in which a question is a result, and its answer comes with the call anew."""
+
+Outcome: TypeAlias = CallToolResult | InputRequiredResult
+
+
+@dataclass(frozen=True)
+class Wish:
+    """A motion that a client asks for.
+
+    Attributes:
+        run: carries it out.
+    """
+
+    robot: str
+    verb: str
+    params: Mapping[str, Any]
+    run: Callable[[], Awaitable[Envelope]]
+
+
+class Approve(BaseModel):
+    """The form that a user fills in."""
+
+    approve: bool = Field(description="True lets the robot make this motion, once")
+
+
+class Approvals:
+    """Questions that were asked and not answered; each is good once."""
+
+    def __init__(self, grants: Callable[[], Grants] = lambda: Grants(state_dir() / "grants")) -> None:
+        self._grants = grants
+        self._asked: dict[str, tuple[float, str]] = {}
+
+    async def carry_out(self, context: Context[Any, Any], access: Access, wish: Wish) -> Outcome:
+        """Carry out a motion; ask the client's user where the robot's operator has to approve it."""
+        robot, verb, params = wish.robot, wish.verb, wish.params
+        motion = json.dumps([access.caller.fleet.source, robot, verb, params], sort_keys=True, default=str)
+        answered = self._answered(context, motion)
+        if answered is not None:
+            return result(await self._granted(wish) if answered else _declined(robot, verb))
+        answer = await wish.run()
+        if answer.get("reason") != Approval.refusal(verb, robot):
+            return result(answer)
+        question, encoded = await _question(access, robot, verb, params)
+        image = [ImageContent(type="image", data=encoded, mime_type="image/jpeg")] if encoded else []
+        if not (access.approves and _can_ask(context)):
+            return result({**answer, "question": question}, *image)
+        shown = access.show_picture(base64.b64decode(encoded)) if encoded else ""
+        message = f"{question}\nPicture: {shown or 'this robot gives none'}"
+        if str(context.protocol_version or "") >= WITHOUT_PARTS:
+            return self._ask(message, motion)
+        reply = await context.elicit(message, Approve)
+        yes = reply.action == "accept" and reply.data.approve
+        return result(await self._granted(wish) if yes else _declined(robot, verb))
+
+    def _ask(self, message: str, motion: str) -> InputRequiredResult:
+        now = time.monotonic()
+        self._asked = {key: each for key, each in self._asked.items() if now - each[0] < ASKED_S}
+        while len(self._asked) >= ASKED_MAX:
+            del self._asked[next(iter(self._asked))]
+        nonce = secrets.token_hex(16)
+        self._asked[nonce] = (now, motion)
+        form = ElicitRequestFormParams(message=message, requested_schema=Approve.model_json_schema())
+        return InputRequiredResult(input_requests={KEY: ElicitRequest(params=form)}, request_state=nonce)
+
+    def _answered(self, context: Context[Any, Any], motion: str) -> bool | None:
+        """Return the user's answer; None where this motion was not asked about, or too long ago."""
+        replies, nonce = context.input_responses, context.request_state
+        if not replies or not nonce:
+            return None
+        at, asked = self._asked.pop(nonce, (0.0, ""))
+        if asked != motion or time.monotonic() - at > ASKED_S:
+            return None
+        reply = replies.get(KEY)
+        if not isinstance(reply, ElicitResult) or reply.action != "accept":
+            return False
+        return (reply.content or {}).get("approve") is True
+
+    async def _granted(self, wish: Wish) -> Envelope:
+        robot, verb = wish.robot, wish.verb
+        try:
+            grant = self._grants().grant(verb, robot, GRANT_S)
+        except (StateFileError, ValidationError, OSError) as refused:
+            return error(f"The approval could not be recorded: {refused}")
+        try:
+            answer = await wish.run()
+        finally:
+            # Where the robot did not take it, as one on another machine does not, nobody else may.
+            unused = grant.exists()
+            grant.unlink(missing_ok=True)
+        if is_error(answer) and unused and answer.get("reason") == Approval.refusal(verb, robot):
+            return {**answer, "approved_here": "the robot is served by another machine or user, which has to approve"}
+        return answer
+
+
+def _can_ask(context: Context[Any, Any]) -> bool:
+    capabilities = context.client_capabilities
+    asks = None if capabilities is None else capabilities.elicitation
+    return asks is not None and (asks.form is not None or asks.url is None)
+
+
+def _declined(robot: str, verb: str) -> Envelope:
+    return error(f"The user did not approve {verb} of {robot}. Do not ask again unless the user wants it.")
+
+
+async def _question(access: Access, robot: str, verb: str, params: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the question and a picture as base64, empty where the robot gives none."""
+    named = {name: params[name] for name in ("robot_name",) if name in params}
+    pose = await access.caller.read(robot, "getPose", named)
+    seen = await access.caller.read(robot, "getPicture", {"width": 640, "height": 480})
+    asked = {name: value for name, value in params.items() if name not in {"speed", "wait"}}
+    lines = [
+        f"Let the real robot {json.dumps(robot)} move?",
+        f"What: {verb} {json.dumps(asked, default=str)[:600]}",
+        f"How far: {_how_far(verb, params, pose)}",
+        f"How fast: {_how_fast(params)}",
+    ]
+    return "\n".join(lines), jpeg_of(seen) or ""
+
+
+def _how_far(verb: str, params: Mapping[str, Any], pose: Envelope) -> str:
+    if verb == "acquireControl":
+        return "nothing yet; it is kept from other programs, and each motion is asked about"
+    if verb == "moveBy":
+        offset = [params.get(name, 0.0) for name in ("dx", "dy", "dz")]
+        return f"the tip by {math.hypot(*offset) * 1000:.0f} mm"
+    tip = [pose.get(name) for name in "xyz"]
+    goal = [params.get(name) for name in "xyz"]
+    if all(isinstance(each, int | float) for each in (*tip, *goal)):
+        return f"the tip by {math.dist(tip, goal) * 1000:.0f} mm"  # type: ignore[arg-type]
+    joints, now = params.get("joints"), pose.get("joints")
+    if isinstance(joints, Mapping) and isinstance(now, Mapping):
+        turns = [abs(to - now[name]) for name, to in joints.items() if isinstance(now.get(name), int | float)]
+        if turns:
+            return f"a joint by up to {max(turns):.0f} degrees"
+    if verb == "setGripper":
+        return "the gripper alone"
+    return "not known before; anywhere within its reach"
+
+
+def _how_fast(params: Mapping[str, Any]) -> str:
+    if "speed" in params:
+        return f"up to {params['speed'] * 100:.0f} % of full speed, {FULL_SPEED}"
+    if "duration" in params:
+        return f"up to full speed, {FULL_SPEED}, for at most {params['duration']:g} s"
+    return f"up to full speed, {FULL_SPEED}"

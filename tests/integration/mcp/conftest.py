@@ -1,0 +1,23 @@
+"""Robots that the tests of a file share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fixtures.mcp_site import McpSite
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[McpSite]:
+    """Serve robots whose state is in a directory of their own; any caller may move them once approved."""
+    state = tmp_path_factory.mktemp("state")
+    state.chmod(0o700)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STRANDS_STATE_DIR", os.fspath(state))
+        patch.setenv("DEVICE_CONNECT_RPC_ALLOW", "mcp,desk,first,second,gone")
+        made = McpSite(Path(state))
+        yield made
+        made.close()
