@@ -1,4 +1,4 @@
-"""``keys``: keys that free robots or sign their stops, and MCP tokens. ``mesh keys``: certificates of a mesh."""
+"""``keys``: keys of operators and tokens of clients; ``mesh keys``: certificates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one client of the MCP server may do, and how its user is shown a picture."""
+"""Permissions of one client of the MCP server, and pictures for its user."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ _ACCESS = "strands_robots.access"
 
 @dataclass(frozen=True)
 class Address:
-    """Where the server listens.
+    """Address of the server.
 
     Attributes:
         cert, key: PEM files of TLS.
@@ -71,7 +71,7 @@ class Address:
 
     @property
     def url(self) -> str:
-        """What a client connects to."""
+        """Address that a client connects to."""
         return f"{self.origin}{PATH}"
 
     @property

@@ -22,7 +22,7 @@ FILE = "mcp-tokens.json"
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """What the client with a token is and may do.
+    """Name and permissions of a client.
 
     Attributes:
         name: the caller that robots see.
