@@ -1,4 +1,4 @@
-"""``mcp``: all robots of a network for any MCP client, on stdin and stdout or over HTTP."""
+"""``mcp``: all robots of a network for MCP clients, on stdio or over HTTP."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def mcp(
         list[str] | None, typer.Option("--http-name", help="A host name by which clients reach it (repeat).")
     ] = None,
 ) -> None:
-    """Serve all robots to MCP clients: to the one that starts this command, or over HTTP."""
+    """Serve all robots to an MCP client that starts this (stdio), or over HTTP."""
     name = device_id("--as", source)
     try:
         from strands_robots.mcp.caller import Caller  # noqa: PLC0415 - loaded when it is used
