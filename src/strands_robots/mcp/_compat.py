@@ -1,4 +1,4 @@
-"""The one private member of the MCP SDK that is used here, for ``mcp`` 2.1 to 2.3.
+"""Private member of the MCP SDK that is used here, for ``mcp`` 2.1 to 2.3.
 
 ``tests/integration/mcp/test_compat.py`` fails when it changes.
 """

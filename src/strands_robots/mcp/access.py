@@ -30,7 +30,7 @@ AccessOf = Callable[[Any], Access]
 
 
 class PictureFiles:
-    """Pictures that a user on this machine is shown, as files; the newest ones are kept."""
+    """Pictures for a user on this machine, as files; the newest ones are kept."""
 
     KEPT = 8
 

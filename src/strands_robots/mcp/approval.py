@@ -78,7 +78,7 @@ class Approvals:
         self._asked: dict[str, tuple[float, str]] = {}
 
     async def carry_out(self, context: Context[Any, Any], access: Access, wish: Wish) -> Outcome:
-        """Carry out a motion; ask the client's user where the robot's operator has to approve it."""
+        """Carry out a motion, with the approval of the client's user if it needs one."""
         robot, verb, params = wish.robot, wish.verb, wish.params
         motion = json.dumps([access.caller.fleet.source, robot, verb, params], sort_keys=True, default=str)
         answered = self._answered(context, motion)
@@ -110,7 +110,7 @@ class Approvals:
         return InputRequiredResult(input_requests={KEY: ElicitRequest(params=form)}, request_state=nonce)
 
     def _answered(self, context: Context[Any, Any], motion: str) -> bool | None:
-        """Return the user's answer; None where this motion was not asked about, or too long ago."""
+        """Return the user's answer; None where this motion was not asked about."""
         replies, nonce = context.input_responses, context.request_state
         if not replies or not nonce:
             return None

@@ -147,7 +147,7 @@ class Caller:
         return await loop.run_in_executor(self._urgent, stop_and_lock, self.fleet, reason)
 
     async def leave(self) -> None:
-        """Halt what this client moves and holds, and release it: the client has gone away."""
+        """Halt what this client moves and holds, and release it."""
         if self._renewing is not None:
             self._renewing.cancel()
             self._renewing = None

@@ -1,4 +1,4 @@
-"""The MCP server over streamable HTTP: tokens, who is there, and calls whose stream was closed."""
+"""MCP server over streamable HTTP, for clients with tokens."""
 
 # mypy: disable-error-code="misc"
 from __future__ import annotations
@@ -100,7 +100,7 @@ class _Client:
 
 
 class HttpServer:
-    """The ASGI application: checks the token, then hands on to the server of its permissions.
+    """ASGI application that checks tokens, over a server for each permission.
 
     Args:
         link_fleet: connects to the robots under a caller's name.

@@ -111,7 +111,7 @@ class RobotResources:
         return EmptyResult()
 
     async def _listening(self, context: Any, call_next: Callable[[Any], Any]) -> Any:
-        """Follow the robots that a stream of the newest revision names, as long as it is open."""
+        """Follow the robots that a stream of events names, as long as it is open."""
         if context.method != "subscriptions/listen":
             return await call_next(context)
         wanted = (context.params or {}).get("notifications")

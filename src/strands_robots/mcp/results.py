@@ -81,7 +81,7 @@ def jpeg_of(answer: Envelope) -> str | None:
 
 
 def unknown_arguments(tool: str, arguments: Mapping[str, Any], known: Mapping[str, Any]) -> str:
-    """Return the refusal of arguments that a tool does not have, empty where there are none."""
+    """Return the refusal of arguments that a tool does not have, or nothing."""
     unknown = [shown(name) for name in arguments if name not in known]
     if not unknown:
         return ""

@@ -1,4 +1,4 @@
-"""MCP server over all robots: its tools, its resources and its guide, for one client or many."""
+"""MCP server over all robots: tools, resources and a guide for models."""
 
 # mypy: disable-error-code="misc, untyped-decorator"
 from __future__ import annotations
@@ -40,7 +40,7 @@ GONE = "strands_robots.gone"
 
 
 class RobotServer(MCPServer[Any]):
-    """The SDK's server; it answers malformed calls by name, and a client that hangs up by a halt."""
+    """Server that refuses malformed calls by name and halts on a closed stream."""
 
     async def call_tool(
         self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
@@ -104,7 +104,7 @@ def build(
 
 
 async def serve_stdio(caller: Caller, *, read_only: bool = False) -> None:
-    """Serve one client on stdio; halt what it moves and release what it holds at its end."""
+    """Serve one client on stdio; at its end halt what it moves and holds."""
     pictures = PictureFiles()
     access = Access(caller, approves=True, show_picture=pictures.show)
     resources = RobotResources(caller.fleet)

@@ -1,4 +1,4 @@
-"""Bearer tokens of the MCP server over HTTP: each has a name, which is the caller's.
+"""Bearer tokens of the MCP server over HTTP, each with a caller's name.
 
 The file has the SHA-256 of each token, so that reading it gives nobody a token.
 """
@@ -42,7 +42,7 @@ class TokenFile:
         self.path = path or state_dir() / FILE
 
     def make(self, token: Token) -> str:
-        """Add a token, in place of one of the same name; return its text, which is not kept.
+        """Add a token, or replace that of the name; return its text, which is not kept.
 
         Raises:
             ValidationError: the name is no caller's.
@@ -66,7 +66,7 @@ class TokenFile:
         return sorted(each.name for each in self._read().values())
 
     def find(self, text: str) -> Token | None:
-        """Return who has this token, None where it is none; a revoked one is refused at once."""
+        """Return the token of this text, None where it is none or was revoked."""
         wanted = _digest(text)
         # Every digest is compared, so that the time tells nothing.
         found = [token for digest, token in self._read().items() if hmac.compare_digest(digest, wanted)]

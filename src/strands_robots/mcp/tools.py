@@ -253,7 +253,7 @@ def add_control(server: MCPServer[Any], access: AccessOf, approvals: Approvals) 
         ttl_s: Annotated[Number, Field(description="0.5 to 600")] = 60.0,
         robot_name: InWorld = "",
     ) -> Answer:
-        """Hold a robot while this client is connected; it halts ttl_s seconds after the client is gone."""
+        """Hold a robot while connected; it halts ttl_s seconds after a lost client."""
         client = access(context)
         params = {"ttl_s": ttl_s, **_given(robot_name=robot_name)}
         run = partial(client.caller.acquire, robot, ttl_s, robot_name)
