@@ -12,7 +12,7 @@ from strands_robots.mcp.caller import Caller
 
 
 @dataclass(frozen=True)
-class Access:
+class ClientAccess:
     """One client as the tools see it.
 
     Attributes:
@@ -25,7 +25,7 @@ class Access:
     show_picture: Callable[[bytes], str]
 
 
-AccessOf = Callable[[Any], Access]
+AccessOf = Callable[[Any], ClientAccess]
 """Returns the access of the client that sent a request."""
 
 

@@ -29,7 +29,7 @@ from mcp.types import (
 from pydantic import BaseModel, Field
 
 from strands_robots.envelope import Envelope, error, is_error
-from strands_robots.mcp.access import Access
+from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.results import jpeg_of, result
 from strands_robots.safety.approval import Approval, Grants, state_dir
 from strands_robots.safety.state_files import StateFileError
@@ -77,7 +77,7 @@ class Approvals:
         self._grants = grants
         self._asked: dict[str, tuple[float, str]] = {}
 
-    async def carry_out(self, context: Context[Any, Any], access: Access, wish: Wish) -> Outcome:
+    async def carry_out(self, context: Context[Any, Any], access: ClientAccess, wish: Wish) -> Outcome:
         """Carry out a motion, with the approval of the client's user if it needs one."""
         robot, verb, params = wish.robot, wish.verb, wish.params
         motion = json.dumps([access.caller.fleet.source, robot, verb, params], sort_keys=True, default=str)
@@ -149,7 +149,7 @@ def _declined(robot: str, verb: str) -> Envelope:
     return error(f"The user did not approve {verb} of {robot}. Do not ask again unless the user wants it.")
 
 
-async def _question(access: Access, robot: str, verb: str, params: Mapping[str, Any]) -> tuple[str, str]:
+async def _question(access: ClientAccess, robot: str, verb: str, params: Mapping[str, Any]) -> tuple[str, str]:
     """Return the question and a picture as base64, empty where the robot gives none."""
     named = {name: params[name] for name in ("robot_name",) if name in params}
     pose = await access.caller.read(robot, "getPose", named)

@@ -25,7 +25,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from strands_robots.device_connect import FleetClient
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.mcp.access import Access
+from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
@@ -95,7 +95,7 @@ class _Client:
 
     def __init__(self, token: Token, caller: Caller, show_picture: Callable[[bytes], str]) -> None:
         self.token = token
-        self.access = Access(caller, approves=token.approves, show_picture=show_picture)
+        self.access = ClientAccess(caller, approves=token.approves, show_picture=show_picture)
         self.open = 0
 
 
@@ -315,8 +315,8 @@ async def serve_http(
             await server.serve(sockets=[listening])
 
 
-def _access_of(context: Any) -> Access:
-    access: Access = context.request_context.request.scope[_ACCESS]
+def _access_of(context: Any) -> ClientAccess:
+    access: ClientAccess = context.request_context.request.scope[_ACCESS]
     return access
 
 

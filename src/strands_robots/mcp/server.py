@@ -17,7 +17,7 @@ from pydantic import ValidationError as Unfit
 
 from strands_robots import __version__
 from strands_robots.envelope import error
-from strands_robots.mcp.access import Access, AccessOf, PictureFiles
+from strands_robots.mcp.access import AccessOf, ClientAccess, PictureFiles
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
@@ -106,7 +106,7 @@ def build(
 async def serve_stdio(caller: Caller, *, read_only: bool = False) -> None:
     """Serve one client on stdio; at its end halt what it moves and holds."""
     pictures = PictureFiles()
-    access = Access(caller, approves=True, show_picture=pictures.show)
+    access = ClientAccess(caller, approves=True, show_picture=pictures.show)
     resources = RobotResources(caller.fleet)
     server = build(lambda _context: access, resources, Approvals(), read_only=read_only)
     ending: list[asyncio.Task[None]] = []
