@@ -17,6 +17,7 @@ import mujoco
 from strands_robots.hardware.device_facts import calibration, half_ranges, joint_units, kind
 from strands_robots.kinematics.arm import Arm, JawMap, JointMap
 from strands_robots.kinematics.chain import MODELS, ArmJoint, Chain, built_in
+from strands_robots.kinematics.model_file import load_model
 from strands_robots.policies.base import Ranges
 from strands_robots.utils import ValidationError, shown
 
@@ -65,8 +66,8 @@ def chain_of(device: Any, model: str | None) -> Chain:
     if not path.is_file():
         raise ValidationError(f"model must be so100, so101 or an MJCF file; there is no {shown(name)}.")
     try:
-        return Chain(mujoco.MjSpec.from_file(str(path)), path.stem)
-    except (ValueError, OSError, mujoco.FatalError) as exc:
+        return Chain(load_model(path, name), path.stem)
+    except mujoco.FatalError as exc:
         raise ValidationError(f"model {shown(name)} cannot be loaded: {' '.join(str(exc).split())[:300]}") from exc
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from strands_robots.simulation.engine import mujoco
+from strands_robots.kinematics.model_file import load_model
 from strands_robots.utils import ValidationError, shown
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -37,10 +37,7 @@ class ModelSource:
 
     def load(self) -> Any:
         """Return a fresh ``MjSpec``. Raises :class:`ValidationError` with the reason."""
-        try:
-            return mujoco.MjSpec.from_file(str(self.path))
-        except (ValueError, OSError, mujoco.FatalError) as exc:
-            raise ValidationError(f"model {shown(self.label)} cannot be loaded: {_first_line(exc)}") from exc
+        return load_model(self.path, self.label)
 
 
 def find(model: object) -> ModelSource:

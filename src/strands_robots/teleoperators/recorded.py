@@ -27,6 +27,12 @@ Frame = tuple[float, Action]
 
 _TIME = "t"
 _COLUMNS = ("action", "timestamp", "episode_index")
+ROWS_MAX = 1_000_000
+"""Frames of a file: five hours and a half at 50 Hz."""
+
+VALUES_MAX = 64_000_000
+BYTES_MAX = 2**30
+BATCH_ROWS = 1024
 
 
 class RecordedLeader:
@@ -128,7 +134,7 @@ def read_episode(path: Path, episode: str | None = None) -> list[Frame]:
     try:
         with ParquetFile(path) as file:
             missing = [name for name in _COLUMNS if name not in file.schema_arrow.names]
-            columns: dict[str, list[Any]] = {} if missing else file.read(columns=list(_COLUMNS)).to_pydict()
+            columns = {} if missing else _columns(file)
     except OSError as exc:
         raise ValidationError(f"the recording {shown(str(path))} cannot be read: {exc.strerror or exc}.") from exc
     except ArrowException as exc:
@@ -146,6 +152,38 @@ def read_episode(path: Path, episode: str | None = None) -> list[Frame]:
         values = {name: number(f"{name} in {place}", value) for name, value in zip(names, action, strict=True)}
         frames.append((number(f"timestamp of {place}", seconds), values))
     return frames
+
+
+def _columns(file: Any) -> dict[str, list[Any]]:
+    """Read the columns of a data file, a part at a time.
+
+    A few kilobytes may state a billion rows of one value, so what the file states of itself is bounded first, and then
+    what it really holds.
+
+    Raises:
+        ValidationError: it has more rows or values than a recording.
+    """
+    about = file.metadata
+    groups = [about.row_group(number) for number in range(min(about.num_row_groups, ROWS_MAX))]
+    parts = [group.column(number) for group in groups for number in range(group.num_columns)]
+    parts = [part for part in parts if part.path_in_schema.partition(".")[0] in _COLUMNS]
+    _within("rows", about.num_rows, ROWS_MAX)
+    _within("values", sum(part.num_values for part in parts), VALUES_MAX)
+    _within("bytes", sum(part.total_uncompressed_size for part in parts), BYTES_MAX)
+    columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
+    values = 0
+    for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=list(_COLUMNS)):
+        values += batch.nbytes // 8
+        _within("values", values, VALUES_MAX)
+        for name, column in batch.to_pydict().items():
+            columns[name] += column
+        _within("rows", len(columns[_COLUMNS[0]]), ROWS_MAX)
+    return columns
+
+
+def _within(what: str, count: int, most: int) -> None:
+    if not 0 <= count <= most:
+        raise ValidationError(f"the recording has {count:,} {what}, and may have {most:,} at most.")
 
 
 def _episode(path: Path, column: list[Any], requested: str | None) -> int:
