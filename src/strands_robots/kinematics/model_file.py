@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, shown
 
 MIB = 2**20
@@ -58,7 +59,7 @@ def load_model(path: Path, label: str) -> Any:
         raise ValidationError(f"model {shown(label)} cannot be loaded: {' '.join(str(exc).split())[:300]}") from exc
 
 
-class ModelBoundError(ValueError):
+class ModelBoundError(StrandsRobotsError, ValueError):
     """A model is beyond a bound; the message names it."""
 
 
