@@ -89,7 +89,7 @@ class _Totals:
 
 
 class _Model:
-    """One model: its XML files, and the files that they name; submodels have one of their own."""
+    """One model or submodel: its XML files, and the files that they name."""
 
     def __init__(self, folder: Path, totals: _Totals) -> None:
         self._folder = folder
@@ -208,7 +208,7 @@ class _Model:
             self._add_points(float(width) * height, path.name)
 
     def _found(self, name: str, folder: str) -> Path | None:
-        """Return the file that a model names, from where MuJoCo takes it; None without one."""
+        """Return the file that a model names, or None, as MuJoCo looks for it."""
         stated = Path(name.removeprefix("package://").removeprefix("file://"))
         below = self._folders.get(folder) or self._folders.get("assetdir") or ""
         places = [self._folder / below / stated, self._folder / stated]
