@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Any, ParamSpec
 from strands_robots.contract import RUNNING
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
+from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import Permit, answered
 from strands_robots.utils import ValidationError, choice, identifier, missing_extra, number, shown
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm, ArmState
+    from strands_robots.kinematics.detector import ObjectDetector
     from strands_robots.kinematics.grasp import Held, SeenObject
     from strands_robots.kinematics.motion import Motion
     from strands_robots.kinematics.moves import Start
@@ -92,6 +94,10 @@ class ArmMixin:
     to 1 open. ``robot_name`` names one robot of a world; empty for the first.
     """
 
+    tool_name_str: str
+    detector: ObjectDetector | None = None
+    """Sees the objects of a real robot; a simulation knows its own."""
+
     @abstractmethod
     def body(self, robot_name: str | None = None) -> Body:
         """Return the body of that name, or the first; raises :class:`ValidationError`."""
@@ -105,12 +111,18 @@ class ArmMixin:
         """Return what a body was told last, by action key; empty where it is not known."""
 
     def objects(self, robot_name: str = "") -> list[SeenObject]:
-        """Return the objects in the base frame of a body, as a detector sees them.
+        """Return the objects in the base frame of a body, as its detector sees them.
 
         Raises:
-            ValidationError: nothing here can tell.
+            ValidationError: it has no detector, or that failed.
         """
-        raise ValidationError(f"{self.body(robot_name).name} has no detector of objects; give a position instead.")
+        name = self.body(robot_name).name
+        if self.detector is None:
+            raise ValidationError(f"{name} has no detector of objects; give a position instead.")
+        from strands_robots.kinematics.detector import detected  # noqa: PLC0415 - numpy, with the first motion
+
+        frames = frames_of(self)
+        return detected(self.detector, {} if frames is None else frames())
 
     @abstractmethod
     def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
@@ -301,18 +313,44 @@ class ArmMixin:
         name = identifier("place", place)
         arm = self.arm(robot_name)
         places: dict[str, dict[str, float]] = {HOME: _degrees(arm, arm.chain.rest)}
-        places |= self._places.get(self.body(robot_name).name, {})
+        places |= self._saved_places(self.body(robot_name).name)
         if name not in places:
             raise ValidationError(f"place must be one of {', '.join(places)}, not {shown(name)}.")
         return self._move("goTo", partial(moves.go_to, place=name, degrees=places[name]), speed, wait, robot_name)
 
     @planned
     def save_place(self, place: str, robot_name: str = "") -> Envelope:
-        """Save the present joints as a place of :meth:`go_to` in this process."""
+        """Save the present joints as a place of :meth:`go_to`, in the state directory.
+
+        ``kept`` is false where that cannot be written: the place is then lost with this process.
+        """
+        from strands_robots.kinematics.places import save_places  # noqa: PLC0415 - with the first place
+
         name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name)
+        if name == HOME:
+            raise ValidationError(f"place must not be {HOME}, which is that of the model.")
         joints = _degrees(arm, arm.state(_observed(body)[1]).joints)
-        self._places.setdefault(body.name, {})[name] = joints
-        return success(f"Saved {name}.", place=name, joints=joints, places=[HOME, *self._places[body.name]])
+        saved = {**self._saved_places(body.name), name: joints}
+        why = ""
+        try:
+            save_places(self._place_key(body.name), saved)
+        except OSError as exc:
+            why = f" It is lost with this process: {exc}."
+        self._places[body.name] = saved
+        return success(f"Saved {name}.{why}", place=name, joints=joints, places=[HOME, *saved], kept=not why)
+
+    def _place_key(self, name: str) -> str:
+        # A place of a simulation must not move the real arm of the same name: their zeros may differ.
+        kind = "simulation" if hasattr(self, "list_robots") else "arm"
+        own = str(getattr(self, "safety_key", "")) or f"{kind}:{self.tool_name_str}"
+        return own if name == self.tool_name_str else f"{own}:{name}"
+
+    def _saved_places(self, name: str) -> dict[str, dict[str, float]]:
+        from strands_robots.kinematics.places import load_places  # noqa: PLC0415 - with the first place
+
+        if name not in self._places:
+            self._places[name] = load_places(self._place_key(name))
+        return self._places[name]
 
     @planned
     def wait_for(self, task_id: str = "", seconds: float = WAIT_S, robot_name: str = "") -> Envelope:

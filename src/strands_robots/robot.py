@@ -22,6 +22,9 @@ logger = logging.getLogger(__name__)
 
 HARDWARE_OPTIONS = ("control_hz", "joint_ranges", "stop_level", "rest_pose", "model", "speed_limit")
 
+DETECTOR = "detector"
+"""Option of a real robot that is set on it: an :class:`~strands_robots.kinematics.detector.ObjectDetector`."""
+
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
 """Error code for a simulated robot whose model is unknown or cannot be loaded."""
 
@@ -66,8 +69,8 @@ def Robot(  # the factory reads as the class it stands for
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
         options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), and ``scene``
             (``tabletop``: a table with a red cube and a plate). ``real``:
-            ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``,
-            ``speed_limit``, and every other one goes to the
+            ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``, ``speed_limit``, ``detector``
+            (an object with ``detect(frames)``, see ``kinematics.detector``), and every other one goes to the
             LeRobot configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
             dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
             ``reachy_mini``: ``host`` (by default searched on the local network) and the arguments of
@@ -177,12 +180,23 @@ def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - as above
 
     own = {key: options.pop(key) for key in HARDWARE_OPTIONS if key in options}
+    detector = options.pop(DETECTOR, None)
+    if detector is not None and not callable(getattr(detector, "detect", None)):
+        raise ValidationError(f"detector must have detect(frames), which {shown(detector)} has not.")
     device = make_device(name, options)
     robot = _construct(_networked(HardwareRobot), device, tool_name=tool_name or _label(name), **own)
     try:
         robot.connect()
     except Exception as exc:
         raise ConnectionError(f"{name} could not be connected: {' '.join(str(exc).split())}") from exc
+    robot.detector = detector
+    if own.get("model") is not None:
+        try:
+            robot.arm()
+        except BaseException:
+            # It would be refused with the first motion; whoever named the model is here now.
+            robot.cleanup()
+            raise
     return robot
 
 

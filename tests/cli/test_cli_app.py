@@ -30,3 +30,17 @@ def test_one_word_loads_the_commands_of_its_module_alone(word: str) -> None:
 def test_unknown_word_is_refused_by_the_whole_application() -> None:
     assert words_of(build("fly")) == words_of(build())
     assert CliRunner().invoke(build("fly"), ["fly"]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--model", "arm.xml"], "a real arm's"),
+        (["--mode", "real", "--detector", "nowhere:make"], "cannot be made"),
+        (["--mode", "real", "--detector", "json:no_such"], "cannot be made"),
+    ],
+)
+def test_serve_refuses_a_model_and_a_detector_that_it_cannot_use(flags: list[str], says: str) -> None:
+    told = CliRunner().invoke(build("serve"), ["serve", "so100", *flags])
+    assert told.exit_code != 0
+    assert says in f"{told.output} {told.exception}"

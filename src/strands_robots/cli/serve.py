@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,7 +29,7 @@ from strands_robots.envelope import text_of
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
-from strands_robots.utils import ValidationError, device_id, number, redacted
+from strands_robots.utils import ValidationError, device_id, number, redacted, shown, text
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -91,6 +92,14 @@ def serve(
             help="Greatest speed of each position, in its unit a second; by default 2 rad/s on a real arm.",
         ),
     ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", help="MJCF of a real arm, for motions to a point; its joints must fit the arm."),
+    ] = None,
+    detector: Annotated[
+        str | None,
+        typer.Option("--detector", help="What sees objects for a real arm: a callable that makes it, module:name."),
+    ] = None,
     state_hz: Annotated[float | None, typer.Option("--state-hz", help="stateUpdate events a second, idle.")] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Also record joints, pictures and events: a new .mcap file.")
@@ -129,9 +138,17 @@ def serve(
         chosen["port"] = serial_port
     if speed_limit is not None:
         chosen["speed_limit"] = number("--speed-limit", speed_limit, above=0, high=SPEED_MAX)
+    if detector is not None:
+        chosen["detector"] = _made_by("--detector", detector)
+    if model is not None:
+        chosen["model"] = str(model.expanduser())
     mode = mode or ("real" if serial_port is not None or robot == "reachy_mini" else "sim")
     if serial_port is not None and mode == "sim":
         raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")
+    if mode == "sim" and (model is not None or detector is not None):
+        raise ValidationError(
+            "--model and --detector are a real arm's; a simulated robot brings its model and objects."
+        )
     if policies is not None:
         warm_profiles()
     body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
@@ -146,6 +163,16 @@ def serve(
         cleanup = getattr(body, "cleanup", None)
         if callable(cleanup):
             cleanup()
+
+
+def _made_by(option: str, name: str) -> Any:
+    """Call ``module:name`` and return what it makes."""
+    module, _, attribute = text(option, name).partition(":")
+    try:
+        made = getattr(import_module(module), attribute)()
+    except Exception as exc:
+        raise ValidationError(f"{option} {shown(name)} cannot be made: {type(exc).__name__}: {exc}") from exc
+    return made
 
 
 def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, piped: bool) -> None:

@@ -12,7 +12,7 @@ from strands_robots.serving.verbs import Verb
 
 
 class MobileBaseDeviceDriver(RobotDeviceDriver):
-    """A mobile base of :mod:`strands_robots.drivers.ros`. Start it with drive, end it with stop."""
+    """A mobile base. Start it with drive, end it with stop."""
 
     labels: ClassVar[Labels] = {"category": "mobile_base"}
     verbs: ClassVar[Mapping[str, Verb]] = BASE_VERBS

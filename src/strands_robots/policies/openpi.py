@@ -80,7 +80,7 @@ class OpenPiConnection:
             raise OpenPiError(f"no policy server answers at {self._profile.url}: {exc}") from exc
 
     def infer(self, observation: Mapping[str, Any], deadline: float, interrupted: threading.Event) -> dict[str, Any]:
-        """Return the answer to an observation; connect again where the server hung up while idle."""
+        """Return the answer to an observation, on a new connection if need be."""
         frame = _module("msgpack").packb(observation, default=_encoded)
         if self._socket is None:
             self.open(deadline, interrupted)

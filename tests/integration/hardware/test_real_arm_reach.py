@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ import pytest
 from fixtures.feetech_bus import FeetechBus, arm_calibration
 from fixtures.waiting import eventually
 
-from strands_robots.kinematics.chain import built_in
+from strands_robots.kinematics.chain import MODELS, built_in
 from strands_robots.policies.base import JOINT_SPEED_RAD_S
+from strands_robots.utils import ValidationError
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 
@@ -77,3 +79,28 @@ def test_stop_ends_a_motion_of_a_real_arm_in_its_middle(arm: Any) -> None:
     eventually(lambda: robot.get_task_status()["step_count"] > 3)
     assert robot.stop_task()["stopped"]
     assert robot.wait_for(started["task_id"])["why"] == "it was stopped"
+
+
+def test_model_of_another_file_plans_the_arm(arm: Any) -> None:
+    robot = arm(model=str(MODELS / "so101.xml"))
+    assert robot.move_to(0.25, 0.1, 0.08, speed=1.0)["error_mm"] < 5.0
+
+
+@pytest.mark.parametrize(
+    ("model", "says"),
+    [("rover.xml", "rover has no"), ("knee.xml", "so101_follower has no joint knee"), ("none.xml", "there is no")],
+)
+def test_model_that_does_not_fit_is_refused_by_name_when_the_robot_is_made(
+    arm: Any, bus: FeetechBus, tmp_path: Path, model: str, says: str
+) -> None:
+    text = (MODELS / "so_arm_links.xml").read_text(encoding="utf-8")
+    (tmp_path / "so_arm_links.xml").write_text(text.replace("elbow_flex", "knee"), encoding="utf-8")
+    (tmp_path / "knee.xml").write_text(
+        (MODELS / "so101.xml").read_text(encoding="utf-8").replace("elbow_flex", "knee"), encoding="utf-8"
+    )
+    path = MODELS / model if (MODELS / model).is_file() else tmp_path / model
+    with pytest.raises(ValidationError, match=says):
+        arm(model=str(path))
+    # The halt of its end freezes it in the middle, where it is.
+    goals = [int.from_bytes(write.data[:2], "little") for write in bus.writes if write.is_for("goal_position")]
+    assert all(abs(goal - 2048) <= 2 for goal in goals)
