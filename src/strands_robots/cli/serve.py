@@ -133,22 +133,13 @@ def serve(
     link = None if on_mesh else network.link()
     from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
 
-    chosen = assignments(options or []) | ({} if host is None else {"host": host})
-    if serial_port is not None:
-        chosen["port"] = serial_port
-    if speed_limit is not None:
-        chosen["speed_limit"] = number("--speed-limit", speed_limit, above=0, high=SPEED_MAX)
-    if detector is not None:
-        chosen["detector"] = _made_by("--detector", detector)
-    if model is not None:
-        chosen["model"] = str(model.expanduser())
+    limit = None if speed_limit is None else number("--speed-limit", speed_limit, above=0, high=SPEED_MAX)
+    given = {"host": host, "port": serial_port, "speed_limit": limit}
+    chosen = assignments(options or []) | {name: value for name, value in given.items() if value is not None}
     mode = mode or ("real" if serial_port is not None or robot == "reachy_mini" else "sim")
     if serial_port is not None and mode == "sim":
         raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")
-    if mode == "sim" and (model is not None or detector is not None):
-        raise ValidationError(
-            "--model and --detector are a real arm's; a simulated robot brings its model and objects."
-        )
+    chosen |= _arm_options(mode, model, detector)
     if policies is not None:
         warm_profiles()
     body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
@@ -165,14 +156,20 @@ def serve(
             cleanup()
 
 
-def _made_by(option: str, name: str) -> Any:
-    """Call ``module:name`` and return what it makes."""
-    module, _, attribute = text(option, name).partition(":")
+def _arm_options(mode: str, model: Path | None, detector: str | None) -> dict[str, Any]:
+    """Return the options of a real arm's motions, with the detector made."""
+    if mode == "sim" and (model is not None or detector is not None):
+        raise ValidationError(
+            "--model and --detector are a real arm's; a simulated robot brings its model and objects."
+        )
+    chosen: dict[str, Any] = {} if model is None else {"model": str(model.expanduser())}
+    if detector is None:
+        return chosen
+    module, _, attribute = text("--detector", detector).partition(":")
     try:
-        made = getattr(import_module(module), attribute)()
+        return {**chosen, "detector": getattr(import_module(module), attribute)()}
     except Exception as exc:
-        raise ValidationError(f"{option} {shown(name)} cannot be made: {type(exc).__name__}: {exc}") from exc
-    return made
+        raise ValidationError(f"--detector {shown(detector)} cannot be made: {type(exc).__name__}: {exc}") from exc
 
 
 def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, piped: bool) -> None:

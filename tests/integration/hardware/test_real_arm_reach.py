@@ -88,7 +88,7 @@ def test_model_of_another_file_plans_the_arm(arm: Any) -> None:
 
 @pytest.mark.parametrize(
     ("model", "says"),
-    [("rover.xml", "rover has no"), ("knee.xml", "so101_follower has no joint knee"), ("none.xml", "there is no")],
+    [("rover.xml", "rover has no"), ("knee.xml", "has no joint knee"), ("none.xml", "there is no")],
 )
 def test_model_that_does_not_fit_is_refused_by_name_when_the_robot_is_made(
     arm: Any, bus: FeetechBus, tmp_path: Path, model: str, says: str
