@@ -36,7 +36,7 @@ FLOORS: list[set[str]] = [
     },
     {"serving"},
     {"device_connect", "mesh", "mesh_session"},
-    {"cli", "tools", "mcp", "dashboard", "robot"},
+    {"cli", "tools", "mcp", "dashboard", "evaluation", "robot"},
 ]
 
 SIBLING_NAMES: dict[str, str] = {}

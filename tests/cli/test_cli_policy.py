@@ -6,9 +6,11 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy
 import pytest
 from click.testing import Result
 from fixtures.checkpoints import write_checkpoint, write_dataset
+from fixtures.openpi_server import OpenPiServer
 
 Run = Callable[..., Result]
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
@@ -60,3 +62,19 @@ def test_without_a_file_it_says_how_to_name_one(run: Run) -> None:
     result = run("policy", "check", "pick", "--robot", "so101")
     assert result.exit_code == 2
     assert "--policies must name the file" in result.output + result.stderr
+
+
+def test_bench_prints_the_figures_of_a_server_against_the_budget(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_POLICIES", "")  # which the command sets
+    with OpenPiServer(lambda observation: {"actions": numpy.zeros((10, 6), numpy.float32)}) as server:
+        keys = json.dumps(JOINTS)
+        entries = f'url = "{server.url}"\nstate = {keys}\naction = {keys}\nunits = "radians"\nrate = 30\n'
+        file = tmp_path / "bench.toml"
+        file.write_text(f'[pi]\nprovider = "openpi"\n{entries}')
+        result = run("policy", "bench", "pi", "--policies", str(file), "--for", "1", "--json")
+    found = json.loads(result.stdout.splitlines()[0])
+    assert found["loop"]["inferences"] >= 2
+    assert {row["what"].split(",")[0] for row in found["rows"]} >= {"latency", "underruns", "control period"}
+    assert result.exit_code == (0 if found["kept"] else 1)

@@ -77,8 +77,9 @@ class Hung(Counting):
 def made(inner: Any, clock: StepClock | None = None, *, latency_s: float = 0.0, **changed: Any) -> ProfiledPolicy:
     entries = {"url": "ws://localhost", "rate": HZ, "max_speed": None, "confirmed": frozenset({"units"})} | changed
     profile = Profile("pick", "remote", ("a",), ("a",), **entries)
-    timing: dict[str, Any] = {} if clock is None else {"now": clock.now, "inline": True, "latency_s": latency_s}
-    policy = ProfiledPolicy(profile, inner, **timing)
+    policy = ProfiledPolicy(profile, inner)
+    if clock is not None:
+        policy.compute_inline(clock.now, latency_s)
     policy.fit(RobotFacts("body", {"a": 0.0}, ["a"], rate=HZ))
     return policy
 
@@ -137,7 +138,8 @@ def test_a_velocity_is_told_to_be_zero_on_underrun() -> None:
         def act(self, observation: Mapping[str, Any]) -> Any:
             return [{"x.vel": 0.5}]
 
-    policy = ProfiledPolicy(profile, Drives(), now=clock.now, inline=True, latency_s=0.2)
+    policy = ProfiledPolicy(profile, Drives())
+    policy.compute_inline(clock.now, 0.2)
     policy._scale, policy._hz = {"x.vel": 1.0}, HZ
     policy.reset("drive", {"x.vel": (-1.0, 1.0)})
     written = []

@@ -158,7 +158,8 @@ def profile(**changed: Any) -> Profile:
 
 
 def profiled(inner: Any, **changed: Any) -> ProfiledPolicy:
-    policy = ProfiledPolicy(profile(**changed), inner, now=lambda: 0.0, inline=True)
+    policy = ProfiledPolicy(profile(**changed), inner)
+    policy.compute_inline(lambda: 0.0)
     policy.fit(ARM)
     policy.reset("wave", RANGES)
     return policy

@@ -23,6 +23,7 @@ COMMANDS = {
     "teleop": ("teleop", "calibrate", "replay"),
     "record": ("record",),
     "policy": ("policy",),
+    "eval": ("eval",),
     "audit": ("audit",),
     "keys": ("keys", "mesh"),
     "enroll": ("enroll",),

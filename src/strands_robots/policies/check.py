@@ -101,6 +101,7 @@ def check_policy(profile: Profile, statements: Sequence[Statement], robot: Robot
     rows = [
         *_sources(statements),
         *_vector("state", profile.state, [(s.source, s.state, s.state_size) for s in statements], list(robot.state)),
+        *_environment(profile, statements, robot),
         *_values(profile, statements, robot),
         *_vector("action", profile.action, [(s.source, s.action, s.action_size) for s in statements], robot.action),
         *_cameras(profile, statements, robot),
@@ -146,6 +147,13 @@ def _vector(
         if size is not None:
             same = size == len(chosen)
             yield _row(f"{name} size", f"{size} ({source})", str(len(chosen)), same, f"name {size} keys in {name}")
+
+
+def _environment(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> Iterator[CheckRow]:
+    """Numbers of what is around the robot, of a policy that takes them."""
+    stated = [(s.source, s.environment, s.environment_size) for s in statements]
+    if profile.environment or any(size or names for _, names, size in stated):
+        yield from _vector("environment", profile.environment, stated, list(robot.state))
 
 
 def _bare(key: str) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 
 from strands_robots.utils import ValidationError, shown
 
-STATE, ACTION = "observation.state", "action"
+STATE, ACTION, ENVIRONMENT = "observation.state", "action", "observation.environment_state"
 HEADER_MAX = 100 * 2**20
 
 Size = tuple[int, int, int]
@@ -32,7 +32,7 @@ class Statement:
         source: the file, or the server's metadata.
         problem: why it cannot be used.
         cameras: size of each picture by the policy's key.
-        state, action: names in the policy's order; only their count where ``*_size`` alone is known.
+        state, environment, action: names in the policy's order; only their count where ``*_size`` alone is known.
         statistics: features whose statistics it has.
         state_range: lowest and highest value of each state in the data.
         language: it has to be told a task.
@@ -43,6 +43,8 @@ class Statement:
     cameras: Mapping[str, Size] | None = None
     state: tuple[str, ...] | None = None
     state_size: int | None = None
+    environment: tuple[str, ...] | None = None
+    environment_size: int | None = None
     action: tuple[str, ...] | None = None
     action_size: int | None = None
     rate: float | None = None
@@ -81,6 +83,7 @@ def dataset_statement(directory: Path) -> Statement:
     return Statement(
         "info.json",
         state=_names(features.get(STATE)),
+        environment=_names(features.get(ENVIRONMENT)),
         action=_names(features.get(ACTION)),
         rate=float(fps) if isinstance(fps, int | float) and not isinstance(fps, bool) and fps > 0 else None,
         state_range=(lows, highs) if lows and highs and len(lows) == len(highs) else None,
@@ -105,6 +108,7 @@ def _config(config: Mapping[str, Any]) -> Statement:
         problem="" if kind else "it names no type",
         cameras=cameras,
         state_size=next(iter(_shape(inputs.get(STATE))), None),
+        environment_size=next(iter(_shape(inputs.get(ENVIRONMENT))), None),
         action_size=next(iter(_shape(outputs.get(ACTION))), None),
         action=tuple(map(str, names)) if isinstance(names, list) and names else None,
         chunk=chunk if isinstance(chunk, int) and not isinstance(chunk, bool) else None,

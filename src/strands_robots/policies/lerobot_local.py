@@ -1,64 +1,98 @@
 """A LeRobot checkpoint as a policy, computed in this process.
 
-Written against LeRobot 0.4 (``lerobot.policies.factory`` and ``lerobot.policies.utils``). LeRobot with its torch is
-not installed in the tests of this project, so this module is **not verified** beyond its refusals.
+Calls are those of LeRobot 0.4.4 to 0.6.1: ``lerobot.policies.factory`` and ``lerobot.policies.utils``. A checkpoint
+does not say which joints it moves, so it is used through a profile alone.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-from strands_robots.policies.base import Action, Ranges
+from strands_robots.policies.base import Action, PolicyError, Ranges
+from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
-from strands_robots.utils import ValidationError, missing_extra, text
+from strands_robots.utils import ValidationError, missing_extra, shown
+
+STATE, ENVIRONMENT, IMAGES = "observation.state", "observation.environment_state", "observation.images."
 
 _MODELS = WarmModels()
 """Loaded checkpoints by path and device."""
 
 
 class LeRobotPolicy:
-    """Policy that loads a checkpoint and computes every action with it.
+    """Policy that computes chunks with a checkpoint of LeRobot's.
+
+    A policy that looks at several observations, or averages over chunks, is asked at every control step and has
+    ``every_tick`` true.
 
     Args:
-        pretrained_name_or_path: a model on the Hugging Face hub, ``org/name``, or a local directory.
-        device: a torch device; by default the checkpoint's own.
+        profile: with ``checkpoint``, a directory on this machine.
+        pretrained_name_or_path: that of the profile.
 
     Raises:
-        ValidationError: no checkpoint.
+        ValidationError: no profile.
         MissingExtraError: the [lerobot] extra is not installed.
     """
 
-    uses_cameras = True
-
-    def __init__(self, pretrained_name_or_path: str = "", device: str = "") -> None:
+    def __init__(self, profile: Profile | None = None, pretrained_name_or_path: str = "") -> None:
         try:
             import_module("lerobot")
         except ModuleNotFoundError as exc:
             raise missing_extra("The policy lerobot_local", "lerobot") from exc
-        if not pretrained_name_or_path:
-            raise ValidationError("pretrained_name_or_path must name a checkpoint, such as 'org/name', not ''.")
-        self._checkpoint = text("pretrained_name_or_path", pretrained_name_or_path, longest=4096)
-        self._device = text("device", device, longest=64, empty=True)
+        if profile is None or not profile.checkpoint:
+            raise ValidationError(
+                f"policy_provider lerobot_local needs a profile for {shown(pretrained_name_or_path)}, because a "
+                "checkpoint does not say which joints it moves: serve the robot with --policies."
+            )
+        self._profile = profile
+        self._checkpoint = str(Path(profile.checkpoint).expanduser())
+        self.uses_cameras = bool(profile.cameras)
+        self.every_tick = _needs_every_tick(Path(self._checkpoint))
         self._instruction = ""
-        self._keys: tuple[str, ...] = ()
-        self._features: dict[str, Any] = {}
         self._loaded: tuple[Any, Any, Any] | None = None
-        self._model: Any = None
-        self._before: Any = None
-        self._after: Any = None
 
     def warm(self) -> str | None:
         """Load the checkpoint on a thread; see :class:`Warmable`."""
-        return _MODELS.warm((self._checkpoint, self._device), self._load)
+        return _MODELS.warm(self._key, self._load)
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        """Take the loaded checkpoint, or load it."""
+        self._loaded = _MODELS.take(self._key, self._load)
+        for each in self._loaded:
+            each.reset()
+        self._instruction = instruction
+
+    def act(self, observation: Mapping[str, Any]) -> list[Action]:
+        if self._loaded is None:
+            raise PolicyError("it was not reset")
+        return self._computed(self._loaded, observation, self._instruction)
+
+    def interrupt(self) -> None:
+        """Do nothing: a forward pass cannot be interrupted."""
+
+    def close(self) -> None:
+        loaded, self._loaded = self._loaded, None
+        if loaded is not None:
+            _MODELS.give(self._key, loaded)
+
+    @property
+    def _key(self) -> tuple[str, str]:
+        return self._checkpoint, self._profile.device
 
     def _load(self) -> tuple[Any, Any, Any]:
-        """Return model and processors; fetching them from the hub first takes minutes."""
+        """Return model and processors, after one inference that is thrown away.
+
+        Raises:
+            PolicyError: the checkpoint does not fit its profile, or answers no finite numbers.
+        """
         factory = import_module("lerobot.policies.factory")
         config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(self._checkpoint)
-        if self._device:
-            config.device = self._device
+        if self._profile.device:
+            config.device = self._profile.device
         # Strictly: a weight that is missing would be a random one, with a line in the log.
         model = factory.get_policy_class(config.type).from_pretrained(self._checkpoint, config=config, strict=True)
         # A checkpoint that was saved on CUDA has processors that ask for it.
@@ -66,47 +100,59 @@ class LeRobotPolicy:
         before, after = factory.make_pre_post_processors(
             config, pretrained_path=self._checkpoint, preprocessor_overrides=on_device
         )
-        return model, before, after
-
-    def reset(self, instruction: str, ranges: Ranges) -> None:
-        """Take the loaded checkpoint, or load it."""
-        self._loaded = _MODELS.take((self._checkpoint, self._device), self._load)
-        self._model, self._before, self._after = self._loaded
-        for each in self._loaded:
+        loaded = model, before, after
+        self._computed(loaded, self._blank(config), self._profile.task or "stand still")
+        for each in loaded:
             each.reset()
-        self._instruction = instruction
-        self._keys = tuple(ranges)
-        self._features = {}
+        return loaded
 
-    def act(self, observation: Mapping[str, Any]) -> Action:
+    def _blank(self, config: Any) -> dict[str, Any]:
+        """Return an observation of zeros, with pictures of the checkpoint's sizes."""
+        numpy = import_module("numpy")
+        blank: dict[str, Any] = dict.fromkeys((*self._profile.state, *self._profile.environment), 0.0)
+        for camera in self._profile.cameras:
+            feature = config.input_features.get(_feature(camera.key))
+            if feature is None:
+                raise PolicyError(f"the checkpoint has no picture {camera.key}")
+            _, height, width = feature.shape
+            blank[camera.key.removeprefix(IMAGES)] = numpy.zeros((height, width, 3), numpy.uint8)
+        return blank
+
+    def _computed(self, loaded: tuple[Any, Any, Any], seen: Mapping[str, Any], task: str) -> list[Action]:
+        """Return the chunk that the checkpoint answers, by the profile's action keys."""
+        model, before, after = loaded
+        numpy, torch, profile = import_module("numpy"), import_module("torch"), self._profile
+        frame = {STATE: numpy.array([seen[key] for key in profile.state], numpy.float32)}
+        if profile.environment:
+            frame[ENVIRONMENT] = numpy.array([seen[key] for key in profile.environment], numpy.float32)
+        frame |= {_feature(camera.key): seen[camera.key.removeprefix(IMAGES)] for camera in profile.cameras}
         utils = import_module("lerobot.policies.utils")
-        if not self._features:
-            self._features = self._dataset_features(observation)
-        frame = utils.build_inference_frame(
-            observation=dict(observation),
-            ds_features=self._features,
-            device=self._model.config.device,
-            task=self._instruction,
-        )
-        with import_module("torch").inference_mode():
-            tensor = self._after(self._model.select_action(self._before(frame)))
-        action: Action = utils.make_robot_action(tensor, self._features)
-        return action
+        with torch.inference_mode():
+            batch = before(utils.prepare_observation_for_inference(frame, torch.device(model.config.device), task, ""))
+            answer = model.select_action(batch) if self.every_tick else model.predict_action_chunk(batch)
+            chunk = after(answer).to("cpu", torch.float64).numpy()
+        chunk = chunk[0] if chunk.ndim == 3 else chunk
+        if chunk.ndim != 2 or chunk.shape[1] != len(profile.action):
+            raise PolicyError(
+                f"the checkpoint answered actions of the shape {chunk.shape}, and the profile has "
+                f"{len(profile.action)} keys"
+            )
+        if not numpy.isfinite(chunk).all():
+            raise PolicyError("the checkpoint answered actions that are no finite numbers")
+        return [dict(zip(profile.action, map(float, row), strict=True)) for row in chunk]
 
-    def interrupt(self) -> None:
-        """Do nothing: a forward pass cannot be interrupted, and is short."""
 
-    def close(self) -> None:
-        self._model = self._before = self._after = None
-        loaded, self._loaded = self._loaded, None
-        if loaded is not None:
-            _MODELS.give((self._checkpoint, self._device), loaded)
+def _feature(key: str) -> str:
+    """Return the full name of a picture, as the checkpoint has it."""
+    return key if key.startswith("observation.") else IMAGES + key
 
-    def _dataset_features(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        convert = import_module("lerobot.datasets.utils").hw_to_dataset_features
-        kinds = {key: tuple(value.shape) if getattr(value, "ndim", 0) else float for key, value in observation.items()}
-        features: dict[str, Any] = {
-            **convert(dict.fromkeys(self._keys, float), "action"),
-            **convert(kinds, "observation"),
-        }
-        return features
+
+def _needs_every_tick(directory: Path) -> bool:
+    """Return True for a policy with a history, or with an average over chunks."""
+    try:
+        config = json.loads((directory / "config.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        # The check refuses it, with the reason.
+        return False
+    steps = config.get("n_obs_steps", 1) if isinstance(config, dict) else 1
+    return (isinstance(steps, int) and steps > 1) or config.get("temporal_ensemble_coeff") is not None

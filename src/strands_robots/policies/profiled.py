@@ -17,12 +17,15 @@ from strands_robots.policies.loop_counts import LoopCounts
 from strands_robots.policies.playback import Playback
 from strands_robots.policies.profiles import CameraMap, Profile
 from strands_robots.policies.warm import Warmable, require_warm
+from strands_robots.safety.gate import MotionRefused
 from strands_robots.utils import ValidationError, missing_extra, number, shown
 
 logger = logging.getLogger(__name__)
 
 UNBOUNDED_PER_S = 10.0
 """Speed bound of a key without a range, in its unit a second."""
+
+LOAD_POLL_S = 0.05
 
 GRACE_S = 0.1
 """Seconds beyond the deadline in which a provider may say by itself why it did not answer."""
@@ -53,33 +56,26 @@ class ProfiledPolicy:
     Args:
         profile: describes the policy.
         inner: decides the actions, in its own units.
-        now: time in seconds.
-        inline: compute in :meth:`act`, for a clock that is moved by hand; answers are there ``latency_s`` later.
     """
 
     def __init__(
         self,
         profile: Profile,
         inner: Policy,
-        *,
-        now: Callable[[], float] = time.monotonic,
-        inline: bool = False,
-        latency_s: float = 0.0,
     ) -> None:
         self.profile = profile
         self.uses_cameras = bool(profile.cameras)
         self.preparing = True
         """True until the first chunk has come; the robot has not moved yet."""
         self._inner = inner
-        self._now = now
+        self._now: Callable[[], float] = time.monotonic
         self._scale: dict[str, float] = {}
         self._limit: SpeedLimit | None = None
         self._last: Action = {}
         self._hz = profile.rate or 0.0
-        if inline or getattr(inner, "every_tick", False):
-            self._inference: Inference = InlineInference(self._infer, inner.close, now, latency_s)
-        else:
-            self._inference = InferenceWorker(profile.name, self._infer, inner.close, now)
+        self._inference: Inference = InferenceWorker(profile.name, self._infer, inner.close)
+        if getattr(inner, "every_tick", False):
+            self.compute_inline()
         self._playback = Playback(rate=1.0, hz=1.0)
         self._asked: tuple[float, float] = (0.0, 0.0)
         self._counts = LoopCounts()
@@ -87,6 +83,16 @@ class ProfiledPolicy:
         self._dry = False
         self._done = False
         self._interrupted = threading.Event()
+
+    def compute_inline(self, now: Callable[[], float] = time.monotonic, latency_s: float = 0.0) -> None:
+        """Compute in :meth:`act`, as a clock that is moved by hand needs it.
+
+        Args:
+            now: that clock, in seconds.
+            latency_s: time of that clock after which an answer is there.
+        """
+        self._now = now
+        self._inference = InlineInference(self._infer, self._inner.close, now, latency_s)
 
     def warm(self) -> str | None:
         """Begin to load the policy, if it takes long; see :class:`Warmable`."""
@@ -106,6 +112,24 @@ class ProfiledPolicy:
         self._scale = {key: _scale(robot.units.get(key), self.profile.unit(key)) for key in keys}
         self._hz = robot.rate
         require_warm(self._inner, self.profile.name)
+
+    def load(self, robot: RobotFacts, within: float) -> None:
+        """Check the policy against a robot, and wait until it is loaded.
+
+        Raises:
+            ValidationError: it does not fit.
+            PolicyError: it could not be loaded ``within`` seconds.
+        """
+        deadline = time.monotonic() + within
+        while True:
+            try:
+                self.fit(robot)
+            except MotionRefused as refused:
+                if not refused.envelope.get("loading") or time.monotonic() > deadline:
+                    raise PolicyError(str(refused.envelope["reason"])) from None
+                time.sleep(LOAD_POLL_S)
+            else:
+                return
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         profile = self.profile

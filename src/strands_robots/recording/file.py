@@ -122,9 +122,9 @@ class Recorder:
         if self._failure is not None:
             raise self._failure
 
-    def take(self, device: str, event: str, payload: Mapping[str, Any]) -> None:
-        """Record one event; returns at once."""
-        self._put(RecordedEvent(time.time(), device, event, payload))
+    def take(self, device: str, event: str, payload: Mapping[str, Any], at: float | None = None) -> None:
+        """Record one event, of now or of ``at`` (s since the epoch); returns at once."""
+        self._put(RecordedEvent(time.time() if at is None else at, device, event, payload))
 
     def take_joints(self, device: str, joints: Mapping[str, float]) -> None:
         """Record the joints of this moment; returns at once."""
