@@ -16,6 +16,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import Permit, answered
+from strands_robots.utils import WAIT_S as WAIT_S  # noqa: PLC0414 - part of what callers of the motions import
 from strands_robots.utils import ValidationError, choice, identifier, missing_extra, number, shown
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
@@ -26,9 +27,6 @@ if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.moves import Start
 
 P = ParamSpec("P")
-
-WAIT_S = 25.0
-"""Longest time for which an answer waits for the end of a motion; the networks wait for 30 s."""
 
 FRESH_S = 0.02
 """Greatest age of joints that are not read again, so that a pose takes no turn on the bus from a running motion."""

@@ -22,6 +22,9 @@ DISTRIBUTION = "strands-robots-edge"
 DURATION_MAX_S = 3600.0
 """Longest task, drive, goal or teleoperation, in seconds."""
 
+WAIT_S = 25.0
+"""Longest time for which an answer waits for the end of a motion; the networks wait for 30 s."""
+
 IDENTIFIER_MAX = 128
 """Longest peer id and message identifier, in characters (the mesh wire's bound)."""
 

@@ -14,7 +14,8 @@ from tests.cli.conftest import Run
 
 from strands_robots import __version__
 from strands_robots.cli import doctor
-from strands_robots.cli.doctor import Finding, certificate_error, other_owners
+from strands_robots.cli.doctor import Finding, certificate_error
+from strands_robots.cli.owners import other_owners
 
 
 @pytest.fixture(autouse=True)

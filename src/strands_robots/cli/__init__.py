@@ -10,12 +10,21 @@ import os
 import sys
 from typing import NoReturn
 
+from strands_robots import __version__
+from strands_robots.device_connect.framework import load_when_used
+from strands_robots.utils import DISTRIBUTION
+
 __all__ = ["main"]
 
 
 def main() -> None:
     """Run the ``strands-robots`` command."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"{DISTRIBUTION} {__version__}")
+        return
     from strands_robots.cli.app import build  # noqa: PLC0415 - importing the package loads no command
+
+    load_when_used()
 
     try:
         build(sys.argv[1] if len(sys.argv) > 1 else "")()

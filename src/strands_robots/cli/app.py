@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from strands_robots import __version__
-from strands_robots.cli.doctor import other_owners, owner_remedy
+from strands_robots.cli.owners import other_owners, owner_remedy
 from strands_robots.utils import DISTRIBUTION
 
 COMMANDS = {

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -21,6 +19,7 @@ from strands_robots import __version__, settings
 from strands_robots.cli.command import command
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Screen, label, table
+from strands_robots.cli.owners import IMPORT_PACKAGE, other_owners, owner_remedy
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.identity import robots_here
 from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
@@ -51,9 +50,6 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "iot": ("awsiotsdk",),
 }
 _REQUIRED = ("device-connect",)
-_IMPORT_PACKAGE = "strands_robots"
-_OWNED = f"{_IMPORT_PACKAGE}/__init__.py"
-_OWNS = re.compile(rf"^(\.\./)*{re.escape(_OWNED)}\b", re.MULTILINE)
 _RENDER_S = 20.0
 
 # Runs in its own process: MuJoCo chooses its OpenGL at import, and a broken driver may end the process.
@@ -137,36 +133,12 @@ def _installation() -> Iterator[Finding]:
     yield Finding("python", Mark.OK, sys.version.split()[0])
     others = other_owners()
     if others:
-        said = f"{', '.join(others)} also installs the import package {_IMPORT_PACKAGE}"
+        said = f"{', '.join(others)} also installs the import package {IMPORT_PACKAGE}"
         yield Finding("distribution", Mark.WARN, said, owner_remedy(others))
         return
     installed = _version(DISTRIBUTION)
     said = f"{DISTRIBUTION} {__version__}"
     yield Finding("distribution", Mark.OK, said if installed else f"{said}, run from its source tree")
-
-
-def other_owners(path: Sequence[str] | None = None) -> list[str]:
-    """Return every other distribution that installs our import package.
-
-    Every command pays for this. So the lists of installed files are searched as text and not parsed, as
-    ``importlib.metadata.packages_distributions`` does, and by the expression only where the name stands in them.
-    """
-    found = set()
-    for installed in metadata.distributions(path=list(sys.path if path is None else path)):
-        files = ""
-        # A broken list of another package must not keep a command, least of all a stop, from running.
-        with suppress(OSError, ValueError):
-            files = installed.read_text("RECORD") or installed.read_text("installed-files.txt") or ""
-        name = installed.metadata["Name"] if _OWNED in files and _OWNS.search(files) else None
-        if name and name.lower().replace("_", "-") != DISTRIBUTION:
-            found.add(f"{name} {installed.version}")
-    return sorted(found)
-
-
-def owner_remedy(others: Sequence[str]) -> str:
-    """Return the commands that make this project the only owner of its import."""
-    names = " ".join(other.split()[0] for other in others)
-    return f"pip uninstall {names}, then reinstall {DISTRIBUTION} (pip install --force-reinstall --no-deps)"
 
 
 def _packages() -> Iterator[Finding]:

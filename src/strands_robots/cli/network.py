@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
@@ -15,7 +14,6 @@ import typer
 from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
-from strands_robots.tools.networks import MeshUnavailableError, joined_mesh
 from strands_robots.utils import missing_extra, port, redacted
 
 if TYPE_CHECKING:
@@ -181,6 +179,8 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
 
 def _near(wanted: str, names: list[str]) -> str:
     """Return a sentence with the names that resemble ``wanted``, else with all."""
+    import difflib  # noqa: PLC0415 - only a name that is not there needs it
+
     alike = difflib.get_close_matches(wanted, names, n=3, cutoff=0.5)
     if alike:
         return f" Near it: {', '.join(alike)}."
@@ -201,6 +201,8 @@ def temporary_mesh_id(name: str) -> str:
 @contextmanager
 def mesh_peer(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mesh]:
     """Join the native mesh while the block runs; raise :class:`CliError` if it fails."""
+    from strands_robots.tools.networks import MeshUnavailableError, joined_mesh  # noqa: PLC0415 - as above
+
     with ExitStack() as stack:
         try:
             mesh = stack.enter_context(joined_mesh(robot, peer_id, peer_type))

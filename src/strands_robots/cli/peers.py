@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
-from strands_robots.arm_mixin import WAIT_S
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
-from strands_robots.cli.network import SOURCE, Network, call_device, describe, mesh_peer, temporary_mesh_id
-from strands_robots.cli.output import CliError, Exit, Screen, first_line, label, plain, table
+from strands_robots.cli.network import SOURCE, Network, call_device, describe
+from strands_robots.cli.output import CliError, Exit, Screen, first_line, plain, table
 from strands_robots.envelope import is_error, text_of
-from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
-from strands_robots.safety.statements import ALARM
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
-from strands_robots.tools.networks import NativeMesh
-from strands_robots.utils import number
+from strands_robots.utils import WAIT_S, number
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.discovery import Peer
@@ -46,8 +39,10 @@ def peers(
 ) -> None:
     """List the robots on the network, or what one of them can do."""
     if on_mesh:
+        from strands_robots.cli.peers_mesh import list_peers  # noqa: PLC0415 - loaded when a network is used
+
         network.use_mesh()
-        _mesh_peers(screen, number("--timeout", timeout, above=0, high=60))
+        list_peers(screen, number("--timeout", timeout, above=0, high=60))
         return
     with network.fleet() as fleet:
         found = fleet.peers(number("--timeout", timeout, above=0, high=60))
@@ -83,9 +78,10 @@ def call(
 ) -> None:
     """Call a function of a device. A value is read as JSON where that is possible, else as text."""
     params = assignments(arguments or [])
-    usual = MOTION_S if function in ARM_MOTION_VERBS and ARM_MOTION_VERBS[function].lasts else CALL_S
-    seconds = number("--timeout", usual if timeout is None else timeout, above=0, high=3600)
+    seconds = number("--timeout", _usual_wait(function) if timeout is None else timeout, above=0, high=3600)
     if on_mesh:
+        from strands_robots.tools.networks import NativeMesh  # noqa: PLC0415 - loaded when a network is used
+
         network.use_mesh()
         answer = NativeMesh().call(device, function, params, seconds)
     else:
@@ -100,28 +96,14 @@ def call(
             screen.say(f"  {key}: {value if isinstance(value, str) else json.dumps(value, default=str)}")
 
 
-def _mesh_peers(screen: Screen, timeout: float) -> None:
-    """List the mesh peers that announce themselves within ``timeout`` seconds."""
-    with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
-        time.sleep(timeout)
-        rows, keys = [row for row in mesh.peers if row["reachable"]], enrolled_peers()
-    for row in rows:
-        if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
-            row["distrusted"] = why
-    if not rows:
-        raise CliError("No peer is on the mesh of this machine.", Exit.SILENT, peers=[])
-    screen.data({"status": "success", "peers": rows})
-    cells = ((r["peer_id"], r["type"], r["hostname"], _mesh_status(r), f"{r['age']:.1f} s") for r in rows)
-    screen.show(table("", ("peer", "type", "host", "status", "last heard"), cells))
+def _usual_wait(function: str) -> float:
+    """Return the seconds to wait for a function's answer."""
+    if function.startswith(("get", "list", "stop")):
+        return CALL_S
+    from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS  # noqa: PLC0415 - saves its import elsewhere
 
-
-def _mesh_status(row: Mapping[str, Any]) -> str | Text:
-    """Return the task's state, or the lockout, or that emergency stops do not arrive."""
-    if row.get("estop_unheard"):
-        return label("CANNOT RECEIVE STOPS", "bold red")
-    if why := str(row.get("distrusted", "")):
-        return label(why, "bold red" if why.startswith(ALARM) else "yellow")
-    return label("LOCKED", "bold red") if row.get("locked") is True else str(row.get("task_status", ""))
+    verb = ARM_MOTION_VERBS.get(function)
+    return MOTION_S if verb is not None and verb.lasts else CALL_S
 
 
 def _facts(peer: Peer) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from device_connect_edge.drivers.decorators import get_rpc_source_device
 from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
-from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
 from strands_robots.device_connect._compat import Labels, emit, observed, on, rpc
 from strands_robots.device_connect.safety_registration import SafetyRegistration
@@ -38,7 +37,7 @@ from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Re
 from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
-from strands_robots.utils import ValidationError, shown, text
+from strands_robots.utils import WAIT_S, ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
 

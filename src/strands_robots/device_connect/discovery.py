@@ -19,30 +19,41 @@ from typing import Any
 from device_connect_edge.messaging.exceptions import MessagingError
 
 from strands_robots import settings
-from strands_robots.device_connect.backends.base import Backend
+from strands_robots.device_connect.backends.base import Backend, NoResponderError
 from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
 from strands_robots.errors import StrandsRobotsError
 
 logger = logging.getLogger(__name__)
 
 PROBE_EVERY_S = 0.25
-"""Seconds between two probes while peers are collected: the first one may leave before every link is up."""
+"""Seconds between two probes while peers are collected."""
+
+PROBE_AGAIN_S = 0.04
+"""Seconds from a new link to a second probe: the first may leave before both sides know their subscriptions."""
 
 LOOK_EVERY_S = 0.02
 """Seconds between two looks at whether the collection is over."""
 
-SETTLED_S = 0.2
-"""Seconds without a new device after which a collection ends early, where at least one has answered.
+SETTLED_S, SETTLED_FOR_SURE_S = 0.2, 0.6
+"""Seconds without a new device or link after which a collection, or a thorough one, ends early.
 
-A device answers a probe within milliseconds. Peers of one another need longer, because their links come up one by one.
+That is where at least one device has answered; a device answers a probe within milliseconds.
 """
 
-SETTLED_AMONG_PEERS_S = 0.4
-SETTLED_FOR_SURE_S = 0.6
-"""The same for a thorough collection."""
+SETTLED_HERE_S, SETTLED_FOR_SURE_HERE_S = 0.15, 0.3
+"""The same on this machine alone, where links come up in milliseconds."""
+
+SETTLED_AMONG_SCOUTED_S = 0.4
+"""The same where peers are found by multicast, because their links come up one by one."""
 
 REGISTRY_S = 0.4
 """Seconds in which a registry that is not known to exist has to answer, where devices answered otherwise."""
+
+REGISTRY_AGAIN_S = 0.05
+"""Seconds between two questions to a registry that no peer of this one serves yet."""
+
+REGISTRY_LINKED_S = 0.6
+"""Seconds in which a registry among peers has to be linked."""
 
 HEARTBEATS_S = 6.0
 """Seconds in which every live device sends a heartbeat; the framework's default is one in 5 s."""
@@ -115,6 +126,8 @@ class Discovery:
         self._described: dict[str, Peer] = {}
         self._beats: dict[str, float] = {}
         self._named: set[str] = set()
+        self._unserved = False
+        """True while the last question to the registry found none."""
         self._listens_since = 0.0
         self._changed_at = 0.0
         self._found: Found = lambda peer: None
@@ -161,19 +174,26 @@ class Discovery:
                 self._changed_at = loop.time()
                 found(peer)
 
-        settled = SETTLED_AMONG_PEERS_S if self._messaging.link.is_peer else SETTLED_S
-        settled = SETTLED_FOR_SURE_S if thorough else settled
+        link = self._messaging.link
+        if link.meeting_point:
+            settled = SETTLED_FOR_SURE_HERE_S if thorough else SETTLED_HERE_S
+        elif thorough:
+            settled = SETTLED_FOR_SURE_S
+        else:
+            settled = SETTLED_AMONG_SCOUTED_S if link.uses_multicast else SETTLED_S
         self._found = found_once
         began = self._changed_at = loop.time()
         listing = asyncio.create_task(self._list(within))
         try:
-            probe_at = began
+            probe_at, links = began, 0
             while (now := loop.time()) < began + within:
+                if (linked := self._messaging.links) > links:
+                    probe_at = self._changed_at = now
                 if now >= probe_at:
-                    probe_at = now + PROBE_EVERY_S
+                    probe_at = now + (PROBE_AGAIN_S if linked > links else PROBE_EVERY_S)
                     await self._messaging.publish(f"{self._root}.discovery.probe", b'{"probe": true}')
-                heard = listing.done() or not (self._expects_registry or now - began < REGISTRY_S)
-                if named and heard and now - self._changed_at >= settled:
+                links = linked
+                if named and self._registry_heard(listing, now - began) and now - self._changed_at >= settled:
                     break
                 await asyncio.sleep(min(LOOK_EVERY_S, within))
             await self._settle_registry(listing, began, sure=thorough and not named)
@@ -184,6 +204,10 @@ class Discovery:
         # A device's own word is newer than the registry's.
         everyone = {**self._listed, **self._described, **self._present}
         return [everyone[name] for name in sorted(everyone)]
+
+    def _registry_heard(self, listing: asyncio.Task[dict[str, Peer]], lasted: float) -> bool:
+        """Return False while the registry's list has to be waited for."""
+        return listing.done() or (not self._expects_registry and (self._unserved or lasted >= REGISTRY_S))
 
     @property
     def _expects_registry(self) -> bool:
@@ -236,12 +260,24 @@ class Discovery:
             RegistryError: it answered with an error.
             MessagingError: no answer within ``within`` seconds.
         """
+        loop = asyncio.get_running_loop()
+        linked_by = loop.time() + REGISTRY_LINKED_S
         devices = {}
-        async for row in self._rows(within):
-            peer = Peer.of(row)
-            devices[peer.id] = peer
-            self._found(peer)
-        return devices
+        while True:
+            self._unserved = False
+            try:
+                async for row in self._rows(within):
+                    peer = Peer.of(row)
+                    devices[peer.id] = peer
+                    self._found(peer)
+            except NoResponderError:
+                if not self._messaging.link.is_peer or loop.time() >= linked_by:
+                    raise
+                # Its link may still come up.
+                self._unserved = True
+                await asyncio.sleep(REGISTRY_AGAIN_S)
+            else:
+                return devices
 
     async def _rows(self, within: float) -> AsyncIterator[Mapping[str, Any]]:
         offset: Any = 0
@@ -267,7 +303,7 @@ class Discovery:
 
     async def _ask(self, leaf: str, method: str, params: Mapping[str, Any], within: float) -> Mapping[str, Any]:
         request = {"jsonrpc": "2.0", "id": uuid.uuid4().hex, "method": method, "params": params}
-        data = await self._messaging.request(f"{self._root}.{leaf}", json.dumps(request).encode(), timeout=within)
+        data = await self._messaging.request_once(f"{self._root}.{leaf}", json.dumps(request).encode(), within)
         reply = _read(data)
         result = reply.get("result")
         if not isinstance(result, Mapping):

@@ -9,13 +9,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.recording.cameras import camera_named
 from strands_robots.serving.picture_verbs import picture
 from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Check, Kind, Parameter, Verb, table
-from strands_robots.utils import ValidationError, flag, identifier, mapping, number, shown, text
+from strands_robots.utils import WAIT_S, ValidationError, flag, identifier, mapping, number, shown, text
 
 REACH_MAX_M = 3.0
 """Largest coordinate of a goal."""

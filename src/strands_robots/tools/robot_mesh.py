@@ -14,11 +14,10 @@ import base64
 from typing import Any
 
 from strands_robots.agent_tool import tool
-from strands_robots.arm_mixin import WAIT_S
 from strands_robots.envelope import error
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.tools import networks
-from strands_robots.utils import ValidationError, choice, device_id, identifier, mapping, shown, text
+from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, shown, text
 
 CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
 """Verb of each action that calls one where none is named."""

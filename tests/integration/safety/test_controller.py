@@ -16,7 +16,8 @@ from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots.audit import read_audit_log
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.safety_controller import SafetyControllerDriver, envelope, safety_controller
+from strands_robots.device_connect.safety_controller import envelope, safety_controller
+from strands_robots.device_connect.safety_controller_driver import SafetyControllerDriver
 from strands_robots.envelope import is_error
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import Progress, SafetyController

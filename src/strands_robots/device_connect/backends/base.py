@@ -66,6 +66,21 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         """The link as it is used, with what ``connect`` was given filled in."""
         return self._link
 
+    @property
+    def links(self) -> int:
+        """Peers that this one is linked to; 0 where a server stands between."""
+        return 0
+
+    async def request_once(self, subject: str, data: bytes, within: float) -> bytes:
+        """Return the first reply to ``data``, asking once.
+
+        Raises:
+            NoResponderError: no device serves ``subject`` at this moment.
+            RequestTimeoutError, NotConnectedError, PublishError: as ``request``.
+        """
+        answer: bytes = await self.request(subject, data, timeout=within)
+        return answer
+
     async def subscribe(
         self,
         subject: str,

@@ -71,7 +71,7 @@ class ZenohBackend(Backend):
         self._outcomes = Backlog(lambda: self._call_soon(self._settle_requests))
         self._callbacks: tuple[Callable[[], Awaitable[None]] | None, ...] = (None, None)
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._tries, self._retry_delay = 3, 0.3
+        self._tries, self._retry_delay = 13, 0.05
 
     async def connect(
         self,
@@ -130,20 +130,25 @@ class ZenohBackend(Backend):
             NotConnectedError: closed, or a client without its router.
         """
         deadline = time.monotonic() + timeout
-        key, remaining = key_of(subject), max(timeout, 0.001)
-        for left in reversed(range(self._tries if self._link.is_peer else 1)):
+        remaining, tries = timeout, self._tries if self._link.is_peer else 1
+        while True:
             try:
-                answer = await self._request_once(key, data, remaining)
+                return await self.request_once(subject, data, remaining)
+            except NoResponderError:
+                tries, remaining = tries - 1, deadline - time.monotonic() - self._retry_delay
+                if tries <= 0 or remaining <= 0:
+                    raise
             except RequestTimeoutError as error:
                 raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
-            if answer is not None:
-                return answer
-            remaining = deadline - time.monotonic() - self._retry_delay
-            if left == 0 or remaining <= 0:
-                break
             # A peer that links at this very moment is not known here yet.
             await asyncio.sleep(self._retry_delay)
-        raise NoResponderError(f"no device answers on {subject}")
+
+    async def request_once(self, subject: str, data: bytes, within: float) -> bytes:
+        """Return the first reply to ``data``, asking the devices that are linked now."""
+        answer = await self._request_once(key_of(subject), data, max(within, 0.001))
+        if answer is None:
+            raise NoResponderError(f"no device answers on {subject}")
+        return answer
 
     async def close(self) -> None:
         """Undeclare everything and release the session."""
@@ -156,6 +161,12 @@ class ZenohBackend(Backend):
         if shared is not None:
             shared.unwatch(self._on_link)
             await on_a_thread(partial(zenoh_session.release, shared))
+
+    @property
+    def links(self) -> int:
+        """Peers that this one is linked to; 0 for a client of a router."""
+        shared = self._shared
+        return shared.links if shared is not None and self._link.is_peer else 0
 
     @property
     def is_connected(self) -> bool:

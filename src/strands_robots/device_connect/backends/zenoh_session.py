@@ -207,6 +207,12 @@ class SharedSession:
         return opened is not None and (self.link.is_peer or bool(opened.remotes))
 
     @property
+    def links(self) -> int:
+        """Number of sessions that this one is linked to."""
+        opened = self._linked_session
+        return 0 if opened is None else len(opened.remotes)
+
+    @property
     def meets(self) -> str:
         """Kind of process on the meeting port, as :func:`meets` returns it."""
         with self._lock:

@@ -1,0 +1,93 @@
+"""Commands from prompt to prompt beside a served arm, and a bare program that discovers and calls it.
+
+All are processes, started in turns, so that what else the machine does falls on all of them.
+"""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from fixtures.command_line import COMMAND, Machine
+
+from benchmarks.table import Row
+
+PROMPT_S = 0.5
+TURNS, QUICK_TURNS = 15, 4
+
+# The framework alone, as an agent uses it: import, connect, find the robot, ask it once.
+BARE = """
+import asyncio, sys
+from device_connect_edge import DeviceRuntime
+from fixtures.bare_caller import Caller
+async def main():
+    async with Caller(servers=("tcp/127.0.0.1:" + sys.argv[1],)) as caller:
+        await caller.sees("arm-1")
+        await caller.call("arm-1", "getStatus")
+asyncio.run(main())
+"""
+
+PYTHON = "python -c pass"
+DISCOVERY = "bare import, discovery and call"
+
+
+def run(quick: bool = False) -> list[Row]:
+    """Measure and give the rows of the table."""
+    with tempfile.TemporaryDirectory() as state:
+        machine = Machine(Path(state))
+        with machine.serving("arm-1"):
+            return _rows(machine, QUICK_TURNS if quick else TURNS)
+
+
+def _rows(machine: Machine, turns: int) -> list[Row]:
+    port = machine.environment["STRANDS_DC_PORT"]
+    commands: dict[str, tuple[str, ...]] = {
+        "--version": ("--version",),
+        "peers": ("peers",),
+        "call arm-1 getStatus": ("call", "arm-1", "getStatus"),
+        "stop arm-1": ("stop", "arm-1"),
+        "estop": ("estop",),
+        "lockout": ("lockout",),
+        "resume --local": ("resume", "--local"),
+        "doctor": ("doctor",),
+    }
+    took: dict[str, list[float]] = {name: [] for name in (PYTHON, DISCOVERY, *commands)}
+    for _ in range(turns):
+        took[PYTHON].append(_timed(lambda: _checked([sys.executable, "-c", "pass"], machine)))
+        took[DISCOVERY].append(_timed(lambda: _checked([sys.executable, "-c", BARE, port], machine)))
+        for name, words in commands.items():
+            took[name].append(_timed(lambda words=words: _checked([*COMMAND, *words], machine)))  # type: ignore[misc]
+    bare = statistics.median(took[DISCOVERY])
+    interpreter = statistics.median(took[PYTHON])
+    rows = [Row(PYTHON, "", _s(interpreter), None, "for information", True)]
+    for name in commands:
+        median = statistics.median(took[name])
+        bounded = name != "doctor"
+        must = f"≤ {PROMPT_S:g} s" if bounded else "for information, it renders a picture"
+        ours, against = _s(median), f"{DISCOVERY} {_s(bare)}"
+        rows.append(
+            Row(f"strands-robots {name}, p50", ours, against, median / bare, must, median <= PROMPT_S or not bounded)
+        )
+    return rows
+
+
+def _checked(line: list[str], machine: Machine) -> None:
+    result = subprocess.run(line, env=machine.environment, capture_output=True, text=True, check=False)
+    # Doctor exits with 1 where it finds something to mend.
+    if result.returncode and "doctor" not in line:
+        raise RuntimeError(f"{line} ended with {result.returncode}: {result.stderr}")
+
+
+def _timed(work: Callable[[], None]) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started
+
+
+def _s(seconds: float) -> str:
+    return f"{seconds:.2f} s"

@@ -1,0 +1,38 @@
+"""``peers --mesh``: list the peers of the native mesh."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rich.text import Text
+
+from strands_robots.cli.network import mesh_peer, temporary_mesh_id
+from strands_robots.cli.output import CliError, Exit, Screen, label, table
+from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
+from strands_robots.safety.statements import ALARM
+
+
+def list_peers(screen: Screen, timeout: float) -> None:
+    """List the mesh peers that announce themselves within ``timeout`` seconds."""
+    with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
+        time.sleep(timeout)
+        rows, keys = [row for row in mesh.peers if row["reachable"]], enrolled_peers()
+    for row in rows:
+        if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+            row["distrusted"] = why
+    if not rows:
+        raise CliError("No peer is on the mesh of this machine.", Exit.SILENT, peers=[])
+    screen.data({"status": "success", "peers": rows})
+    cells = ((r["peer_id"], r["type"], r["hostname"], _status(r), f"{r['age']:.1f} s") for r in rows)
+    screen.show(table("", ("peer", "type", "host", "status", "last heard"), cells))
+
+
+def _status(row: Mapping[str, Any]) -> str | Text:
+    """Return the task's state, or the lockout, or that emergency stops do not arrive."""
+    if row.get("estop_unheard"):
+        return label("CANNOT RECEIVE STOPS", "bold red")
+    if why := str(row.get("distrusted", "")):
+        return label(why, "bold red" if why.startswith(ALARM) else "yellow")
+    return label("LOCKED", "bold red") if row.get("locked") is True else str(row.get("task_status", ""))
