@@ -10,18 +10,15 @@ from typing import Any, ClassVar
 
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
-from strands_robots import settings
 from strands_robots.contract import RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.reachy.links import DEFAULT_PREFIX
-from strands_robots.envelope import error
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
 from strands_robots.serving.verbs import Verb
-from strands_robots.serving.workers import Share, called
 from strands_robots.utils import flag
 
 logger = logging.getLogger(__name__)
@@ -67,7 +64,6 @@ class ReachyMiniDriver(RobotDriver):
         if flag("release_on_estop", release_on_estop):
             self.reachy.release_on_estop = True
         super().__init__(self.reachy, hardware=True, authorization=authorization, approval=approval)
-        self._emergencies = Share()
 
     @property
     def identity(self) -> DeviceIdentity:
@@ -112,29 +108,7 @@ class ReachyMiniDriver(RobotDriver):
         await super().disconnect()
         await asyncio.to_thread(self.reachy.disconnect)
 
-    # Emergency.
-
-    @emit(labels={"safety": "critical"})
-    async def emergencyStop(self, reason: str = "") -> None:
-        """This device halts, holds or releases its torque as configured, and calls for an emergency stop.
-
-        Args:
-            reason: Why the emergency stop was triggered
-        """
-        within = 2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0
-        try:
-            told = await called(
-                self._emergencies,
-                lambda: self.reachy.emergency_stop(reason, release=self.reachy.release_on_estop),
-                within,
-            )
-        except Exception as exc:  # noqa: BLE001 - the fleet is told, whatever this robot's own stop did
-            logger.critical("%s: its own emergency stop failed: %s: %s", self.peer_id, type(exc).__name__, exc)
-            self.robot.gate.revoke()
-            told = error(f"the robot did not answer within {within:g} s.")
-        level = logging.WARNING if told.get("stopped") else logging.CRITICAL
-        text = told["content"][0]["text"]
-        logger.log(level, "%s: emergency stop (%s): %s Torque %s.", self.peer_id, reason, text, told.get("torque"))
+    # Events.
 
     @emit()
     async def motionComplete(self, name: str, state: str, detail: str = "", duration: float = 0.0) -> None:

@@ -25,6 +25,7 @@ from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.safety import ed25519
 from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.resume import sign
+from strands_robots.safety.stopping import StopVerdict
 
 Call = Callable[..., dict[str, Any]]
 MOTIONS = ("look", "antennas", "body", "nod", "shake", "happy", "wakeUp", "sleep", "enableMotors", "disableMotors")
@@ -166,15 +167,30 @@ def test_status_reports_link_version_state_and_fresh_joints(call: Call, daemon: 
 
 
 @pytest.mark.usefixtures("allowed")
-def test_own_emergency_stop_halts_and_releases_the_motors(call: Call, device: ReachyMiniDriver, daemon: Daemon) -> None:
+def test_own_emergency_stop_locks_halts_and_releases_the_motors(
+    call: Call, device: ReachyMiniDriver, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
     device.reachy.release_on_estop = True
+    locked: list[bool] = []
+    halt = device.reachy.motions.halt
+
+    def halted(reason: str) -> StopVerdict:
+        locked.append(device.reachy.gate.lockout("motion") is not None)
+        return halt(reason)
+
+    monkeypatch.setattr(device.reachy.motions, "halt", halted)
     call("shake")
     asyncio.run(device.emergencyStop(reason="test"))
+    eventually(lambda: locked)
+    assert locked[0], "it locks before it halts"
     motion = device.reachy.motions.current
     assert motion is not None
-    assert motion.facts()["state"] == "stopped"
+    eventually(lambda: motion.facts()["state"] == "stopped")
+    assert call("getStatus")["locked"] is True
+    for function in MOTIONS:
+        assert call(function)["status"] == "error", function
     if daemon.kind.simulation != "mujoco":
-        assert daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"}
+        eventually(lambda: daemon.request("GET", "/api/motors/status").json() == {"mode": "disabled"})
 
 
 @pytest.mark.usefixtures("allowed")
