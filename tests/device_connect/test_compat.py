@@ -9,12 +9,13 @@ import logging
 
 import pytest
 from device_connect_edge import DeviceRuntime
-from device_connect_edge.drivers import DeviceDriver, decorators, rpc
+from device_connect_edge.discovery import PresenceAnnouncer
+from device_connect_edge.drivers import DeviceDriver, before_emit, decorators, on, periodic, rpc
 from device_connect_edge.drivers.decorators import get_rpc_source_device
 from opentelemetry import trace
 from opentelemetry.sdk.trace import TracerProvider
 
-from strands_robots.device_connect._compat import Runtime
+from strands_robots.device_connect._compat import CollectedOnce, Runtime
 from strands_robots.device_connect.backends import LinkConfig, jsonrpc
 
 
@@ -176,8 +177,63 @@ async def test_framework_serves_when_a_tracer_is_configured(monkeypatch):
     assert driver._get_functions()["whoAsks"] == driver.whoAsks
 
 
+def test_presence_is_the_frameworks_own_message():
+    def announced(runtime):
+        runtime.messaging = None
+        capabilities = runtime._driver.capabilities.model_dump()
+        runtime._d2d_announcer = PresenceAnnouncer(
+            None, "toy-1", "default", capabilities, {"model": "x"}, runtime.status
+        )
+        message = json.loads(runtime._d2d_announcer._build_payload())
+        for each in (message, message["status"]):
+            del each["ts"]
+        return message
+
+    mine, theirs = ours(Driver()), stock(Driver())
+    mine.status = theirs.status = {"availability": "busy"}
+    assert announced(mine) == announced(theirs)
+    # The status is read anew for each message.
+    mine.status["availability"] = "idle"
+    assert json.loads(mine._d2d_announcer._build_payload())["status"]["availability"] == "idle"
+
+
+class Marked(CollectedOnce, Driver):
+    @on(event_name="peer_lost")
+    async def _on_lost(self, device_id, event_name, payload):
+        """Note."""
+
+    @periodic(interval=60.0)
+    async def tick(self):
+        """Tick."""
+
+    @before_emit("done")
+    async def first(self, payload, **_more):
+        """Go first."""
+
+
+def test_methods_collected_once_are_those_that_the_framework_finds():
+    class Plain(Driver):
+        _on_lost, tick, first = Marked._on_lost, Marked.tick, Marked.first
+
+    def collected(driver):
+        driver._collect_routines()
+        driver._collect_internal_handlers()
+        handlers = {name: [each.__name__ for each in found] for name, found in driver._internal_handlers.items()}
+        subscriptions = [each["handler"].__name__ for each in driver._collect_event_subscriptions()]
+        return sorted(driver._get_functions()), sorted(driver._routines), handlers, subscriptions
+
+    assert collected(Marked()) == collected(Plain())
+    assert collected(Marked())[1:] == (["tick"], {"done": ["first"]}, ["_on_lost"])
+    assert "invoke" in dir(Marked())
+
+
 # Members that _compat.py calls, replaces, or whose way of working it relies upon.
 SOURCE_HASHES = {
+    "DeviceDriver._collect_event_subscriptions": "e7cb8dcf80dd5e57",
+    "DeviceDriver._collect_internal_handlers": "8e6ddae73ead5f0b",
+    "DeviceDriver._collect_routines": "dc71c15bf180514e",
+    "PresenceAnnouncer.__init__": "d44d12623ab47859",
+    "PresenceAnnouncer._build_payload": "ee9a1f6416aa0fbf",
     "DeviceDriver._get_functions": "7dc82c18974d7295",
     "DeviceDriver._invoke_decorated": "2edf78c79ad0cb8d",
     "DeviceDriver.invoke": "275902836c43f991",
@@ -200,7 +256,12 @@ SOURCE_HASHES = {
 }
 
 
-OWNERS = {"DeviceRuntime": DeviceRuntime, "DeviceDriver": DeviceDriver, "decorators": decorators}
+OWNERS = {
+    "DeviceRuntime": DeviceRuntime,
+    "DeviceDriver": DeviceDriver,
+    "PresenceAnnouncer": PresenceAnnouncer,
+    "decorators": decorators,
+}
 
 
 def test_framework_has_the_pinned_version():

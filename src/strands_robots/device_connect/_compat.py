@@ -10,7 +10,7 @@ import contextlib
 import functools
 import inspect
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import Future
 from typing import Any, TypeVar, cast
 
@@ -24,7 +24,7 @@ from .. import settings
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
 from .beat import Beating, beat_of
-from .presence import PresenceView, presence_builder
+from .presence import PresenceView, encoded_capabilities, presence_builder
 
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""
@@ -60,6 +60,54 @@ def emit(labels: Labels | None = None) -> Callable[[F], F]:
 def on(event_name: str) -> Callable[[F], F]:
     """Declare a handler of an event of every device of the tenant, this one included."""
     return cast(Callable[[F], F], drivers.on(event_name=event_name))
+
+
+@functools.lru_cache(maxsize=256)
+def _marked(driver: Any, mark: str) -> tuple[str, ...]:
+    """Return the names of a class's methods that a decorator of the framework marked."""
+    found = []
+    for name in dir(driver):
+        method = inspect.getattr_static(driver, name)
+        if getattr(getattr(method, "__func__", method), mark, False):
+            found.append(name)
+    return tuple(found)
+
+
+class CollectedOnce(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
+    """A driver whose decorated methods are found once for its class.
+
+    The framework looks through all attributes of each device, once for each kind of method.
+    """
+
+    _mark = ""
+
+    def __dir__(self) -> Iterable[str]:
+        kind: Any = type(self)
+        return _marked(kind, self._mark) if self._mark else super().__dir__()
+
+    @contextlib.contextmanager
+    def _only(self, mark: str) -> Iterator[None]:
+        self._mark = mark
+        try:
+            yield
+        finally:
+            del self._mark
+
+    def _collect_internal_handlers(self) -> None:
+        with self._only("_is_internal_handler"):
+            super()._collect_internal_handlers()
+
+    def _collect_routines(self) -> None:
+        with self._only("_is_device_routine"):
+            super()._collect_routines()
+
+    def _collect_event_subscriptions(self) -> list[dict[str, Any]]:
+        with self._only("_is_event_subscription"):
+            return cast(list[dict[str, Any]], super()._collect_event_subscriptions())
+
+    def _get_functions(self) -> dict[str, Callable[..., Any]]:
+        with self._only("_is_device_function"):
+            return cast(dict[str, Callable[..., Any]], super()._get_functions())
 
 
 class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type information
@@ -127,7 +175,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._announcer = announcer
         if announcer is not None:
             build = presence_builder(
-                announcer._device_id, announcer._capabilities, announcer._identity, announcer._status
+                announcer._device_id, encoded_capabilities(self._driver), announcer._identity, announcer._status
             )
             announcer._build_payload = build
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import json
 import logging
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import Future
@@ -16,13 +17,12 @@ from functools import partial
 from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
-from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.drivers.decorators import get_rpc_source_device
 from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
-from strands_robots.device_connect._compat import Labels, emit, observed, on, rpc
+from strands_robots.device_connect._compat import CollectedOnce, Labels, emit, observed, on, rpc
 from strands_robots.device_connect.safety_registration import SafetyRegistration
 from strands_robots.device_connect.state_reports import report_changes, sweep
 from strands_robots.device_connect.telemetry import RolloutPump
@@ -49,8 +49,12 @@ START_DEADLINE_S = 10.0
 READ_DEADLINE_S = 5.0
 """Seconds in which a robot has to have answered a read."""
 
+FIRST_LOOK_S = 0.02
+"""Seconds from the start of a device to its first state."""
+
 _FUNCTIONS: WeakKeyDictionary[type, tuple[FunctionDef, ...]] = WeakKeyDictionary()
 _EVENTS: WeakKeyDictionary[type, tuple[EventDef, ...]] = WeakKeyDictionary()
+_DESCRIBED: WeakKeyDictionary[type, tuple[str, str]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +114,7 @@ def enveloped(verb: str, answer: object) -> Envelope:
     return success(f"{verb} answered.", **{k: v for k, v in plain.items() if k not in ("content", "status")})
 
 
-class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
+class RobotDriver(CollectedOnce):
     """Robot as a device; subclasses name its verbs and events and read its state.
 
     Args:
@@ -386,6 +390,19 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             _EVENTS[type(self)] = tuple(super().events)
         return list(_EVENTS[type(self)])
 
+    def described(self) -> str:
+        """Return the capabilities as JSON, encoded once for a class and its labels.
+
+        Raises:
+            TypeError, ValueError: JSON cannot carry them.
+        """
+        labels = json.dumps(self.labels, allow_nan=False)
+        known = _DESCRIBED.get(type(self))
+        if known is None or known[0] != labels:
+            known = labels, json.dumps(self.capabilities.model_dump(), allow_nan=False)
+            _DESCRIBED[type(self)] = known
+        return known[1]
+
     @property
     def status(self) -> DeviceStatus:
         """Live availability: busy (score 1.0) while something runs, else idle (0.0)."""
@@ -472,7 +489,12 @@ class RobotDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no t
             # A quiet robot is looked at by the sweep.
             return moving_hz if moved else idle_hz if self.activity.fault else 0.0
 
-        return report_changes(look, tell, rate=rate, changed=changed, most_hz=busy_hz, same=same)
+        async def after_the_start() -> None:
+            # The first look costs the start of the device nothing.
+            await asyncio.sleep(FIRST_LOOK_S)
+            await report_changes(look, tell, rate=rate, changed=changed, most_hz=busy_hz, same=same)
+
+        return after_the_start()
 
     @property
     def quiet(self) -> bool:

@@ -27,6 +27,7 @@ from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
 from strands_robots.device_connect.device_loop import DeviceLoop, enter_loop
 from strands_robots.device_connect.links import insecure_opt_in, link_for
+from strands_robots.device_connect.presence import encoded_capabilities
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.safety_registration import SafetyRegistration, register_safety
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
@@ -121,9 +122,6 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     driver = driver_for(robot, peer_type)
     announceable(driver)
     warnings = _framework_warnings(name)
-    if isinstance(driver, RobotDriver):
-        # The runtime reads the status when it is made, on the loop, where a robot that blocks would hold all others.
-        await driver.read_activity()
     registration = asyncio.create_task(
         called(
             _REGISTRATIONS,
@@ -131,6 +129,9 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
             bringup_timeout,
         )
     )
+    if isinstance(driver, RobotDriver):
+        # The runtime reads the status when it is made, on the loop, where a robot that blocks would hold all others.
+        await driver.read_activity()
 
     async def before_live(messaging: Any) -> None:
         await refuse_duplicate(name, reach, messaging)
@@ -151,6 +152,10 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     task = asyncio.create_task(_live(runtime, registration), name=f"device {name}")
     try:
         await runtime.wait_ready(bringup_timeout)
+        registered = registration.result()
+        if registered is not None:
+            # A connection of its own, which would take the interpreter from the one that comes up until here.
+            await called(_REGISTRATIONS, registered.open, bringup_timeout)
     except BaseException as exc:
         await asyncio.shield(_put_down(runtime, task))
         if isinstance(exc, TimeoutError):
@@ -319,10 +324,10 @@ def announceable(driver: DeviceDriver) -> None:
     Raises:
         ValidationError: naming the functions and events to mend.
     """
-    capabilities = driver.capabilities
     with contextlib.suppress(TypeError, ValueError):  # the fault is searched below, part by part
-        json.dumps(capabilities.model_dump(), allow_nan=False)
+        encoded_capabilities(driver)
         return
+    capabilities = driver.capabilities
     faults = []
     for part in (*capabilities.functions, *capabilities.events):
         try:

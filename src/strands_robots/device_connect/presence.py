@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from device_connect_edge.discovery import PresenceCollector
+from device_connect_edge.drivers import DeviceDriver
 
 from strands_robots.device_connect.backends import LinkConfig, open_client
 
@@ -30,17 +31,30 @@ OnPeer = Callable[[str], Any]
 Presence = dict[str, Any]
 
 
+def encoded_capabilities(driver: DeviceDriver) -> str:
+    """Return the capabilities of a driver as JSON.
+
+    Raises:
+        TypeError, ValueError: JSON cannot carry them.
+    """
+    described = getattr(driver, "described", None)
+    return str(described()) if callable(described) else json.dumps(driver.capabilities.model_dump(), allow_nan=False)
+
+
 def presence_builder(
-    device_id: str, capabilities: Presence, identity: Presence, status: Mapping[str, Any]
+    device_id: str, capabilities: str, identity: Presence, status: Mapping[str, Any]
 ) -> Callable[[], bytes]:
     """Return a builder of presence messages that encodes the description once.
 
     Args:
         device_id: whose presence.
-        capabilities, identity: the description, which stays as it is.
+        capabilities: in JSON.
+        identity: stays as it is.
         status: read anew for each message.
     """
-    described = json.dumps({"device_id": device_id, "capabilities": capabilities, "identity": identity})[:-1]
+    described = (
+        f'{{"device_id": {json.dumps(device_id)}, "capabilities": {capabilities}, "identity": {json.dumps(identity)}'
+    )
 
     def build() -> bytes:
         now = time.time()

@@ -66,11 +66,18 @@ class SafetyRegistration:
         self._held: Registered | None = self.entry
         try:
             self._listener: ListenerRegistration = estop_listener().register(
-                name, ("device-connect", link), lambda: stop_link(link), self.identity
+                name, ("device-connect", link), lambda: stop_link(link), self.identity, opened=False
             )
         except BaseException:
             self.entry.close()
             raise
+
+    def open(self) -> None:
+        """Open the e-stop link, unless it is open; return before it is up.
+
+        Until then the runtime's handler and every RPC ``stop`` stop the robot.
+        """
+        self._listener.open()
 
     @property
     def up(self) -> bool:

@@ -279,6 +279,10 @@ class ListenerRegistration:
         self.link = link
         self._listener = listener
 
+    def open(self) -> None:
+        """Open the link, unless it is open or this registration has ended."""
+        self._listener.open(self)
+
     def close(self) -> None:
         """Unregister. Safe to call twice."""
         self._listener.unregister(self)
@@ -297,6 +301,7 @@ class EstopListener:
         self._make_rules = rules
         self._registering = threading.Lock()
         self._registrations: tuple[ListenerRegistration, ...] = ()
+        self._open: set[Hashable] = set()
         self._refusals = RefusalLog()
         self._budget = FailureBudget()
         self._latch_answers = LatchAnswers()
@@ -321,22 +326,31 @@ class EstopListener:
         key: Hashable,
         make: Callable[[], StopLink],
         identity: SigningIdentity | None = None,
+        *,
+        opened: bool = True,
     ) -> ListenerRegistration:
         """Serve a robot over the link of ``key``; ``make`` the link if it is new.
 
         Args:
             identity: signs the robot's verdicts; without one they are not signed.
+            opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
         with self._registering:
             if self._queue is None:
                 self._start()
             link = next((each.link for each in self._registrations if each.key == key), None)
-            if link is None:
-                link = make()
-                link.open((ESTOP, CHECK_IN, CHECK_IN_ANSWER), self.receive, lambda up: None)
-            registration = ListenerRegistration(self, robot_id, key, link, identity)
+            registration = ListenerRegistration(self, robot_id, key, make() if link is None else link, identity)
             self._registrations = (*self._registrations, registration)
-            return registration
+        if opened:
+            registration.open()
+        return registration
+
+    def open(self, registration: ListenerRegistration) -> None:
+        """Open the link of a registration, unless it is open."""
+        with self._registering:
+            if registration in self._registrations and registration.key not in self._open:
+                registration.link.open((ESTOP, CHECK_IN, CHECK_IN_ANSWER), self.receive, lambda up: None)
+                self._open.add(registration.key)
 
     def unregister(self, registration: ListenerRegistration) -> None:
         """Serve a device no longer; the thread ends with the last one."""
@@ -345,6 +359,8 @@ class EstopListener:
                 return
             self._registrations = tuple(each for each in self._registrations if each is not registration)
             last_of_link = all(each.key != registration.key for each in self._registrations)
+            if last_of_link:
+                self._open.discard(registration.key)
             events, thread = (self._queue, self._thread) if not self._registrations else (None, None)
             if events is not None:
                 self._queue = self._thread = None
