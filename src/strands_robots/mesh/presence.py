@@ -142,13 +142,21 @@ class PresencePublisher:
         if bound is not None:
             context.audit("presence_identity_conflict", peer, held=bound, offered=session)
             return
-        if context.registry.full_for(peer, session):
+        anonymous = session is None and not sample.sessionless
+        if context.registry.full_for(peer, session, anonymous=anonymous):
             context.audit("presence_left_out", reason="the table of peers is full, or its session announced too many")
             return
         facts = presence.facts()
         older = not sample.sessionless and (peer, sample.session) not in self._tokens
         if context.registry.update(
-            peer, presence.robot_type, presence.hostname, facts, session=session, certificate=certificate, older=older
+            peer,
+            presence.robot_type,
+            presence.hostname,
+            facts,
+            session=session,
+            certificate=certificate,
+            older=older,
+            anonymous=anonymous,
         ):
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
 

@@ -117,16 +117,18 @@ class PeerRegistry:
         session: str | None = None,
         certificate: tuple[str, str] | None = None,
         older: bool = False,
+        anonymous: bool = False,
     ) -> bool:
         """Insert or refresh a row; True when the peer is new and has a row now.
 
         A living peer that states no session or no certificate keeps the one that it is bound to. ``older`` is a peer of
-        a 0.5 release, towards which messages are paced.
+        a 0.5 release, towards which messages are paced. ``anonymous`` is one without a session on a transport that has
+        them; all of these are bounded together, as those of one session are.
         """
         now = self._clock()
         with self._lock:
             known = self._rows.get(peer_id)
-            if known is None and not self._has_place(session, now):
+            if known is None and not self._has_place(session, now, anonymous=anonymous):
                 return False
             # Taken out and put in again, so that the rows are in the order of their last heartbeat.
             self._rows.pop(peer_id, None)
@@ -144,14 +146,17 @@ class PeerRegistry:
                 self._older.discard(peer_id)
         return known is None
 
-    def full_for(self, peer_id: str, session: str | None) -> bool:
+    def full_for(self, peer_id: str, session: str | None, *, anonymous: bool = False) -> bool:
         """True when a heartbeat of this newcomer would be left out."""
         with self._lock:
-            return peer_id not in self._rows and not self._has_place(session, self._clock(), make=False)
+            if peer_id in self._rows:
+                return False
+            return not self._has_place(session, self._clock(), make=False, anonymous=anonymous)
 
-    def _has_place(self, session: str | None, now: float, *, make: bool = True) -> bool:
+    def _has_place(self, session: str | None, now: float, *, make: bool = True, anonymous: bool = False) -> bool:
         """True when a newcomer of ``session`` fits; silent rows may be dropped for it."""
-        of_session = sum(row.session == session for row in self._rows.values()) if session is not None else 0
+        bounded = session is not None or anonymous
+        of_session = sum(row.session == session for row in self._rows.values()) if bounded else 0
         if of_session >= SESSION_PEERS_MAX:
             return False
         over = len(self._rows) + 1 - max(1, self._most())

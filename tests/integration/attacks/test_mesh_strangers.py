@@ -1,24 +1,23 @@
-"""Strangers on the mesh of one machine, without certificates, move no real hardware."""
+"""Strangers on the mesh of one machine, without certificates, move no real hardware.
+
+A thousand tries of each kind: ``make bench ARGS=attacks``.
+"""
 
 from __future__ import annotations
 
-import json
-import time
-import uuid
+import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-import zenoh
+from fixtures.mesh_strangers import APPROVED, WAVE, Stranger, stranger_on
 from fixtures.waiting import eventually
 from tests.integration.mesh.networks import OverZenoh, network
 
-from strands_robots.mesh.console_keys import INPUT, MOTION, ConsoleSigner
+from strands_robots.mesh.registry import SESSION_PEERS_MAX
 
-TIMES = 15
-WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
-APPROVED = {"STRANDS_ROBOT_COMMAND_ALLOW": "start@arm-1,teleop_receive@arm-1"}
+TRIES = 15
+KINDS = ["unsigned", "copied source", "wrong key", "another purpose", "replay", "ghosts and a stolen name"]
 
 
 @pytest.fixture
@@ -33,44 +32,40 @@ def net(tmp_path: Path) -> Iterator[OverZenoh]:
 
 
 @pytest.fixture
-def stranger(net: OverZenoh) -> Iterator[zenoh.Session]:
-    with session(net) as opened:
+def stranger(net: OverZenoh) -> Iterator[Stranger]:
+    with stranger_on(net.port, net.folder) as opened:
         yield opened
 
 
-def session(net: OverZenoh) -> zenoh.Session:
-    endpoints = {"endpoints": [f"tcp/127.0.0.1:{net.port}"]}
-    config = {"mode": "client", "namespace": "strands", "connect": endpoints}
-    return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+@pytest.mark.parametrize("kind", KINDS)
+def test_stranger_moves_no_hardware(net: OverZenoh, stranger: Stranger, kind: str) -> None:
+    assert list(stranger.kinds()) == KINDS
+    arm, console = net.peers["arm-1"], net.peers["console"]
+    stranger.capture(lambda: console.ask("send", "arm-1", WAVE, 20))
+    assert console.ask("send", "arm-1", {"action": "stop"}, 20)["type"] == "response"
+    assert arm.ask("started") == ["wave"]
+    assert stranger.attack(kind, TRIES) == []
+    assert (arm.ask("started"), arm.ask("moving")) == (["wave"], False)
+    assert console.ask("send", "arm-1", WAVE, 20)["result"]["status"] == "success"
+    assert arm.ask("started") == ["wave", "wave"]
 
 
-def source_of(stranger: zenoh.Session, victim: str) -> Any:
-    """The source that the victim puts on its messages, to be copied."""
-    received: list[Any] = []
-    listening = stranger.declare_subscriber(f"strands/{victim}/presence", received.append)
-    source = eventually(lambda: received and received[0].source_info, what=f"a heartbeat of {victim}")
-    listening.undeclare()
-    return source
-
-
-def command(**more: Any) -> dict[str, Any]:
-    head = {"sender_id": "console", "turn_id": uuid.uuid4().hex, "timestamp": time.time(), "target_id": "arm-1"}
-    return {**head, "command": WAVE, **more}
-
-
-@pytest.mark.parametrize("signature", ["none", "own key", "another purpose"])
-def test_stranger_with_a_copied_source_moves_no_hardware(
-    net: OverZenoh, stranger: zenoh.Session, signature: str, monkeypatch: pytest.MonkeyPatch
+def test_flood_of_names_takes_no_living_peers_place_and_hides_no_frozen_robot(
+    net: OverZenoh, stranger: Stranger
 ) -> None:
-    arm, source = net.peers["arm-1"], source_of(stranger, "console")
-    if signature == "another purpose":
-        monkeypatch.setenv("STRANDS_STATE_DIR", str(net.folder / "console"))  # what the console signed for a stream
-    signer, purpose = ConsoleSigner(), INPUT if signature == "another purpose" else MOTION
-    for _ in range(TIMES):
-        body = command() if signature == "none" else signer.sign(command(), purpose)
-        stranger.put("strands/arm-1/cmd", json.dumps(body), source_info=source)
-    eventually(lambda: "wire_motion_refused" in arm.ask("audited"))
-    # It is served after the forged ones, so none of them is still on its way.
-    assert net.peers["console"].ask("send", "arm-1", {"action": "status"}, 20)["type"] == "response"
-    assert arm.ask("moving") is False
-    assert net.peers["console"].ask("send", "arm-1", WAVE, 20)["result"]["status"] == "success"
+    arm, console = net.peers["arm-1"], net.peers["console"]
+    bound = {"arm-1": console.ask("zid", "arm-1"), "console": arm.ask("zid", "console")}
+    with stranger_on(net.port, net.folder) as another:
+        for each in (stranger, another):
+            assert each.attack("ghosts and a stolen name", 30) == []
+    assert {"arm-1": console.ask("zid", "arm-1"), "console": arm.ask("zid", "console")} == bound
+    assert len(console.ask("peers")) <= SESSION_PEERS_MAX + 1, "those that state no session share one bound"
+    assert "presence_left_out" in console.ask("audited")
+    assert "presence_identity_conflict" in console.ask("audited")
+    arm.signal(signal.SIGSTOP)  # type: ignore[attr-defined]
+    try:
+        console.ask("estop")
+        assert "arm-1" in eventually(lambda: console.ask("silent"))
+    finally:
+        arm.signal(signal.SIGCONT)  # type: ignore[attr-defined]
+    eventually(lambda: arm.ask("epoch"), what="it is locked when it wakes")
