@@ -1,4 +1,4 @@
-"""Attacks on the way of a stop: floods of forged and of fresh stops, and what the true one takes meanwhile."""
+"""Attacks: floods on the way of a stop, and strangers that want to move hardware on the mesh."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.mesh_peer import MeshPeer
+from fixtures.mesh_strangers import APPROVED, WAVE, stranger_on
 from fixtures.nats_server import NatsServer
 from fixtures.plane_process import planned
 from fixtures.stop_controller import controller
-from fixtures.waiting import eventually
+from fixtures.waiting import eventually, free_port
 from fixtures.zenoh_router import ZenohRouter
 
 from benchmarks.safety import Figures, Fleet, Hiccups, row
@@ -22,6 +24,7 @@ from strands_robots.safety import ed25519
 
 STOPS, STOPS_QUICK = 500, 20
 FLOOD_S, FLOOD_QUICK_S = 60.0, 10.0
+TRIES, TRIES_QUICK = 1000, 20
 EVERY_S = 0.5
 """From one true stop to the next in a flood whose memory is watched."""
 
@@ -38,7 +41,40 @@ def run(quick: bool = False) -> list[Row]:
             rows.append(_forged(transport, url, f"{name}: forged signatures under 2,000 names", OTHERS, stops, 0.1))
             rows.append(_forged(transport, url, f"{name}: those under the controller's name", ["safety-1"], stops, 0.5))
             rows.append(_flooded(transport, url, name, seconds))
-    return [*rows, machine.row()]
+    return [*rows, *_strangers(TRIES_QUICK if quick else TRIES), machine.row()]
+
+
+def _strangers(tries: int) -> list[Row]:
+    """Tries of strangers to move approved hardware on a mesh of one machine without certificates."""
+    rows = []
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-strangers-")))
+        port = free_port()
+        console, arm = (_peer(stack, folder, port, *each) for each in (("console", "none"), ("arm-1", "arm")))
+        console.sees("arm-1")
+        arm.sees("console")
+        stranger = stack.enter_context(stranger_on(port, folder))
+        stranger.capture(lambda: console.ask("send", "arm-1", WAVE, 20))
+        console.ask("send", "arm-1", {"action": "stop"}, 20)
+        for kind in stranger.kinds():
+            before, began = len(arm.ask("started")), time.monotonic()
+            admitted = stranger.attack(kind, tries)
+            moved, took = len(arm.ask("started")) - before, time.monotonic() - began
+            text = f"{moved} motions, {len(admitted)} admitted, in {took:.1f} s"
+            ok = not moved and not admitted
+            rows.append(Row(f"Zenoh mesh: {kind}, {tries} tries to move hardware", text, "", None, "0 motions", ok))
+        again = console.ask("send", "arm-1", WAVE, 20)["result"]["status"]
+        rows.append(Row("the console afterwards", again, "", None, "it moves the robot", again == "success"))
+    return rows
+
+
+def _peer(stack: ExitStack, folder: Path, port: int, name: str, robot: str) -> MeshPeer:
+    state = folder / name
+    state.mkdir(mode=0o700)
+    settings = {"STRANDS_STATE_DIR": str(state), "STRANDS_MESH_PORT": str(port), **APPROVED}
+    peer = MeshPeer(name, robot, settings)
+    stack.callback(peer.close)
+    return peer
 
 
 def _forged(transport: str, url: str, what: str, names: Sequence[str], stops: int, bound_s: float) -> Row:
