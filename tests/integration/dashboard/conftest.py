@@ -1,0 +1,81 @@
+"""A browser, robots in a process of their own, and a page's server on a port of the test's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.command_line import Machine
+from fixtures.page_site import PageServer, browser, chromium, shows
+from fixtures.stop_robots import robots
+from fixtures.waiting import eventually
+
+from strands_robots.device_connect.backends import loopback_config
+
+ARMS = ("arm-1", "arm-2", "arm-3")
+
+
+@pytest.fixture(scope="session")
+def chrome() -> Iterator[Any]:
+    pytest.importorskip("playwright.sync_api")
+    assert chromium(), "Chromium is not installed; run: make system"
+    with browser("--host-resolver-rules=MAP rebound.example 127.0.0.1") as started:
+        yield started
+
+
+class Cell:
+    """Three arms, a page's server, and pages of it."""
+
+    def __init__(self, folder: Path, chrome: Any, stack: ExitStack) -> None:
+        self.stack, self.chrome, self.folder = stack, chrome, folder
+        state = folder / "robots"
+        state.mkdir(mode=0o700)
+        own = folder / "server"
+        own.mkdir(mode=0o700)
+        self.machine = Machine(own)
+        self.port = int(self.machine.environment["STRANDS_DC_PORT"])
+        self.link = loopback_config(self.port)
+        # The arms count as hardware: a caller is allowed, and its verbs are approved.
+        self.settings = {
+            "STRANDS_STATE_DIR": str(state),
+            "DEVICE_CONNECT_RPC_ALLOW": "dashboard",
+            "STRANDS_ROBOT_COMMAND_ALLOW": "execute,moveJoints,acquireControl",
+        }
+
+    def serve_arms(self, *names: str, **settings: str) -> Any:
+        """Arms in a process of their own, ready to be stopped."""
+        arms = robots(self.link, *(names or ARMS), environment={**self.settings, **settings})
+        self.stack.callback(arms.close)
+        eventually(lambda: arms.ask("ready"), what="the robots' e-stop links")
+        return arms
+
+    def serve_page(self, *arguments: str) -> PageServer:
+        """A page's server."""
+        server = PageServer(self.machine, *arguments)
+        self.stack.callback(server.close)
+        return server
+
+    def open(self, server: PageServer, robots: int = len(ARMS), path: str = "", **options: Any) -> Any:
+        """A page of its own browser context that shows so many robots and could stop them."""
+        context = self.chrome.new_context(**options)
+        self.stack.callback(context.close)
+        page = context.new_page()
+        page.problems = []
+        page.on("pageerror", lambda error: page.problems.append(str(error)))
+        page.on("console", lambda said: page.problems.append(said.text) if said.type == "error" else None)
+        page.goto(server.url + path)
+        ready = f"document.querySelectorAll('.card').length >= {robots} && document.body.dataset.canStop === 'yes'"
+        shows(page, ready, 30.0)
+        return page
+
+
+Make = Callable[[], Cell]
+
+
+@pytest.fixture
+def cell(tmp_path: Path, chrome: Any) -> Iterator[Cell]:
+    with ExitStack() as stack:
+        yield Cell(tmp_path, chrome, stack)
