@@ -153,6 +153,8 @@ class Mesh(SensorLoopsMixin):
         self._pipeline = Pipeline.of(
             robot, lambda: peer, hardware=hardware, authorize=SenderCheck(context, hardware=hardware), own=own
         )
+        if self._pipeline.leases is not None:
+            self._pipeline.leases.attach(self._teleop)
         self._commands = CommandReceiver(
             context,
             self._pipeline,

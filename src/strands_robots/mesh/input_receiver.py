@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from functools import partial
 from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.bus_access import read_joints
+from strands_robots.contract import Haltable
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.executor import BoundedExecutor
@@ -18,11 +21,20 @@ from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, 
 from strands_robots.mesh.transport import Sample
 from strands_robots.policies.base import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
 
 ApplyFn = Callable[[Any, dict[str, float]], Any]
+
+HOLD_S = 0.5
+"""Silence of a leader, in seconds, after which its follower holds its position."""
+
+LOST_S = 2.0
+"""Silence after which the stream is closed, and the follower is free for others."""
+
+WATCH_S = 0.05
 
 AUDIT_EVERY = 100
 DEPTH = 32
@@ -67,6 +79,9 @@ class InputReceiver:
     Frames are applied one after another on a thread of the stream's own, so that a slow bus holds up neither the
     transport nor a stop; a bus slower than the leader loses the oldest frames, counted as rate-dropped.
 
+    A leader that moved the follower and falls silent for 0.5 s leaves it holding its position; after 2 s the stream is
+    closed. Neither locks.
+
     Raises:
         ValidationError: ``source_peer_id`` or ``device_name`` is no identifier.
     """
@@ -89,7 +104,9 @@ class InputReceiver:
         self._running = False
         self._permit: Permit | None = None
         self._session: str | None = None
-        self._opened = self._ended = 0.0
+        self._opened = self._ended = self._moved = 0.0
+        self._holds = False
+        self._closed = threading.Event()
         self._sequence = -1
         self._last: dict[str, tuple[float, float]] = {}
         self._seeded = False
@@ -108,6 +125,11 @@ class InputReceiver:
         return self._running and self._permit is not None and self._permit.valid
 
     @property
+    def leading(self) -> bool:
+        """True while the leader moves the follower, or has just begun."""
+        return self.running and time.monotonic() - max(self._opened, self._moved) < LOST_S
+
+    @property
     def stats(self) -> dict[str, Any]:
         """Return the counters; ``rejected`` is the sum of the ``rejected_*``."""
         running = self.running
@@ -117,6 +139,7 @@ class InputReceiver:
             "source": self._source,
             "device": self._device,
             "running": running,
+            "holding": self._holds,
             "frames_received": counts["received"],
             "errors": counts["errors"],
             "out_of_order": counts["out_of_order"],
@@ -156,6 +179,7 @@ class InputReceiver:
         """Hear no further frame; one that is being applied is not waited for."""
         if self._running:
             self._running, self._ended = False, time.monotonic()
+            self._closed.set()
             self._mesh.unsubscribe(self._name)
             if self._executor is not None:
                 self._executor.close()
@@ -198,7 +222,35 @@ class InputReceiver:
         if not self._mesh.listen(self.topic, self.on_frame, self._name):
             self._running, self._ended = False, time.monotonic()
             return "the mesh is not running"
+        self._moved, self._holds, self._closed = 0.0, False, threading.Event()
+        watch = partial(self._watch, self._closed)
+        threading.Thread(target=watch, name=f"mesh-watch-{self._device}", daemon=True).start()
         return None
+
+    def _watch(self, closed: threading.Event) -> None:
+        """Hold the follower, then close the stream, of a leader that fell silent."""
+        while not closed.wait(WATCH_S) and self.running:
+            silent = time.monotonic() - self._moved
+            if not self._moved or silent < HOLD_S:
+                continue
+            if silent >= LOST_S:
+                logger.warning("%s: the leader is silent; the stream is closed.", self.topic)
+                self._mesh.record("input_stream_lost", self._source, device=self._device, silent_s=round(silent, 2))
+                self.close()
+                return
+            if not self._holds:
+                self._holds = True
+                self._hold()
+
+    def _hold(self) -> None:
+        body = getattr(self._robot, "body", None)
+        try:
+            if callable(body):
+                body().hold(self._permit)
+            elif isinstance(self._robot, Haltable):
+                stop_executor().halt(self._robot, self._source, "its leader is silent")
+        except Exception:
+            logger.critical("%s: the follower could not hold its position.", self.topic, exc_info=True)
 
     @property
     def _name(self) -> str:
@@ -313,6 +365,7 @@ class InputReceiver:
         except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the frame counts as not applied
             answer = {"status": "error", "reason": f"{type(exc).__name__}: {exc}"}
         self._counts["received"] += 1
+        self._moved, self._holds = time.monotonic(), False
         if is_error(answer):
             self._counts["errors"] += 1
             if self._counts["errors"] <= LOGGED_ERRORS:

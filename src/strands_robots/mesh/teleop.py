@@ -60,6 +60,10 @@ class TeleopReceivers:
         with self._lock:
             return self._end(lambda key, each: True)
 
+    def leading(self) -> bool:
+        """Return True while a leader moves a robot."""
+        return any(receiver.leading for receiver in list(self._receivers.values()))
+
     def void(self) -> None:
         """Let no frame move anything from now on, because a robot is being stopped.
 

@@ -18,7 +18,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 from strands_robots.contract import RUNNING, Robot, WorldRobot, body_of
@@ -40,6 +40,9 @@ TTL_MIN_S, TTL_MAX_S, TTL_S = 0.5, 600.0, 60.0
 
 DISPLACED_MAX = 16
 """Former holders of a robot that are still told that they were displaced."""
+
+FOLLOW = "teleop_receive"
+"""The motion of a human: a leader's stream."""
 
 PURPOSE = "take-control"
 TAKE_FIELDS = frozenset({"v", "purpose", "robot", "epoch", "t", "nonce", "sig"})
@@ -202,6 +205,7 @@ class ControlLease:
         robot: its name in messages.
         halt: stops what the robot does, without a lockout.
         moving: whether it moves now; asked only while the lease of one motion is in the way, and under no lock.
+        led_by: the leader at the robot's own machine that drives it, empty without one.
         hardware: False for a simulation, which a human may take without a key where none is configured.
         clock: monotonic seconds.
         wall: wall-clock seconds, against which an assertion's age is held.
@@ -214,6 +218,7 @@ class ControlLease:
         halt: Callable[[str], object],
         moving: Callable[[], bool],
         *,
+        led_by: Callable[[], str] = lambda: "",
         hardware: bool = True,
         keys: Callable[[], Sequence[bytes]] = configured_keys,
         clock: Callable[[], float] = time.monotonic,
@@ -223,6 +228,7 @@ class ControlLease:
         self._robot = robot
         self._halt = halt
         self._moving = moving
+        self._led_by = led_by
         self._hardware = hardware
         self._keys = keys
         self._clock, self._wall, self._watched = clock, wall, watched
@@ -268,6 +274,11 @@ class ControlLease:
         """
         holder = _name(caller)
         self._settle()
+        leader = self._led_by()
+        if leader:
+            # Whoever sits at the robot must not be halted by a lease that ends.
+            text = f"acquireControl is refused: {leader} ({HUMAN}) leads it at its own machine."
+            raise NotHolderError(text, "not_holder", holder=leader, kind=HUMAN)
         with self._changing:
             lease = self._lease
             own = lease is not None and (_is(lease, lease_id) or (lease.until is None and lease.holder == holder))
@@ -336,7 +347,7 @@ class ControlLease:
             holder, lease = _name(caller), self._lease
             if lease is None:
                 # Known by its name alone; without a lease_id nobody can renew it.
-                self._lease = Lease(holder, AGENT, secrets.token_hex(16))
+                self._lease = Lease(holder, HUMAN if verb == FOLLOW else AGENT, secrets.token_hex(16))
             elif lease.until is not None or lease.holder != holder:
                 raise self._not_holder(verb, lease)
             return Admission(self._starting)
@@ -450,6 +461,16 @@ class ControlLease:
         self._observers.tell(change)
 
 
+class InputStreams(Protocol):
+    """Streams of remote leaders, which move the first robot of a world."""
+
+    def leading(self) -> bool:
+        """Return True while a leader moves the robot."""
+
+    def void(self) -> None:
+        """Let no frame move the robot from now on; wait for nothing."""
+
+
 class ControlLeases:
     """The leases of one robot, one for each robot of a world.
 
@@ -462,6 +483,11 @@ class ControlLeases:
         self._by_name: dict[str, ControlLease] = {}
         self._changing = threading.Lock()
         self._observers = _Observers()
+        self._streams: weakref.WeakSet[InputStreams] = weakref.WeakSet()
+
+    def attach(self, streams: InputStreams) -> None:
+        """Count the motions of these streams as long as they live."""
+        self._streams.add(streams)
 
     def only(self, name: str) -> ControlLeases:
         """Return the same leases, for a network peer that is one robot of the world."""
@@ -492,6 +518,7 @@ class ControlLeases:
                     shown_as,
                     lambda reason: self._halt(name, reason),
                     lambda: self._moves(name),
+                    led_by=lambda: self._led_by(name),
                     hardware=self._hardware,
                 )
                 lease.observe(self._observers.tell)
@@ -519,7 +546,20 @@ class ControlLeases:
     def _robot(self) -> Robot | None:
         return next((robot for each in self._served if (robot := each()) is not None), None)
 
+    def _streams_of(self, name: str) -> list[InputStreams]:
+        robot = self._robot()
+        first = next(iter(robot.list_robots()), "") if isinstance(robot, WorldRobot) else name
+        return list(self._streams) if name == first else []
+
+    def _led_by(self, name: str) -> str:
+        """Return the leader at this machine that drives the robot, empty without one."""
+        robot = self._robot()
+        led = getattr(body_of(robot), "teleoperated_by", None)
+        return str(led(name or getattr(robot, "tool_name_str", ""))) if callable(led) else ""
+
     def _moves(self, name: str) -> bool:
+        if any(each.leading() for each in self._streams_of(name)):
+            return True
         robot = self._robot()
         if isinstance(robot, WorldRobot):
             return any(row.get("robot") == name for row in robot.list_policies_running())
@@ -528,6 +568,8 @@ class ControlLeases:
         return callable(status) and str(status().get("task_status", "")).lower() in RUNNING
 
     def _halt(self, name: str, reason: str) -> None:
+        for each in self._streams_of(name):
+            each.void()
         robot = self._robot()
         if isinstance(robot, WorldRobot):
             robot.stop_policy(name)

@@ -112,8 +112,9 @@ PEER_VERBS = table(
             WORLD_VERBS["step"].summary,
             (_optional("steps", int, "Physics steps to take, 1 to 10000", between(1, 10_000)),),
             run=step_world,
+            of_world=True,
         ),
-        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=reset_world),
+        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=reset_world, of_world=True),
         _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream."),
         _peer_verb("teleop_receive", Kind.MOTION, "Follow a leader's input stream.", (_SOURCE, _DEVICE)),
         _peer_verb(

@@ -264,7 +264,7 @@ class Pipeline:
         lease_id = arguments.pop(LEASE_ID, "") or "" if verb.leased else ""
         if leases is None or not verb.leased:
             return Admission()
-        name = arguments.get("robot_name", "") if "robot_name" in verb.by_name else None
+        name = None if verb.of_world else arguments.get("robot_name", "")
         try:
             return leases.admit(verb.name, command.caller, lease_id, name)
         except NotHolderError as exc:

@@ -382,6 +382,7 @@ WORLD_VERBS = table(
             returns="sim_time, step_count",
             run=step_world,
             critical=False,
+            of_world=True,
         ),
         Verb(
             "reset",
@@ -389,6 +390,7 @@ WORLD_VERBS = table(
             "Halt everything and put the world back to its initial state.",
             run=reset_world,
             critical=False,
+            of_world=True,
         ),
         *WORLD_MOTION_VERBS.values(),
         *PICTURE_VERBS.values(),

@@ -86,6 +86,7 @@ class Verb:
         urgent: it takes energy away, and waits for no read and no motion.
         while_locked: it works under a lockout; caller and operator are asked as for any motion.
         instead: the verb that a locked robot offers in the place of this one.
+        of_world: a motion of all robots of a world; any other is of one, the first where none is named.
         on_lease: a verb of the control lease; its ``run`` gets ``caller``, ``robot`` and ``leases`` besides.
     """
 
@@ -103,6 +104,7 @@ class Verb:
     while_locked: bool = False
     instead: str = ""
     on_lease: bool = False
+    of_world: bool = False
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -1,0 +1,133 @@
+"""An agent and a teleoperator at one robot: one moves it, the other is refused by name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet
+
+from strands_robots.mesh.core import Mesh
+from strands_robots.mesh.input import InputPublisher
+from strands_robots.mesh.input_receiver import HOLD_S, LOST_S
+from strands_robots.serving.control import leases_of
+from strands_robots.simulation import Simulation
+
+
+class Leader:
+    """A teleoperator whose shoulder goes to and fro."""
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def get_action(self) -> dict[str, float]:
+        self.reads += 1
+        return {"shoulder_pan": (self.reads % 20) / 100}
+
+
+class Cell:
+    """A simulated arm, an agent, and a leader with its publisher."""
+
+    def __init__(self, peers: Fleet) -> None:
+        self.world = Simulation()
+        assert self.world.add_robot("arm", "so100")["status"] == "success"
+        self.robot = peers.join(self.world, "sim-1", "sim")
+        self.agent, self.lead = peers.join(None, "agent"), peers.join(None, "lead")
+        self.publisher = InputPublisher(self.lead, Leader(), hz=50)
+
+    def ask(self, peer: Mesh, action: str, **arguments: Any) -> dict[str, Any]:
+        reply = peer.send("sim-1", {"action": action, **arguments}, timeout=20)
+        return reply.get("result") or reply
+
+    def follow(self) -> dict[str, Any]:
+        return self.ask(self.lead, "teleop_receive", source_peer_id="lead")
+
+    def stream(self) -> dict[str, Any]:
+        [row] = self.ask(self.agent, "teleop_status")["streams"]
+        return dict(row)
+
+    def begin(self) -> None:
+        assert self.follow()["status"] == "success"
+        self.publisher.start()
+        eventually(lambda: self.stream()["frames_received"] > 10, what="frames")
+
+    def close(self) -> None:
+        self.publisher.stop()
+        self.world.cleanup()
+
+
+@pytest.fixture
+def cell(peers: Fleet) -> Iterator[Cell]:
+    made = Cell(peers)
+    yield made
+    made.close()
+
+
+def test_teleoperator_is_refused_while_an_agent_holds_the_robot(cell: Cell) -> None:
+    held = cell.ask(cell.agent, "acquireControl")
+    refused = cell.follow()
+    assert "agent (agent) holds control" in str(refused)
+    assert cell.ask(cell.agent, "releaseControl", lease_id=held["lease_id"])["status"] == "success"
+    cell.begin()
+
+
+def test_agent_is_refused_while_a_teleoperator_leads_and_free_after_it_fell_silent(cell: Cell) -> None:
+    cell.begin()
+    assert "lead (human) holds control" in str(cell.ask(cell.agent, "moveJoints", joints={"shoulder_pan": 5.0}))
+    assert "lead (human) holds control" in str(cell.ask(cell.agent, "acquireControl"))
+    # As a leader that crashed: no frame follows, and nobody closes the stream.
+    cell.publisher.stop()
+    eventually(lambda: cell.ask(cell.agent, "acquireControl", ttl_s=0.5).get("status") == "success", what="a free robot")
+    assert cell.ask(cell.agent, "status")["status"] == "success"
+    assert cell.robot.lockout_epoch is None
+
+
+def test_follower_of_a_silent_leader_holds_after_half_a_second_and_is_let_go_after_two(cell: Cell) -> None:
+    cell.begin()
+    cell.publisher.stop()
+    silent = time.monotonic()
+    eventually(lambda: cell.stream()["holding"], what="the hold")
+    held = time.monotonic() - silent
+    assert HOLD_S - 0.1 <= held < LOST_S - 0.5
+    targets = cell.world.body("arm").targets
+    where = cell.world.body("arm").get_joints()
+    assert targets["shoulder_pan"] == pytest.approx(where["shoulder_pan"], abs=0.05)
+    eventually(lambda: not cell.stream()["running"], what="the end of the stream")
+    assert cell.world.gate.refusal("motion") is None
+
+
+def test_leader_that_pauses_for_less_than_two_seconds_leads_on(cell: Cell) -> None:
+    cell.begin()
+    cell.publisher.stop()
+    eventually(lambda: cell.stream()["holding"], what="the hold")
+    again = InputPublisher(cell.lead, Leader(), hz=50)
+    again.start()
+    eventually(lambda: not cell.stream()["holding"], what="frames again")
+    assert cell.stream()["running"]
+    again.stop()
+
+
+def test_takeover_ends_the_stream_of_the_teleoperator_before_its_answer(cell: Cell) -> None:
+    cell.begin()
+    taken = cell.ask(cell.agent, "takeControl", reason="a hand in the way")
+    received = cell.stream()["frames_received"]
+    assert taken["status"] == "success"
+    assert not cell.stream()["running"]
+    targets = cell.world.body("arm").targets
+    time.sleep(0.2)  # ten frames of the leader, none of which may count
+    assert cell.stream()["frames_received"] == received
+    assert cell.ask(cell.agent, "releaseControl", lease_id=taken["lease_id"])["status"] == "success"
+    assert cell.world.body("arm").targets == targets
+
+
+def test_agent_gets_no_lease_of_a_robot_that_is_led_at_its_own_machine(cell: Cell) -> None:
+    assert cell.world.attach_teleop(Leader(), "joystick")["status"] == "success"
+    assert cell.world.teleoperate("joystick")["status"] == "success"
+    refused = cell.ask(cell.agent, "acquireControl")
+    assert "joystick (human) leads it" in str(refused)
+    assert cell.world.stop_teleoperate()["stopped"] is True
+    assert cell.ask(cell.agent, "acquireControl", ttl_s=0.5)["status"] == "success"
+    assert leases_of(cell.world, hardware=False).of().facts()["holder"] == "agent"
