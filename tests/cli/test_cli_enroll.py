@@ -46,11 +46,11 @@ class SigningFleet:
         if function == "resume":
             self.locked = False
         rows = [{"epoch": EPOCH, "source": "desk", "reason": "", "since": 0.0}] if self.locked else []
-        fields = {"locked": self.locked, "epochs": [each["epoch"] for each in rows]}
+        fields = {"locked": self.locked, "epochs": [each["epoch"] for each in rows], **params}
         purpose = Purpose.LOCKOUT_STATE
         if function == "resume":
             purpose = Purpose.RESUME_ANSWER
-            fields |= {"status": "success", "nonce": params["assertion"]["nonce"]}
+            fields = {"locked": self.locked, "status": "success", "nonce": params["assertion"]["nonce"]}
         statement = signed(self.identity, purpose, device, {**fields, **self.signs})
         return success("done", locked=self.locked, lockout=rows, statement=statement)
 
@@ -115,6 +115,7 @@ def test_a_robot_without_a_key_is_named_and_not_enrolled(run: Run, fleet: Signin
     [
         ("robot", {"locked": False}, "ALARM: its answer says something else than its signed part"),
         ("robot", {"epochs": []}, "ALARM: its answer says something else than its signed part"),
+        ("robot", {"nonce": "b" * 32}, "ALARM: its answer says something else than its signed part"),
         ("stranger", {}, "ALARM: its answer has a signature"),
         ("", {}, "only claimed"),
     ],
@@ -139,14 +140,39 @@ def test_a_lockout_state_that_is_not_the_robots_own_is_not_shown(
 
 def test_a_recorded_lockout_state_is_not_shown(run: Run, fleet: SigningFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     run("enroll")
-    recorded = fleet.call("arm-1", "getStatus", {}, 1.0)
-    monkeypatch.setattr(fleet, "call", lambda *called: recorded)
+    asked: list[dict[str, Any]] = []
+    answer = fleet.call
+
+    def recording(device: str, function: str, params: dict[str, Any], timeout: float) -> Envelope:
+        asked.append(params)
+        return answer(device, function, params, timeout)
+
+    monkeypatch.setattr(fleet, "call", recording)
     assert EPOCH in run("lockout").stdout
-    now = time.time() + 120
+    recorded = answer("arm-1", "getStatus", asked[-1], 1.0)
+    monkeypatch.setattr(fleet, "call", lambda *called: recorded)
+    told = run("lockout")
+    assert EPOCH not in told.stdout
+    assert "ALARM: its answer says something else than its signed part" in told.stdout
+
+
+def test_a_signed_lockout_state_of_another_time_is_not_shown(
+    run: Run, fleet: SigningFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run("enroll")
+    now = time.time() + 2 * statements.STATED_WITHIN_S
     monkeypatch.setattr(statements, "time", SimpleNamespace(time=lambda: now))
-    result = run("lockout")
-    assert "not of this minute" in result.stdout
-    assert EPOCH not in result.stdout
+    answer = fleet.call
+
+    def of_another_time(*called: Any) -> Envelope:
+        with monkeypatch.context() as then:
+            then.setattr(statements, "time", time)
+            return answer(*called)
+
+    monkeypatch.setattr(fleet, "call", of_another_time)
+    told = run("lockout")
+    assert EPOCH not in told.stdout
+    assert "not of this minute" in told.stdout
 
 
 def test_only_the_robot_itself_says_that_it_was_resumed(

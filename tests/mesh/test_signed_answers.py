@@ -93,6 +93,20 @@ def test_lockout_state_of_an_enrolled_peer_needs_its_signature(peers: Fleet) -> 
     assert asked().lockouts == ()
 
 
+def test_recorded_status_is_no_answer_to_a_later_question(peers: Fleet) -> None:
+    peers.join(Arm(), "arm-1")
+    console = peers.join(None, "console")
+    enroll("arm-1")
+    keys = EnrolledKeys().load()
+    nonces = [new_epoch(), new_epoch()]
+    answers = [console.send("arm-1", {"action": "status", "nonce": each}, 20)["result"] for each in nonces]
+    proven = [lockout_distrust("arm-1", answers[n], [], keys, nonces[n]) for n in range(2)]
+    assert proven == ["", ""]
+    assert "ALARM" in lockout_distrust("arm-1", answers[0], [], keys, nonces[1])
+    plain = console.send("arm-1", {"action": "status"}, 20)["result"]
+    assert "ALARM" in lockout_distrust("arm-1", plain, [], keys, nonces[1])
+
+
 def test_announced_lockout_state_is_signed_in_presence_and_in_state(peers: Fleet) -> None:
     arm = peers.join(Arm(), "arm-1")
     states = received(peers, topics.state("arm-1"))

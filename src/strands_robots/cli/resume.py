@@ -23,6 +23,7 @@ from strands_robots.safety.approval import GRANT_S, Grants, state_dir
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.lockout import OVERFLOW, Lockout, utc
+from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
 from strands_robots.safety.statements import Purpose, distrust
@@ -217,21 +218,28 @@ def _enrolled(fleet: FleetClient) -> dict[str, bytes]:
 
 
 def _ask(fleet: FleetClient, name: str, seconds: float, key: bytes | None) -> LockoutReport:
-    began = time.monotonic()
+    began, asked = time.monotonic(), {} if key is None else {"nonce": new_epoch()}
     try:
-        answer = call_device(fleet, name, "getStatus", {}, seconds)
+        answer = call_device(fleet, name, "getStatus", asked, seconds)
     except CliError as failure:
         return LockoutReport(name, problem=failure.reason)
-    return status_report(name, answer, (time.monotonic() - began) * 1000, key)
+    return status_report(name, answer, (time.monotonic() - began) * 1000, key, asked)
 
 
-def status_report(name: str, answer: Mapping[str, Any], took_ms: float, key: bytes | None) -> LockoutReport:
-    """Return the lockouts in an answer to getStatus; ``key`` is the enrolled one."""
+def status_report(
+    name: str, answer: Mapping[str, Any], took_ms: float, key: bytes | None, asked: Mapping[str, str]
+) -> LockoutReport:
+    """Return the lockouts in an answer to getStatus.
+
+    Args:
+        key: the enrolled one, or None.
+        asked: the arguments of the question, its nonce where the robot is enrolled.
+    """
     if "locked" not in answer:
         return LockoutReport(name, problem="it does not report lockouts", facts=answer, round_trip_ms=took_ms)
     rows = answer.get("lockout")
     lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping)) if isinstance(rows, list) else ()
-    stated = {"locked": answer["locked"], "epochs": [each.epoch for each in lockouts]}
+    stated = {"locked": answer["locked"], "epochs": [each.epoch for each in lockouts], **asked}
     problem = distrust(Purpose.LOCKOUT_STATE, name, answer.get("statement"), key, stated)
     return LockoutReport(name, () if problem else lockouts, problem, answer, took_ms)
 

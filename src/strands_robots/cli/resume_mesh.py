@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.safety.lockout import OVERFLOW, Lockout
-from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust, resume_distrust
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.peer_answers import enrolled_key, enrolled_peers, lockout_distrust, resume_distrust
 from strands_robots.safety.resume import sign
 from strands_robots.utils import shown
 
@@ -94,7 +95,8 @@ def _outcome(before: tuple[Lockout, ...], left: tuple[Lockout, ...] | None, said
 
 def _ask(mesh: Mesh, name: str, seconds: float, keys: Mapping[str, bytes] | None) -> LockoutReport:
     began = time.monotonic()
-    reply = mesh.send(name, {"action": "status"}, seconds)
+    nonce = new_epoch() if keys and enrolled_key(name, keys) else ""
+    reply = mesh.send(name, {"action": "status", **({"nonce": nonce} if nonce else {})}, seconds)
     took_ms = (time.monotonic() - began) * 1000
     result = reply.get("result")
     if reply.get("type") != "response" or not isinstance(result, Mapping):
@@ -103,7 +105,7 @@ def _ask(mesh: Mesh, name: str, seconds: float, keys: Mapping[str, bytes] | None
     if not isinstance(rows, list):
         return LockoutReport(name, problem="it does not report lockouts", facts=result, round_trip_ms=took_ms)
     lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping))
-    distrusted = lockout_distrust(name, result, [each.epoch for each in lockouts], keys)
+    distrusted = lockout_distrust(name, result, [each.epoch for each in lockouts], keys, nonce)
     problem = distrusted or str(result.get("estop_unheard", ""))
     return LockoutReport(name, () if distrusted else lockouts, problem, result, took_ms)
 

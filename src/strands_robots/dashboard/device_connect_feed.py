@@ -24,6 +24,7 @@ from strands_robots.device_connect.enrollment import enrolled_robots
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.safety.identity import KeyFileError
+from strands_robots.safety.orders import new_epoch
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
@@ -171,9 +172,11 @@ class DeviceConnectFeed:
 
     async def _ask(self, name: str, limit: asyncio.Semaphore) -> None:
         async with limit:
-            began = time.monotonic()
+            self._load_keys()
+            key, began = self._keys.get(name), time.monotonic()
+            asked = {} if key is None else {"nonce": new_epoch()}
             try:
-                answer = await self._fleet.call_async(name, "getStatus", {}, ASK_S)
+                answer = await self._fleet.call_async(name, "getStatus", asked, ASK_S)
             except (LookupError, TimeoutError, RuntimeError, MessagingError, ValidationError):
                 # A robot that does not answer is shown by the age of what it said last.
                 return
@@ -182,8 +185,7 @@ class DeviceConnectFeed:
         if self._model.row(key_of(self.network, name)) is None:
             self._names.discard(name)
             return
-        self._load_keys()
-        report = status_report(name, answer, took_ms, self._keys.get(name))
+        report = status_report(name, answer, took_ms, key, asked)
         if not self._keys_usable:
             self._model.update(self.network, name, locked=None, doubt="the enrolled keys cannot be used")
         else:

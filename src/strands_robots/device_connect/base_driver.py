@@ -229,7 +229,7 @@ class RobotDriver(CollectedOnce):
         answer = verb.run(self.robot, arguments) if verb.run is not None else getattr(self.robot, verb.method)()
         if not isinstance(answer, dict):
             return answer
-        lockouts = {} if self.registration is None else self.registration.facts()
+        lockouts = {} if self.registration is None else self.registration.facts(arguments.get("nonce", ""))
         control = {} if self.pipeline.leases is None else {"control": self.pipeline.leases.facts()}
         return {**answer, **lockouts, **control}
 

@@ -105,11 +105,15 @@ class SafetyRegistration:
         fields = {"status": answer["status"], "nonce": nonce if is_epoch(nonce) else "", **self._lock_fields()}
         return {**answer, "statement": signed(self.identity, Purpose.RESUME_ANSWER, self.device_id, fields)}
 
-    def facts(self) -> dict[str, Any]:
-        """Return the lockouts and the check-in of the robot, for ``getStatus``."""
+    def facts(self, nonce: str = "") -> dict[str, Any]:
+        """Return the lockouts and the check-in of the robot, for ``getStatus``.
+
+        Args:
+            nonce: of the question; the signed part repeats it.
+        """
         lockouts = self.entry.latch.state.all
         check_in = plane().checkin.fields(time.monotonic())
-        fields = {**self._lock_fields(), "check_in": check_in}
+        fields = {**self._lock_fields(), "check_in": check_in, **({"nonce": nonce} if nonce else {})}
         return {
             "locked": bool(lockouts),
             "lockout": [each.fields() for each in lockouts],

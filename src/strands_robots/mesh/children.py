@@ -138,7 +138,8 @@ class Children:
         context: the parent's.
         pipeline: the parent's, whose threads and pending commands the children share.
         kind: the parent's type.
-        safety: returns, for a child's id, the parent's lockout, which holds it as well; ``report`` returns all of it.
+        safety: returns, for a child's id, the parent's lockout, which holds it as well; ``report`` returns all of it,
+            for a nonce.
         own: returns, for a child's id, the verbs that the parent answers for it.
         teleop: the parent's input streams, which may drive any of the robots.
         audit: makes the audit of a child.
@@ -153,7 +154,7 @@ class Children:
         *,
         kind: str,
         safety: Callable[[str], Mapping[str, Any]],
-        report: Callable[[str], Mapping[str, Any]],
+        report: Callable[[str, str], Mapping[str, Any]],
         own: Callable[[str], Mapping[str, Own]],
         teleop: TeleopReceivers,
         audit: Callable[[str], AuditThrottle],

@@ -148,7 +148,7 @@ class Mesh(SensorLoopsMixin):
             "resume": self._resume_of(peer),
         }
         if robot is not None:
-            own["status"] = status_of(robot, lambda: {**self._adapter.report(), **self._hearing.facts()})
+            own["status"] = status_of(robot, lambda nonce: {**self._adapter.report("", nonce), **self._hearing.facts()})
             own["execute"] = execute_on(robot, context, lambda: self._pipeline.closed)
         self._pipeline = Pipeline.of(
             robot, lambda: peer, hardware=hardware, authorize=SenderCheck(context, hardware=hardware), own=own

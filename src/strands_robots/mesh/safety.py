@@ -144,10 +144,10 @@ class SafetyAdapter:
         """Return each lockout with its source, reason and time."""
         return [each.fields() for each in self._entry.latch.state.all] if self._entry is not None else []
 
-    def report(self, peer_id: str = "") -> dict[str, Any]:
+    def report(self, peer_id: str = "", nonce: str = "") -> dict[str, Any]:
         """Return lockouts and check-in; of a robot of its world by its id."""
         check_in = self._plane.checkin.fields(time.monotonic())
-        facts = with_lockout_statement(self.identity, peer_id or self._peer_id, self.facts())
+        facts = with_lockout_statement(self.identity, peer_id or self._peer_id, self.facts(), nonce)
         return {**facts, "lockout": self.lockouts(), "check_in": check_in}
 
     def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
@@ -224,13 +224,17 @@ class SafetyAdapter:
             entry.close()
 
 
-def status_of(robot: Robot, facts: Callable[[], Mapping[str, Any]]) -> Own:
-    """Make the ``status`` of a peer: what the robot answers, with the safety facts."""
+def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
+    """Make the ``status`` of a peer: what the robot answers, with the safety facts.
+
+    Args:
+        facts: returns them for the nonce of the question.
+    """
 
     def status(arguments: Arguments) -> object:
         run = PEER_VERBS["status"].run
         answer = run(robot, arguments) if run is not None else None
-        return {**answer, **facts()} if isinstance(answer, Mapping) else answer
+        return {**answer, **facts(arguments.get("nonce", ""))} if isinstance(answer, Mapping) else answer
 
     return status
 

@@ -34,11 +34,18 @@ def with_stop_statement(
     return {**result, "statement": statement}
 
 
-def with_lockout_statement(identity: SigningIdentity | None, peer_id: str, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``locked`` and ``epochs`` with their signed part, if there is a key."""
+def with_lockout_statement(
+    identity: SigningIdentity | None, peer_id: str, facts: Mapping[str, Any], nonce: str = ""
+) -> dict[str, Any]:
+    """Return ``locked`` and ``epochs`` with their signed part, if there is a key.
+
+    Args:
+        nonce: of the question, so that a recorded answer fits no other one.
+    """
     if identity is None:
         return dict(facts)
     fields = {"device_id": peer_id, "locked": facts["locked"], "epochs": facts["epochs"]}
+    fields |= {"nonce": nonce} if nonce else {}
     return {**facts, "statement": signed(identity, Purpose.LOCKOUT_STATE, peer_id, fields)}
 
 
@@ -101,7 +108,7 @@ def stop_distrust(reply: Mapping[str, Any], keys: Mapping[str, bytes] | None) ->
     name, result = str(reply.get("responder_id")), reply.get("result")
     answer = result if isinstance(result, Mapping) else {}
     answered = {"turn_id": reply.get("turn_id"), **_stated(answer)}
-    return distrust(Purpose.STOP_VERDICT, name, answer.get("statement"), _key_of(name, keys), answered)
+    return distrust(Purpose.STOP_VERDICT, name, answer.get("statement"), enrolled_key(name, keys), answered)
 
 
 def record_heads(witness: str, replies: Iterable[Mapping[str, Any]], expected: Collection[str]) -> None:
@@ -115,19 +122,21 @@ def record_heads(witness: str, replies: Iterable[Mapping[str, Any]], expected: C
     for reply in replies:
         name, result = str(reply.get("responder_id")), reply.get("result")
         statement = result.get("statement") if isinstance(result, Mapping) else None
-        key = _key_of(name, keys)
+        key = enrolled_key(name, keys)
         if isinstance(statement, Mapping) and (key is not None or name in expected):
             proof = proof_of(Purpose.STOP_VERDICT, name, statement, key)
             if proof is not Proof.WRONG:
                 log_witness(witness, name, statement.get("audit"), signed=proof is Proof.SIGNED)
 
 
-def lockout_distrust(name: str, facts: Mapping[str, Any], epochs: list[str], keys: Mapping[str, bytes] | None) -> str:
+def lockout_distrust(
+    name: str, facts: Mapping[str, Any], epochs: list[str], keys: Mapping[str, bytes] | None, nonce: str = ""
+) -> str:
     """Return the reason why a lockout state is not proven, or ""."""
     if keys is None:
         return UNUSABLE
-    answered = {"locked": facts.get("locked"), "epochs": epochs}
-    return distrust(Purpose.LOCKOUT_STATE, name, facts.get("statement"), _key_of(name, keys), answered)
+    answered = {"locked": facts.get("locked"), "epochs": epochs} | ({"nonce": nonce} if nonce else {})
+    return distrust(Purpose.LOCKOUT_STATE, name, facts.get("statement"), enrolled_key(name, keys), answered)
 
 
 def resume_distrust(
@@ -137,10 +146,10 @@ def resume_distrust(
     if keys is None:
         return UNUSABLE
     answered = {"nonce": _nonce_of(assertion), "status": result.get("status")}
-    return distrust(Purpose.RESUME_ANSWER, name, result.get("statement"), _key_of(name, keys), answered)
+    return distrust(Purpose.RESUME_ANSWER, name, result.get("statement"), enrolled_key(name, keys), answered)
 
 
-def _key_of(name: str, keys: Mapping[str, bytes]) -> bytes | None:
+def enrolled_key(name: str, keys: Mapping[str, bytes]) -> bytes | None:
     """Return the enrolled key of a peer; a robot of a world has the world's."""
     return keys.get(name) or keys.get(name.rpartition("__")[0])
 

@@ -33,6 +33,7 @@ from strands_robots.serving.verbs import (
     DURATION,
     INSTRUCTION,
     MOTOR_IDS,
+    NONCE,
     POLICY_PROVIDER,
     REQUIRED,
     RESUME,
@@ -100,7 +101,7 @@ _REACHY = tuple(_of_reachy(verb) for verb in REACHY_VERBS.values() if verb.run a
 
 PEER_VERBS = table(
     [
-        _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", run=status),
+        _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", (NONCE,), run=status),
         _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
         _peer_verb("features", Kind.READ, GET_FEATURES.summary, method="get_features"),
         _peer_verb("state", Kind.READ, GET_STATE.summary, method="get_state"),

@@ -13,6 +13,7 @@ from strands_robots.drivers.reachy.target import HeadPose, Target, bounded
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.verbs import (
+    NONCE,
     RESUME,
     Arguments,
     Check,
@@ -177,6 +178,7 @@ REACHY_VERBS = table(
             "getStatus",
             "Read link, daemon state, version, motor mode, application, data age, motion, its outcome and lockouts.",
             lambda reachy, _: reachy.get_task_status(),
+            NONCE,
         ),
         _read(
             "getDaemonStatus",

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, text, whole
+from strands_robots.safety.resume import is_epoch
+from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, shown, text, whole
 
 Arguments = Mapping[str, Any]
 """Checked arguments, by parameter."""
@@ -69,6 +70,18 @@ _LEASE_ID = Parameter(
     lambda name, value: text(name, value, longest=LEASE_ID_MAX, empty=True),
     default="",
 )
+
+
+def _nonce(name: str, value: object) -> str:
+    if value == "" or is_epoch(value):
+        return str(value)
+    raise ValidationError(f"{name} must be 32 hex digits, or empty, not {shown(value)}.")
+
+
+NONCE = Parameter(
+    "nonce", str, "32 hex digits, fresh, that the signed part of the answer repeats; empty for none", _nonce, default=""
+)
+"""Of the read that shows lockouts: an answer that was recorded before fits no other question."""
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,10 @@ def test_a_stop_halts_locks_and_is_answered_and_a_signed_resume_frees_without_mo
         assert refused["status"] == "error"
         assert report.estop_id in refused["reason"]
         assert "safety-1" in refused["reason"]
-        status = floor.agent.call(device, "getStatus")
+        nonce = new_epoch()
+        status = floor.agent.call(device, "getStatus", {"nonce": nonce})
+        assert status["statement"]["nonce"] == nonce
+        assert floor.agent.call(device, "getStatus", {"nonce": "of old"})["status"] == "error"
         assert status["status"] == "success"
         assert status["locked"] is True
         assert status["lockout"][0]["epoch"] == report.estop_id
