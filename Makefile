@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 REAL_ARM := .venv-lerobot/bin
 MODELS := .venv-models/bin
+POLICIES := .venv-policies/bin
 DDS_SECURITY := .venv-dds-security/bin
 DDS_TESTS := tests/integration/ros/test_dds.py tests/integration/ros/test_dds_security.py \
   tests/integration/ros/test_rtps_bridge.py tests/ros/test_dds_types.py tests/ros/test_dds_security.py
@@ -71,6 +72,10 @@ real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot
 models:  ## The models of four other projects in a world of ours, in .venv-models, and their test
 	@./scripts/models.sh
 	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
+
+lerobot:  ## LeRobot 0.4.4 with torch, in .venv-policies, and the tests of policies that are computed here
+	@./scripts/lerobot.sh
+	@$(POLICIES)/python -m pytest tests/integration/policies $(ARGS)
 
 real-arm-next:  ## The same on LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-lerobot-0.6.1
 	@./scripts/real-arm.sh 0.6.1

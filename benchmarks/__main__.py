@@ -25,6 +25,7 @@ PARTS = {
     "cli": "Commands from prompt to prompt",
     "device": "Bring-up, import and fleets in one process",
     "fleet": "Hundreds of devices",
+    "policies": "Trained policies",
     "simulation": "Physics",
     "reach": "Arms that reach and grasp",
     "safety": "From the controller's call to the last write",

@@ -133,7 +133,8 @@ def train(dataset: LeRobotDataset, folder: Path, steps: int) -> None:
 def profiles(file: Path, checkpoint: Path, dataset: Path, url: str) -> None:
     """Describe the policy twice: computed in this process, and by a server."""
     joints, target = str(list(JOINTS)).replace("'", '"'), str(list(TARGET)).replace("'", '"')
-    both = f'action = {joints}\nunits = "radians"\nrate = {FPS}\nhorizon = 10\nmax_speed = 1.0\n'
+    units = 'units = { default = "radians", "target.x" = "metres", "target.y" = "metres", "target.z" = "metres" }'
+    both = f"action = {joints}\n{units}\nrate = {FPS}\nhorizon = 10\nmax_speed = 1.0\n"
     file.write_text(
         f'[reach-act]\nprovider = "lerobot_local"\ncheckpoint = "{checkpoint}"\ndataset = "{dataset}"\n'
         f"state = {joints}\nenvironment = {target}\n{both}\n"

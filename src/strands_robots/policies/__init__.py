@@ -96,12 +96,13 @@ def _profiled(profile: Profile) -> Policy:
     """Make the policy of a profile, with the options that its provider takes."""
     from strands_robots.policies.profiled import ProfiledPolicy  # noqa: PLC0415 - loaded where profiles are used
 
-    if profile.provider not in provider_names():
+    provider = ALIASES.get(profile.provider, profile.provider)
+    if provider not in provider_names():
         known = ", ".join(provider_names())
         raise ValidationError(
             f"profile {profile.name}: provider must be one of {known}, not {shown(profile.provider)}."
         )
-    factory, address = policy_factory(profile.provider), urlsplit(profile.url)
+    factory, address = policy_factory(provider), urlsplit(profile.url)
     offered: dict[str, Any] = {
         "profile": profile,
         "pretrained_name_or_path": profile.checkpoint,
