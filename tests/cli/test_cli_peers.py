@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import json
+import re
+import time
+from dataclasses import replace
 
 import pytest
 from tests.cli.conftest import FakeFleet, Run
@@ -27,6 +30,14 @@ def test_peers_are_listed_as_table_and_as_json(run: Run, fleet: FakeFleet) -> No
     assert "instruction: string" in output
     assert "Start a policy." in output
     assert "And more" not in output
+
+
+def test_peers_show_the_age_of_the_last_sign_of_life(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [replace(arm(), heard_at=time.monotonic() - 3600.0), arm("arm-2")]
+    late, listed = (line for line in run("peers").stdout.splitlines() if "arm-" in line)
+    assert re.search(r" 36\d\d\.\d s ", late) and "only listed" in listed
+    ages = [peer["age_s"] for peer in json.loads(run("peers", "--json").stdout)["peers"]]
+    assert 3600.0 <= ages[0] < 3700.0 and ages[1] is None
 
 
 def test_peer_text_cannot_control_the_terminal(run: Run, fleet: FakeFleet) -> None:

@@ -11,6 +11,7 @@ from tests.cli.conftest import FakeFleet, Run
 from strands_robots.cli.output import Exit
 from strands_robots.cli.stop import exit_code, progress_rows, report_rows, summary
 from strands_robots.device_connect import safety_controller
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
@@ -144,3 +145,11 @@ def test_stop_takes_a_device_or_all(run: Run, fleet: FakeFleet, arguments: tuple
 )
 def test_only_an_affirmative_answer_is_a_stop(answer: Envelope, stopped: bool | None) -> None:
     assert stop_outcome(answer)[0] is stopped
+
+
+def test_stop_of_an_unknown_device_names_the_near_ones(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [Peer("arm-1"), Peer("rover")]
+    fleet.stops = {"amr-1": error("No device 'amr-1' in tenant 'default'.", stopped=None)}
+    result = run("stop", "amr-1")
+    assert result.exit_code == 3
+    assert "Near it: arm-1." in result.stderr

@@ -167,14 +167,19 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
     try:
         return fleet.call(device, function, params, seconds)
     except NoSuchDeviceError as exc:
-        near = _near(device, [peer.id for peer in fleet.peers(1.0)])
-        raise CliError(plain(f"{exc.args[0]}{near}", 2000), Exit.SILENT) from exc
+        raise CliError(plain(f"{exc.args[0]}{near_devices(fleet, device)}", 2000), Exit.SILENT) from exc
     except DeviceTimeoutError as exc:
         raise CliError(plain(exc.args[0], 2000), Exit.SILENT) from exc
     except CallRefusedError as exc:
         known = [peer.functions for peer in fleet.peers(1.0) if peer.id == device] if exc.code == NO_METHOD else []
         near = _near(function, [str(each.get("name", "")) for functions in known for each in functions])
         raise CliError(plain(f"{exc}{near}", 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+
+
+def near_devices(fleet: FleetClient, device: str) -> str:
+    """Return a sentence with the ids that resemble one that is not there, else empty."""
+    names = [peer.id for peer in fleet.peers(1.0)]
+    return "" if device in names else _near(device, names)
 
 
 def _near(wanted: str, names: list[str]) -> str:

@@ -33,6 +33,9 @@ WIDE = 4096
 PANEL_WIDTH = 100
 """Columns of a panel there."""
 
+LATE_S = 2.0
+"""Age in seconds of a robot's last sign of life that is shown in red: our robots give one a second."""
+
 LOG_LINES = 5
 POLL_S = 0.05
 

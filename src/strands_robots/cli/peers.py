@@ -8,10 +8,11 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe
-from strands_robots.cli.output import CliError, Exit, Screen, first_line, plain, table
+from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, first_line, label, plain, table
 from strands_robots.envelope import is_error, text_of
 from strands_robots.utils import WAIT_S, number
 
@@ -56,10 +57,17 @@ def peers(
         _show_functions(screen, found[0])
         return
     rows = (
-        (peer.id, peer.type, peer.model, peer.status.get("availability", ""), ", ".join(_function_names(peer)))
+        (
+            peer.id,
+            peer.type,
+            peer.model,
+            peer.status.get("availability", ""),
+            _age(peer),
+            ", ".join(_function_names(peer)),
+        )
         for peer in found
     )
-    screen.show(table("", ("device", "type", "model", "status", "functions"), rows))
+    screen.show(table("", ("device", "type", "model", "status", "last heard", "functions"), rows))
 
 
 def call(
@@ -107,7 +115,16 @@ def _usual_wait(function: str) -> float:
 
 
 def _facts(peer: Peer) -> dict[str, Any]:
-    return {name: value for name, value in asdict(peer).items() if name != "location"}
+    facts = {name: value for name, value in asdict(peer).items() if name not in ("location", "heard_at")}
+    age = peer.age_s
+    return {**facts, "age_s": None if age is None else round(age, 3)}
+
+
+def _age(peer: Peer) -> Text:
+    age = peer.age_s
+    if age is None:
+        return label("only listed", "yellow")
+    return label(f"{age:.1f} s", "bold red" if age > LATE_S else "")
 
 
 def _function_names(peer: Peer) -> list[str]:
@@ -120,7 +137,7 @@ def _show_functions(screen: Screen, peer: Peer) -> None:
         properties = (each.get("parameters") or {}).get("properties") or {}
         parameters = ", ".join(f"{name}: {_type_name(schema)}" for name, schema in properties.items())
         rows.append((each.get("name", ""), parameters, first_line(each.get("description"))))
-    screen.show(table(plain(peer.id), ("function", "parameters", "what it does"), rows))
+    screen.show(table(f"{plain(peer.id)}, last heard {_age(peer)}", ("function", "parameters", "what it does"), rows))
     screen.say(f"Events: {', '.join(peer.events)}")
 
 

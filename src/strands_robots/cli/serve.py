@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.device_connect.shutdown import StopSignal
 
+EVERY_PROGRAM_HERE = "Every program of this machine can drive and read the robot, no other machine can."
+
 _POLL_S = 0.2
 
 
@@ -247,6 +249,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
     lines: list[Any] = [
         *(label(f"NOT READY. {each}", "bold red") for each in lacking),
         label(describe(link)),
+        *([label(EVERY_PROGRAM_HERE)] if link.loopback_only and not link.authenticated else []),
         *([label(f"Tenant {link.tenant}.")] if link.tenant != "default" else []),
         table("", ("function", "what it does"), ((name, first_line(text)) for name, text in functions.items())),
         label("From another terminal:", "bold"),

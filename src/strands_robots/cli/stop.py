@@ -13,7 +13,7 @@ from rich.table import Table
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import SOURCE, Network, describe
+from strands_robots.cli.network import SOURCE, Network, describe, near_devices
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.envelope import Envelope, text_of
 from strands_robots.safety.answers import Answer
@@ -70,6 +70,8 @@ def stop(
     seconds = number("--timeout", timeout, above=0, high=60)
     with network.fleet() as fleet:
         answers = fleet.stop_all(seconds) if device is None else {device: fleet.stop(device, seconds, name)}
+        unknown = device is not None and stop_outcome(answers[device])[0] is None
+        near = near_devices(fleet, device) if unknown and device is not None else ""
     if not answers:
         raise CliError(f"No robot that can be stopped answered. {describe(fleet.link)}", Exit.SILENT, devices={})
     outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
@@ -80,7 +82,7 @@ def stop(
     if moving:
         raise CliError(f"DID NOT STOP: {', '.join(moving)}.", Exit.REFUSED, devices=devices)
     if silent:
-        raise CliError(f"It is unknown whether these stopped: {', '.join(silent)}.", Exit.SILENT, devices=devices)
+        raise CliError(f"It is unknown whether these stopped: {', '.join(silent)}.{near}", Exit.SILENT, devices=devices)
     if everything and fleet.stale:
         raise CliError(f"These stopped: {', '.join(outcomes)}. {fleet.stale}", Exit.SILENT, devices=devices)
     screen.data({"status": "success", "devices": devices})

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from strands_robots.cli.command import Seconds, command
 from strands_robots.cli.network import Network, call_device
-from strands_robots.cli.output import CliError, Exit, Screen, label, plain
+from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
@@ -29,9 +29,6 @@ REDRAW_S = 0.07
 
 MISSED_BEATS = 3
 """Beats that are missing in a row when a device counts as silent."""
-
-LATE_S = 2.0
-"""Age in seconds of the last sign of life that is shown in red: our robots give one a second."""
 
 FIRST_SIGN_S = 6.0
 """Seconds in which any live device has sent a first heartbeat."""
@@ -69,8 +66,12 @@ def watch(
     longest = None if seconds is None else number("--for", seconds, above=0, high=7 * 24 * 3600)
     with network.fleet() as fleet:
         limits: dict[str, Range] = {}
-        with contextlib.suppress(CliError):  # a device without getFeatures is drawn without its limits
+        try:
             limits = joint_limits(call_device(fleet, device, "getFeatures", {}, 3.0))
+        except CliError as failure:
+            # A device without getFeatures is drawn without its limits.
+            if isinstance(failure.__cause__, LookupError):
+                raise
         signs = SignsOfLife(lambda: fleet.last_heartbeat(device), lambda: fleet.beats_every(device))
         with fleet.subscription(device, signs.take):
             frames = follow(signs, longest, device)

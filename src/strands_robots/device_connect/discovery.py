@@ -13,7 +13,7 @@ import logging
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from device_connect_edge.messaging.exceptions import MessagingError
@@ -87,6 +87,13 @@ class Peer:
     functions: tuple[Mapping[str, Any], ...] = ()
     events: tuple[str, ...] = ()
     location: str = ""
+    heard_at: float | None = field(default=None, compare=False)
+    """Monotonic time of its last own message; None where only the registry names it."""
+
+    @property
+    def age_s(self) -> float | None:
+        """Seconds since its last own message."""
+        return None if self.heard_at is None else max(0.0, time.monotonic() - self.heard_at)
 
     @property
     def stop_verb(self) -> str | None:
@@ -203,7 +210,11 @@ class Discovery:
             self._found = lambda peer: None
         # A device's own word is newer than the registry's.
         everyone = {**self._listed, **self._described, **self._present}
-        return [everyone[name] for name in sorted(everyone)]
+        return [self._with_last_beat(everyone[name]) for name in sorted(everyone)]
+
+    def _with_last_beat(self, peer: Peer) -> Peer:
+        beat = self._beats.get(peer.id)
+        return peer if beat is None or beat <= (peer.heard_at or 0.0) else replace(peer, heard_at=beat)
 
     def _registry_heard(self, listing: asyncio.Task[dict[str, Peer]], lasted: float) -> bool:
         """Return False while the registry's list has to be waited for."""
@@ -298,7 +309,7 @@ class Discovery:
             logger.debug("%s sent a heartbeat and does not describe itself: %s", name, exc)
             return
         if answer.get("device_id") == name:
-            peer = self._described[name] = Peer.of(answer)
+            peer = self._described[name] = replace(Peer.of(answer), heard_at=time.monotonic())
             self._found(peer)
 
     async def _ask(self, leaf: str, method: str, params: Mapping[str, Any], within: float) -> Mapping[str, Any]:
@@ -320,7 +331,7 @@ class Discovery:
             self._beats.pop(name, None)
             self._named.discard(name)
         else:
-            peer = self._present[name] = Peer.of(presence)
+            peer = self._present[name] = replace(Peer.of(presence), heard_at=time.monotonic())
             self._found(peer)
 
     async def _on_heartbeat(self, data: bytes, subject: str, reply: str | None) -> None:

@@ -106,7 +106,8 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
         )
         return True
     if allow_insecure is None and stated and link.loopback_only:
-        logger.warning(
+        # What the panel of serve says, too. Nothing has to be done about it.
+        logger.info(
             "No authentication on 127.0.0.1: every program on this machine can drive and read this robot, "
             "no other machine can."
         )

@@ -71,6 +71,12 @@ class SafetyRegistration:
         except BaseException:
             self.entry.close()
             raise
+        if not link.loopback_only and not estop_listener().signed:
+            logger.warning(
+                "%s: the source of an emergency stop is what it says it is. DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not "
+                "set, so only a broker's access rules can vouch for it.",
+                device_id,
+            )
 
     def open(self) -> None:
         """Open the e-stop link, unless it is open; return before it is up.

@@ -372,6 +372,11 @@ class EstopListener:
         if thread is not None and thread is not threading.current_thread():
             thread.join(2.0)
 
+    @property
+    def signed(self) -> bool:
+        """True when a stop needs a signature; else its source is what it says it is."""
+        return self._rules.signed
+
     def accept_params(self, source: str, params: Mapping[str, Any], path: str) -> None:
         """Act on a parsed emergency stop of another path; return at once.
 
@@ -414,11 +419,6 @@ class EstopListener:
         self._rules.require_keys()
         self._check_ins = CheckInRules(self._rules)
         audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
-        if not self._rules.signed:
-            logger.warning(
-                "The source of an emergency stop is what it says it is: DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not set, "
-                "and only a broker's access rules can vouch for it."
-            )
         self._end_short_turns = shorten_turns()
         self._queue = FairQueue()
         self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)

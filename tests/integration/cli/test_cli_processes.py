@@ -39,6 +39,18 @@ def test_serve_prints_its_id_and_functions(arm: dict[str, Any]) -> None:
     assert {"execute", "stop", "getStatus"} <= set(arm["functions"])
 
 
+def test_panel_of_a_robot_on_this_machine_comes_without_a_warning(machine: Machine) -> None:
+    served = machine.start("serve", "so100", "--peer-id", "quiet-1")
+    assert served.stdout is not None and served.stderr is not None
+    shown = [served.stdout.readline()]
+    while shown[-1] and "Ctrl-C stops the robot" not in shown[-1]:
+        shown.append(served.stdout.readline())
+    served.terminate()
+    _, warned = served.communicate(timeout=WITHIN_S)
+    assert "Every program of this machine can drive" in "".join(shown)
+    assert warned == ""
+
+
 def test_peers_lists_the_arm_and_its_functions(machine: Machine, arm: dict[str, Any]) -> None:
     code, said = machine.json("peers", "--timeout", "20")
     assert code == 0

@@ -70,6 +70,18 @@ def test_served_arm_is_called_by_any_action_of_the_mesh(machine: Machine) -> Non
         assert (code, answer["status"]) == (0, "success")
 
 
+def test_arm_of_the_mesh_is_started_stopped_and_run_to_the_end_by_call(machine: Machine) -> None:
+    policy = ("instruction=wave", "policy_provider=mock")
+    with machine.serving("arm-1", "--mesh"):
+        code, answer = machine.json("call", "--mesh", "arm-1", "start", *policy, "duration=60")
+        assert (code, answer["status"]) == (0, "success")
+        assert machine.json("call", "--mesh", "arm-1", "status")[1]["task_status"] == "running"
+        assert machine.json("stop", "arm-1", "--mesh")[1]["stopped"] is True
+        code, answer = machine.json("call", "--mesh", "arm-1", "execute", *policy, "duration=0.5", "--timeout", "60")
+        assert (code, answer["status"]) == (0, "success")
+        assert machine.json("call", "--mesh", "arm-1", "status")[1]["task_status"] != "running"
+
+
 def test_unanswered_stop_is_no_success(machine: Machine) -> None:
     code, answer = machine.json("estop", "--mesh")
     assert (code, answer["stopped"]) == (3, None)
