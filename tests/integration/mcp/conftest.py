@@ -21,3 +21,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[McpSite]:
         made = McpSite(Path(state))
         yield made
         made.close()
+
+
+@pytest.fixture(autouse=True)
+def same_state(site: McpSite, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have robots read the state that the servers write, in each test."""
+    monkeypatch.setenv("STRANDS_STATE_DIR", os.fspath(site.state))
