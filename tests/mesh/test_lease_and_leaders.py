@@ -80,7 +80,8 @@ def test_agent_is_refused_while_a_teleoperator_leads_and_free_after_it_fell_sile
     assert "lead (human) holds control" in str(cell.ask(cell.agent, "acquireControl"))
     # As a leader that crashed: no frame follows, and nobody closes the stream.
     cell.publisher.stop()
-    eventually(lambda: cell.ask(cell.agent, "acquireControl", ttl_s=0.5).get("status") == "success", what="a free robot")
+    acquired = {"action": "acquireControl", "ttl_s": 0.5}
+    eventually(lambda: cell.ask(cell.agent, **acquired).get("status") == "success", what="a free robot")
     assert cell.ask(cell.agent, "status")["status"] == "success"
     assert cell.robot.lockout_epoch is None
 

@@ -17,6 +17,7 @@ from strands_robots.serving.control import (
     VERSION,
     ControlChange,
     ControlLease,
+    LeaseWatch,
     NotHolderError,
     leases_of,
     sign_take,
@@ -214,10 +215,11 @@ def test_hardware_without_a_key_cannot_be_taken_and_a_simulation_can() -> None:
 
 def test_lease_ends_in_time_without_a_call() -> None:
     halted = threading.Event()
-    lease = ControlLease("arm-1", lambda reason: halted.set(), lambda: False)
+    watch = LeaseWatch()
+    lease = ControlLease("arm-1", lambda reason: halted.set(), lambda: False, watched=watch.add)
     lease.acquire("agent-a", "agent", 0.05)
     assert halted.wait(10.0)
-    eventually(lambda: not any(each.name == "control-leases" for each in threading.enumerate()))
+    eventually(lambda: not watch.running, what="the end of the watch")
 
 
 @pytest.fixture

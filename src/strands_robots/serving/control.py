@@ -160,13 +160,18 @@ def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], f
     return {**body, "sig": ed25519.encode(signing_key.sign(ed25519.canonical(body)))}
 
 
-class _Watch:
+class LeaseWatch:
     """One thread that ends leases in time; it lives as long as there is one."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._leases: set[ControlLease] = set()
         self._thread: threading.Thread | None = None
+
+    @property
+    def running(self) -> bool:
+        """True while there is a lease to end."""
+        return self._thread is not None
 
     def add(self, lease: ControlLease) -> None:
         """Watch a lease until it is over."""
@@ -194,7 +199,7 @@ class _Watch:
                     each.expire()
 
 
-watch: Callable[[ControlLease], None] = _Watch().add
+watch: Callable[[ControlLease], None] = LeaseWatch().add
 """Ends a lease when its time is over."""
 
 

@@ -61,7 +61,7 @@ def test_robot_of_an_agent_that_was_killed_is_halted_and_free(
         eventually(lambda: not moving(robot), within=TTL_S + 5.0, what="the halt")
         status = second.call("arm-1", "getStatus")
         assert (status["control"]["held"], status["locked"]) == (False, False)
-        assert second.call("arm-1", "acquireControl")["status"] == "success"
+        assert second.call("arm-1", "acquireControl", {"ttl_s": 0.5})["status"] == "success"
 
 
 def test_partition_halts_the_robot_by_itself_and_voids_the_lease(
