@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from fixtures.nats_server import NatsServer
 from fixtures.waiting import free_port
@@ -31,20 +31,45 @@ BURST_S = 12.0
 """Seconds in which a device announces itself more often after its start."""
 
 
+IDLE_MOST = 0.1
+"""Share of a core that 100 idle devices may take."""
+
+
 def run(quick: bool = False) -> list[Row]:
-    """Measure and give the rows of the table."""
-    many, more, stops = (50, 75, 3) if quick else (100, 250, 20)
-    idle_s = 5.0 if quick else 20.0
+    """Measure and give the rows of the table; some four minutes a network."""
+    size = Size(50, 75, (4, 25), 3, 4, 4.0) if quick else Size(100, 250, (8, 50), 20, 20, 10.0)
     rows: list[Row] = []
     for title, network in NETWORKS.items():
-        with network() as (transport, endpoint):
-            rows += _one_process(title, transport, endpoint, many, idle_s)
-    with _nats() as (transport, endpoint):
-        rows += _one_more(transport, endpoint, more)
-        rows += _rounds(transport, endpoint, 4 if quick else 20)
-    with _nats() as (transport, endpoint):
-        rows += _hundreds(transport, endpoint, (4, 25) if quick else (8, 50), stops)
+        for part in (_one_process, _processes, _one_more, _rounds, _hundreds):
+            # A network of its own: what the part before left at it is no part of the next one.
+            with network() as (transport, endpoint):
+                rows += part(Network(title, transport, endpoint), size)
     return rows
+
+
+class Size(NamedTuple):
+    """How much is measured."""
+
+    many: int
+    more: int
+    fleet: tuple[int, int]
+    stops: int
+    rounds: int
+    idle_s: float
+
+
+class Network(NamedTuple):
+    """Where devices meet: title of its rows, kind and endpoint."""
+
+    title: str
+    transport: str
+    endpoint: str
+
+    def child(self, kind: str, first: int, count: int, state: str = "") -> Child:
+        return Child(kind, first, count, self.transport, self.endpoint, state)
+
+    def row(self, what: str, ours: str, must: str, ok: bool, bare: str = "", ratio: float = math.nan) -> Row:
+        return Row(f"{self.title}: {what}", ours, bare, None if math.isnan(ratio) else ratio, must, ok)
 
 
 @contextlib.contextmanager
@@ -108,44 +133,40 @@ class Child:
         return facts
 
 
-def _one_process(title: str, transport: str, endpoint: str, count: int, idle_s: float) -> Iterator[Row]:
-    with Child("ours", 0, count, transport, endpoint) as child:
-        mine = _joined_and_idle(child, idle_s)
-    theirs = dict.fromkeys(mine, float("nan"))
+def _one_process(network: Network, size: Size) -> Iterator[Row]:
+    count, share = size.many, size.many / 100
+    with network.child("ours", 0, count) as child:
+        mine = _joined_and_idle(child, size.idle_s)
+    theirs = dict.fromkeys(mine, math.nan)
     # Bare peers need descriptors by the square of their number; a process has 1,024, which is enough for 22 of them.
-    if transport != "meet":
-        with Child("bare", 0, count, transport, endpoint) as child:
-            theirs = _joined_and_idle(child, idle_s)
-    share, bare = count / 100, "" if math.isnan(theirs["join"]) else "bare"
-    yield Row(
-        f"{title}: CPU to join {count} devices in one process",
+    compared = network.transport != "meet"
+    if compared:
+        with network.child("bare", 0, count) as child:
+            theirs = _joined_and_idle(child, size.idle_s)
+    yield network.row(
+        f"CPU to join {count} devices in one process",
         f"{mine['join']:.2f} s",
-        bare and f"bare runtimes on one loop {theirs['join']:.2f} s",
-        _ratio(mine["join"], theirs["join"]),
         f"≤ {3 * share:g} s",
         mine["join"] <= 3 * share,
+        f"bare runtimes on one loop {theirs['join']:.2f} s" if compared else "",
+        mine["join"] / theirs["join"],
     )
     growth = mine["last"] / mine["first"]
-    yield Row(
-        f"{title}: the last {GROUP} of them against the second {GROUP}",
+    yield network.row(
+        f"the last {GROUP} of them against the second {GROUP}",
         f"{mine['last']:.2f} s against {mine['first']:.2f} s",
-        bare and f"bare {theirs['last'] / theirs['first']:.1f} times",
-        None,
         "≤ 1.5 times",
         growth <= 1.5,
+        f"bare {theirs['last'] / theirs['first']:.1f} times" if compared else "",
     )
-    yield Row(
-        f"{title}: {count} idle devices in one process",
+    yield network.row(
+        f"{count} idle devices in one process",
         f"{mine['share']:.1%} of a core",
-        bare and f"bare {theirs['share']:.1%}",
-        _ratio(mine["share"], theirs["share"]),
-        f"≤ {10 * share:g} % of a core",
-        mine["share"] <= 0.1 * share,
+        f"≤ {IDLE_MOST * share:.0%} of a core",
+        mine["share"] <= IDLE_MOST * share,
+        f"bare {theirs['share']:.1%}" if compared else "",
+        mine["share"] / theirs["share"],
     )
-
-
-def _ratio(ours: float, theirs: float) -> float | None:
-    return None if math.isnan(theirs) else ours / theirs
 
 
 def _joined_and_idle(child: Child, idle_s: float) -> dict[str, float]:
@@ -157,68 +178,93 @@ def _joined_and_idle(child: Child, idle_s: float) -> dict[str, float]:
     return {"join": sum(groups), "first": groups[1], "last": groups[-1], "share": child.facts()["share"]}
 
 
-def _one_more(transport: str, endpoint: str, count: int) -> Iterator[Row]:
-    with Child("ours", 0, count, transport, endpoint) as child:
-        marks = child.facts()["marks"]
-    last, before = marks[-1], marks[-2]
-    mb, threads, fds = ((last[key] - before[key]) / GROUP for key in ("mb", "threads", "fds"))
-    yield Row(
-        f"NATS: one more idle device, at {count} in a process",
-        f"{mb:.2f} MB, {threads:.1f} threads, {fds:.1f} descriptors",
-        "",
-        None,
-        "≤ 0.7 MB, 0 threads, ≤ 0.2 descriptors",
-        mb <= 0.7 and threads <= 0.1 and fds <= 0.2,
+def _processes(network: Network, size: Size) -> Iterator[Row]:
+    processes = size.many // GROUP
+    with contextlib.ExitStack() as stack:
+        children = [stack.enter_context(network.child("ours", each * GROUP, GROUP)) for each in range(processes)]
+        for child in children:
+            child.facts()
+        time.sleep(BURST_S)
+        for child in children:
+            child.ask(f"idle {size.idle_s}")
+        share = sum(child.facts()["share"] for child in children)
+    most = IDLE_MOST * size.many / 100
+    yield network.row(
+        f"{processes} processes of {GROUP} idle devices, in all",
+        f"{share:.1%} of a core",
+        f"≤ {most:.0%} of a core",
+        share <= most,
     )
 
 
-def _rounds(transport: str, endpoint: str, turns: int) -> Iterator[Row]:
-    with Child("rounds", turns, 50, transport, endpoint) as child:
+def _one_more(network: Network, size: Size) -> Iterator[Row]:
+    with network.child("ours", 0, size.more) as child:
+        marks = child.facts()["marks"]
+    for at in (1, len(marks) - 2):
+        before, after = marks[at], marks[at + 1]
+        mb, threads, fds = ((after[key] - before[key]) / GROUP for key in ("mb", "threads", "fds"))
+        yield network.row(
+            f"one more idle device, from {at * GROUP} to {(at + 1) * GROUP} in a process",
+            f"{mb:.2f} MB, {threads:.2f} threads, {fds:.2f} descriptors",
+            "≤ 0.7 MB, 0 threads, ≤ 0.2 descriptors",
+            mb <= 0.7 and threads <= 0.1 and fds <= 0.2,
+        )
+
+
+def _rounds(network: Network, size: Size) -> Iterator[Row]:
+    with network.child("rounds", size.rounds, 50) as child:
         marks = child.facts()["marks"]
     # The allocator keeps what the first rounds needed most.
     first, last = marks[len(marks) // 2], marks[-1]
-    yield Row(
-        f"NATS: left after {turns} rounds of 50 joins and leaves, against after half of them",
+    yield network.row(
+        f"left after {size.rounds} rounds of 50 joins and leaves, against after half of them",
         ", ".join(f"{last[key] - first[key]:+.0f} {key}" for key in ("mb", "threads", "fds")),
-        "",
-        None,
         "≤ 5 MB, 0 threads, 0 descriptors",
         last["mb"] - first["mb"] <= 5 and last["threads"] <= first["threads"] and last["fds"] <= first["fds"],
     )
 
 
-def _hundreds(transport: str, endpoint: str, shape: tuple[int, int], stops: int) -> Iterator[Row]:
-    processes, each = shape
-    count, link = processes * each, link_to(transport, endpoint)
+def _hundreds(network: Network, size: Size) -> Iterator[Row]:
+    processes, each = size.fleet
+    count, link = processes * each, link_to(network.transport, network.endpoint)
     with tempfile.TemporaryDirectory(prefix="fleet-") as state, contextlib.ExitStack() as stack:
         children = [
-            stack.enter_context(Child("ours", number * each, each, transport, endpoint, state))
-            for number in range(processes)
+            stack.enter_context(network.child("ours", number * each, each, state)) for number in range(processes)
         ]
         for child in children:
             child.facts()
         began = time.monotonic()
+        agent = stack.enter_context(network.child("agent", 0, count))
         with FleetClient(link, "bench") as fleet:
             found = 0
             while found < count and time.monotonic() < began + 30:
                 found = len(fleet.peers(2.0))
             took = time.monotonic() - began
-        yield Row(
-            f"NATS: {count} devices in {processes} processes, found after the last start",
+        yield network.row(
+            f"{count} devices in {processes} processes, found after the last start",
             f"{found} in {took:.1f} s",
-            "",
-            None,
             f"{count} in ≤ 10 s",
             found == count and took <= 10,
         )
-        yield from _stops(link, children, count, stops, Path(state))
+        # Its start, with the import of its packages, is part of the time.
+        facts = agent.facts()
+        took = facts["found_at"] - began
+        yield network.row(
+            "the same, by a bare agent, which calls each of them",
+            f"{facts['found']} in {took:.1f} s, {facts['called']} answered",
+            f"{count} in ≤ 10 s, {count} answered",
+            facts["found"] == facts["called"] == count and took <= 10,
+        )
+        yield from _stops(network, link, children, size, Path(state))
 
 
-def _stops(link: LinkConfig, children: list[Child], count: int, stops: int, state: Path) -> Iterator[Row]:
+def _stops(network: Network, link: LinkConfig, children: list[Child], size: Size, state: Path) -> Iterator[Row]:
+    count, stops = math.prod(size.fleet), size.stops
     expected = [f"arm-{number}" for number in range(count)]
     halts, verdicts, answered = [], [], []
     controller = SafetyController("bench-safety", lambda: stop_link(link))
     try:
+        controller.wait_link(10.0)
         for _ in range(stops):
             pressed = time.monotonic()
             report = controller.stop(expected, "bench", deadline_s=10.0)
@@ -228,23 +274,19 @@ def _stops(link: LinkConfig, children: list[Child], count: int, stops: int, stat
             for child in children:
                 child.ask("halts")
                 times += child.facts()["halts"].values()
-            halts.append((max(times, default=float("nan")) - pressed) * 1e3)
+            halts.append((max(times, default=math.nan) - pressed) * 1e3)
     finally:
         controller.close()
     stored = len(list(state.glob("lockouts/*")))
-    yield Row(
-        f"NATS: emergency stop to {count} devices, last halt, worst of {stops}",
+    yield network.row(
+        f"emergency stop to {count} devices, last halt, worst of {stops}",
         f"{max(halts):.0f} ms (p50 {statistics.median(halts):.0f})",
-        "",
-        None,
         "≤ 150 ms",
         max(halts) <= 150,
     )
-    yield Row(
-        f"NATS: every verdict of such a stop, worst of {stops}; lockouts on disk",
+    yield network.row(
+        f"every verdict of such a stop, worst of {stops}; lockouts on disk",
         f"{min(answered)} of {count} in {max(verdicts):.0f} ms; {stored}",
-        "",
-        None,
         f"{count} in ≤ 2 s; {count}",
         min(answered) == count and max(verdicts) <= 2000 and stored == count,
     )

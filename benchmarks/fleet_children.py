@@ -1,7 +1,8 @@
 """Many devices in one process, for :mod:`benchmarks.fleet`: ``python -m benchmarks.fleet_children KIND ...``.
 
 ``KIND FIRST COUNT TRANSPORT ENDPOINT``: joins ``COUNT`` devices, ``ours`` or ``bare`` (the framework's runtimes on one
-loop), reports, and then obeys lines on its standard input: ``idle SECONDS``, ``halts`` and ``end``.
+loop), reports, and then obeys lines on its standard input: ``idle SECONDS``, ``halts`` and ``end``. ``agent`` finds
+``COUNT`` devices with the framework's agent tools and calls each of them.
 """
 
 from __future__ import annotations
@@ -126,6 +127,27 @@ def bare(first: int, count: int, transport: str, endpoint: str) -> None:
     os._exit(0)
 
 
+def agent(count: int, transport: str, endpoint: str) -> None:
+    """Find and call as a bare agent does."""
+    if transport == "nats":
+        os.environ.update(MESSAGING_BACKEND="nats", NATS_URL=endpoint)
+    else:
+        os.environ["ZENOH_CONNECT"] = f"tcp/127.0.0.1:{endpoint}" if transport == "meet" else endpoint
+    import device_connect_agent_tools as tools  # noqa: PLC0415 - it reads the environment
+
+    tools.connect()
+    found: set[str] = set()
+    until = time.monotonic() + 30
+    while len(found) < count and time.monotonic() < until:
+        found |= {each["device_id"] for each in tools.discover_devices() if each["device_id"].startswith("arm-")}
+        time.sleep(0.05)
+    found_at = time.monotonic()
+    answers = (tools.invoke_device(each, "getStatus", {}) for each in sorted(found))
+    report(found=len(found), found_at=found_at, called=sum(bool(each.get("success")) for each in answers))
+    obey()
+    os._exit(0)
+
+
 def obey() -> None:
     for line in sys.stdin:
         command, *arguments = line.split()
@@ -148,6 +170,8 @@ def main() -> None:
     kind, first, count, transport, endpoint = sys.argv[1:]
     if kind == "bare":
         bare(int(first), int(count), transport, endpoint)
+    elif kind == "agent":
+        agent(int(count), transport, endpoint)
     else:
         (rounds if kind == "rounds" else ours)(int(first), int(count), link_to(transport, endpoint))
 

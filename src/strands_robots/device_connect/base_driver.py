@@ -23,6 +23,7 @@ from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
 from strands_robots.device_connect._compat import CollectedOnce, Labels, emit, observed, on, rpc
+from strands_robots.device_connect.runtime_stops import stops_of
 from strands_robots.device_connect.safety_registration import SafetyRegistration
 from strands_robots.device_connect.state_reports import report_changes, sweep
 from strands_robots.device_connect.telemetry import RolloutPump
@@ -288,6 +289,16 @@ class RobotDriver(CollectedOnce):
         """Halt every motion source on the emergency stop of an allowed source."""
         await self.on_estop(device_id, payload)
 
+    @property
+    def _stops_are_shared(self) -> bool:
+        """True where one subscription receives the stops for all devices of the link."""
+        return self.registration is not None and type(self).onEmergencyStop is RobotDriver.onEmergencyStop
+
+    def _collect_event_subscriptions(self) -> list[dict[str, Any]]:
+        """Return the subscriptions of this device alone."""
+        found = super()._collect_event_subscriptions()
+        return [each for each in found if not (self._stops_are_shared and each["handler"] == self.onEmergencyStop)]
+
     async def on_estop(self, device_id: object, payload: object) -> None:
         """Act on an emergency stop of the runtime, in the safety plane if registered."""
         if self.registration is not None:
@@ -447,6 +458,8 @@ class RobotDriver(CollectedOnce):
         """Start telling the state; the robot manages its own hardware connection."""
         if self.runtime is None or self._watchers:
             return
+        if self._stops_are_shared:
+            await stops_of(self.runtime.link).join(self)
         if not self._looked_once:
             await self.read_activity()
         pump = RolloutPump(self._on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
@@ -517,6 +530,8 @@ class RobotDriver(CollectedOnce):
     async def disconnect(self) -> None:
         """Stop telling the state; the robot manages its own shutdown."""
         watchers, self._watchers = self._watchers, []
+        if self._stops_are_shared:
+            await stops_of(self.runtime.link).leave(self)
         if watchers:
             sweep(settings.number("STRANDS_DC_STATE_HZ")).remove(self)
         self._changed = []
