@@ -1,4 +1,4 @@
-.PHONY: help demo dashboard test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next dds-security models
+.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -80,6 +80,9 @@ lerobot:  ## LeRobot 0.4.4 with torch, in .venv-policies, and the tests of polic
 real-arm-next:  ## The same on LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-lerobot-0.6.1
 	@./scripts/real-arm.sh 0.6.1
 	@.venv-lerobot-0.6.1/bin/python -m pytest tests/integration/hardware $(ARGS)
+
+soak: venv  ## A hundred robots at 10 Hz on the page for ten minutes (SECONDS=600)
+	@$(BIN)/python -m benchmarks.soak $(or $(SECONDS),600)
 
 lint: venv  ## ruff and mypy --strict
 	@$(BIN)/ruff check .

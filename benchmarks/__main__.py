@@ -34,6 +34,7 @@ PARTS = {
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",
     "recording": "Recording where robots are served",
+    "dashboard": "The operator's page in Chromium",
     "ros": "Robots on ROS graphs",
     "arm": "A real arm (in the environment of `make real-arm`)",
 }
