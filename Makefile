@@ -38,6 +38,7 @@ system:
 	@./scripts/real-arm.sh
 	@./scripts/models.sh
 	@./scripts/mcp.sh
+	@./scripts/mcp-conformance.sh
 	@./scripts/venv.sh .venv-bridge requirements/bridge.lock
 	@./scripts/rosbridge.sh
 	@./scripts/registry.sh

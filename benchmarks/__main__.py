@@ -33,6 +33,7 @@ PARTS = {
     "attacks": "Attacks on the way of a stop",
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",
+    "mcp": "Robots for MCP clients",
     "recording": "Recording where robots are served",
     "dashboard": "The operator's page in Chromium",
     "ros": "Robots on ROS graphs",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
 from collections.abc import Awaitable
@@ -23,6 +24,8 @@ from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.results import refused_arguments, result, unknown_arguments
 from strands_robots.mcp.tools import add_control, add_motions, add_reads, add_stops
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -125,6 +128,8 @@ async def serve_stdio(caller: Caller, *, read_only: bool = False) -> None:
     try:
         async with resources.published():
             await server.run_stdio_async()
+    except* BrokenPipeError:
+        logger.info("The client has gone away.")
     finally:
         await caller.leave()
         caller.close()
