@@ -17,7 +17,8 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.hardware import HardwareRobot
 from strands_robots.policies import create_policy
-from strands_robots.policies.openpi import OpenPiError, OpenPiPolicy
+from strands_robots.policies.openpi import OpenPiPolicy
+from strands_robots.policies.policy_server import PolicyServerError
 from strands_robots.policies.profiles import CameraMap, Profile
 from strands_robots.utils import ValidationError
 
@@ -118,7 +119,7 @@ def test_a_batch_axis_is_taken_off(make: Make) -> None:
 def test_an_unusable_answer_to_the_first_inference_is_told_before_anything_moves(
     make: Make, answer: Any, words: str
 ) -> None:
-    with pytest.raises(OpenPiError, match=words):
+    with pytest.raises(PolicyServerError, match=words):
         make(lambda observation: answer)
 
 
@@ -132,7 +133,7 @@ def test_an_unusable_answer_to_the_first_inference_is_told_before_anything_moves
 def test_metadata_that_contradicts_the_profile_is_refused(
     make: Make, metadata: dict[str, Any], entries: dict[str, Any], words: str
 ) -> None:
-    with pytest.raises(OpenPiError, match=words):
+    with pytest.raises(PolicyServerError, match=words):
         make(metadata=metadata, **entries)
 
 
@@ -147,7 +148,7 @@ def test_a_late_answer_is_never_taken_for_the_next_one(make: Make) -> None:
         return {"actions": late}
 
     server.answer = slow
-    with pytest.raises(OpenPiError, match="did not answer in time"):
+    with pytest.raises(PolicyServerError, match="did not answer in time"):
         policy.act(SEEN)
     let_go.set()
     eventually(lambda: _acted(policy), what="an answer on a new connection")
@@ -158,7 +159,7 @@ def test_a_late_answer_is_never_taken_for_the_next_one(make: Make) -> None:
 def _acted(policy: OpenPiPolicy) -> bool:
     try:
         return policy.act(SEEN)[0]["grip.pos"] == 0.0
-    except OpenPiError:
+    except PolicyServerError:
         return False
 
 
@@ -188,7 +189,7 @@ def test_a_stop_ends_a_hung_inference_at_once(make: Make) -> None:
     def act() -> None:
         try:
             policy.act(SEEN)
-        except OpenPiError as exc:
+        except PolicyServerError as exc:
             failed.append(str(exc))
 
     thread = threading.Thread(target=act)
@@ -205,7 +206,7 @@ def test_the_token_of_the_profiles_file_is_sent(make: Make, tmp_path: Path) -> N
     file.write_text("secret\n")
     _, policy = make(token="secret", token_file=str(file))
     assert policy.act(SEEN)
-    with pytest.raises(OpenPiError):
+    with pytest.raises(PolicyServerError):
         make(token="another", token_file=str(file), first_deadline_s=2.0)
     with pytest.raises(ValidationError, match="token_file cannot be read"):
         make(token_file=str(tmp_path / "none"))
@@ -214,7 +215,7 @@ def test_the_token_of_the_profiles_file_is_sent(make: Make, tmp_path: Path) -> N
 def test_without_a_server_it_says_where_it_looked() -> None:
     url = f"ws://127.0.0.1:{free_port()}"
     policy = OpenPiPolicy(Profile("pi", "openpi", KEYS, KEYS, url=url, first_deadline_s=2.0))
-    with pytest.raises(OpenPiError, match=url):
+    with pytest.raises(PolicyServerError, match=url):
         policy.reset("wave", {})
 
 

@@ -21,7 +21,8 @@ from fixtures.waiting import eventually, free_port
 from websockets.sync.server import ServerConnection, serve
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.policies.remote import PolicyServerError, RemotePolicy
+from strands_robots.policies.policy_server import PolicyServerError
+from strands_robots.policies.remote import RemotePolicy
 from strands_robots.utils import ValidationError
 
 SERVER = Path(__file__).resolve().parents[2] / "examples" / "policy_server.py"

@@ -25,6 +25,7 @@ _BUILT_IN = {
     "mock": ("strands_robots.policies.mock", "MockPolicy"),
     "remote": ("strands_robots.policies.remote", "RemotePolicy"),
     "openpi": ("strands_robots.policies.openpi", "OpenPiPolicy"),
+    "groot": ("strands_robots.policies.groot", "GrootPolicy"),
     "lerobot_local": ("strands_robots.policies.lerobot_local", "LeRobotPolicy"),
 }
 

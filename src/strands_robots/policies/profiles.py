@@ -17,7 +17,8 @@ from strands_robots import settings
 from strands_robots.utils import ValidationError, choice, identifier, mapping, number, shown, text, whole
 
 UNITS = ("degrees", "radians", "normalized", "percent", "metres")
-LAYOUTS = ("libero", "droid", "aloha")
+LAYOUTS = ("libero", "droid", "aloha", "n1.5", "n1.6", "n1.6-flat")
+"""Forms of a server's observation: the first three of openpi, the others of GR00T."""
 FLIPS = ("none", "180", "horizontal", "vertical")
 CONFIRMABLE = ("units", "rate", "image size")
 """Facts that a profile may declare to be right although nothing states them."""
@@ -60,7 +61,8 @@ class Profile:
         units: unit of the policy's numbers by key; the entry ``""`` is that of all others.
         rate: control steps a second at which the data was recorded; None where nothing states it.
         horizon: actions that are played of each answer; None for all.
-        layout: of an openpi server's observation: libero, droid or aloha.
+        layout: form of a server's observation, of :data:`LAYOUTS`; empty for the provider's first.
+        parts: the keys in each of a GR00T server's parts, in its order.
         task: the text that the policy was trained with; empty takes the caller's instruction.
         first_deadline_s, deadline_s: longest time until the policy is ready, and of each later answer.
         max_speed: whole ranges that a joint may cross in a second; None for no bound.
@@ -82,7 +84,8 @@ class Profile:
     rate: float | None = None
     chunk: int | None = None
     horizon: int | None = None
-    layout: str = "libero"
+    layout: str = ""
+    parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     task: str = ""
     device: str = ""
     first_deadline_s: float = 120.0
@@ -273,6 +276,7 @@ _ENTRIES: dict[str, Callable[[str, object], Any]] = {
     "chunk": lambda name, value: whole(name, value, low=1, high=10_000),
     "horizon": lambda name, value: whole(name, value, low=1, high=10_000),
     "layout": lambda name, value: choice(name, value, LAYOUTS),
+    "parts": lambda name, value: {part: _order(f"{name}.{part}", keys) for part, keys in mapping(name, value).items()},
     "task": _text(2000),
     "device": _text(64),
     "first_deadline_s": _seconds,

@@ -24,19 +24,12 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NoReturn
 
-from strands_robots.policies.base import Action, PolicyError, Ranges, checked_action, numbers
+from strands_robots.policies.base import Action, Ranges, checked_action, numbers
+from strands_robots.policies.policy_server import CHUNK_MAX, SLICE_S, PolicyServerError
 from strands_robots.utils import ValidationError, choice, dial_host_error, flag, missing_extra, number, shown, whole
 
 DEFAULT_PORT = 8765
-CHUNK_MAX = 10_000
-"""Longest accepted chunk of actions."""
-
-_SLICE_S = 0.05
 _CLOSE_S = 0.5
-
-
-class PolicyServerError(PolicyError):
-    """The policy server refused, sent an unusable answer, or did not answer in time."""
 
 
 class RemotePolicy:
@@ -149,7 +142,7 @@ class RemotePolicy:
             if left <= 0:
                 raise PolicyServerError(f"the policy server at {self.url} did not answer {message['type']} in time")
             try:
-                frame = self._connection.recv(timeout=min(left, _SLICE_S))
+                frame = self._connection.recv(timeout=min(left, SLICE_S))
             except TimeoutError:
                 continue
             answer = self._decoded(frame)

@@ -1,0 +1,260 @@
+"""A policy server of Isaac GR00T: MessagePack over ZeroMQ, REQ and REP.
+
+A question is ``{endpoint, data, api_token}``. An array is ``{__ndarray_class__: true, as_npy: bytes}`` in numpy's own
+format, and an error ``{error: text}``. N1.5 takes a flat observation without a batch axis; N1.6 and N1.7 take maps
+``video``, ``state`` and ``language`` with one, or, behind their wrapper for simulations, flat keys with one. Source:
+Isaac-GR00T, ``gr00t/eval/service.py`` (N1.5) and ``gr00t/policy/server_client.py`` (N1.6, N1.7).
+
+A socket that missed an answer cannot ask again, so it is closed and another one opened. Nothing is encrypted: use
+loopback or a tunnel.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Any
+
+from strands_robots.policies.base import Action
+from strands_robots.policies.policy_server import (
+    ANSWER_MAX,
+    PolicyServerError,
+    ServedPolicy,
+    actions_of,
+    compare,
+    picture_key,
+    wait_for_answer,
+)
+from strands_robots.policies.profiles import Profile
+from strands_robots.policies.warm import WarmModels
+from strands_robots.utils import ValidationError, missing_extra, shown
+
+LAYOUTS = ("n1.6", "n1.6-flat", "n1.5")
+LANGUAGE = "annotation.human.task_description"
+"""Key of the instruction where the server states none."""
+
+_KINDS = "biuf"
+"""Kinds of numpy arrays that are decoded."""
+
+
+class GrootConnection:
+    """One ZeroMQ socket to a server; used by one policy at a time."""
+
+    def __init__(self, url: str, token: str) -> None:
+        self._url = url
+        self._token = token
+        self._socket: Any = None
+        self.language = LANGUAGE
+
+    def infer(self, observation: Any, deadline: float, interrupted: threading.Event) -> Any:
+        return self.ask("get_action", observation, deadline, interrupted)
+
+    def ask(self, endpoint: str, data: Any, deadline: float, interrupted: threading.Event) -> Any:
+        """Return the answer of an endpoint; ``data`` None asks without any.
+
+        Raises:
+            PolicyServerError: no answer in time, one that cannot be read, or the server's error.
+        """
+        question: dict[str, Any] = {"endpoint": endpoint}
+        if data is not None:
+            question["data"] = data
+        if self._token:
+            question["api_token"] = self._token
+        self._open().send(_module("msgpack").packb(question, default=_encoded))
+        frame = wait_for_answer(self._url, self._receive, deadline, interrupted, self.close)
+        try:
+            answer = _module("msgpack").unpackb(frame, object_hook=_decoded, strict_map_key=False)
+        except (ValueError, TypeError, RecursionError, EOFError) as exc:
+            raise PolicyServerError(f"the policy server at {self._url} sent an unreadable answer: {exc}") from exc
+        if isinstance(answer, Mapping) and "error" in answer:
+            raise PolicyServerError(f"the policy server at {self._url} failed: {shown(answer['error'])}")
+        return answer
+
+    def close(self) -> None:
+        socket, self._socket = self._socket, None
+        if socket is not None:
+            socket.close(linger=0)
+
+    def _open(self) -> Any:
+        zmq = _module("zmq")
+        if self._socket is None:
+            self._socket = zmq.Context.instance().socket(zmq.REQ)
+            self._socket.setsockopt(zmq.LINGER, 0)
+            self._socket.setsockopt(zmq.MAXMSGSIZE, ANSWER_MAX)
+            self._socket.connect(self._url)
+        return self._socket
+
+    def _receive(self, seconds: float) -> bytes:
+        if not self._socket.poll(max(1, round(seconds * 1000))):
+            raise TimeoutError
+        frame: bytes = self._socket.recv()
+        return frame
+
+
+class GrootPolicy(ServedPolicy):
+    """Policy on a GR00T server; the profile's ``parts`` name the keys of each part.
+
+    Raises:
+        ValidationError: also parts that lack a key of ``state`` or ``action``, or name one twice.
+    """
+
+    provider = "groot"
+    connections = WarmModels()
+
+    def __init__(self, profile: Profile | None = None) -> None:
+        super().__init__(profile)
+        self._layout = self.layout(LAYOUTS)
+        self._language = LANGUAGE
+        self._state = _parts_of(self.profile, "state", self.profile.state)
+        self._action = _parts_of(self.profile, "action", self.profile.action)
+        for module in ("zmq", "msgpack", "numpy"):
+            _module(module)
+
+    def connect(self, token: str, deadline: float) -> GrootConnection:
+        connection = GrootConnection(self.profile.url, token)
+        try:
+            self._compare(connection, connection.ask("get_modality_config", None, deadline, threading.Event()))
+        except BaseException:
+            connection.close()
+            raise
+        return connection
+
+    def observation(self, seen: Mapping[str, Any], task: str) -> dict[str, Any]:
+        numpy, nested = _module("numpy"), self._layout == "n1.6"
+        # History of one: time before height or number, and the batch before time.
+        axes = (None,) if self._layout == "n1.5" else (None, None)
+        kind = numpy.float64 if self._layout == "n1.5" else numpy.float32
+        video = {picture_key(each): numpy.asarray(seen[picture_key(each)])[axes] for each in self.profile.cameras}
+        state = {part: numpy.array([seen[key] for key in keys], kind)[axes] for part, keys in self._state.items()}
+        if nested:
+            told: dict[str, Any] = {"video": video, "state": state, "language": {self._language: [[task]]}}
+        else:
+            told = {f"video.{name}": each for name, each in video.items()}
+            told |= {f"state.{name}": each for name, each in state.items()}
+            told[self._language] = [task]
+        return told if self._layout == "n1.5" else {"observation": told, "options": None}
+
+    def actions(self, answer: Any) -> list[Action]:
+        numpy = _module("numpy")
+        if isinstance(answer, Sequence) and not isinstance(answer, str | bytes) and answer:
+            answer = answer[0]
+        if not isinstance(answer, Mapping):
+            raise PolicyServerError(f"the server at {self.profile.url} answered without actions: {shown(answer)}")
+        given = {str(part).removeprefix("action."): each for part, each in answer.items()}
+        if missing := sorted(self._action.keys() - given.keys()):
+            raise PolicyServerError(
+                f"the server answered no {', '.join(missing)}; it has {', '.join(sorted(given)) or 'nothing'}"
+            )
+        rows = {}
+        for part, keys in self._action.items():
+            chunk = numpy.asarray(given[part])
+            if chunk.ndim == 3 and chunk.shape[0] == 1:
+                chunk = chunk[0]
+            rows[part] = actions_of(chunk[:, None] if chunk.ndim == 1 and len(keys) == 1 else chunk, keys)
+        lengths = {part: len(each) for part, each in rows.items()}
+        if len(set(lengths.values())) != 1:
+            raise PolicyServerError(f"the server answered parts of different lengths: {lengths}")
+        together = [
+            {key: value for part in step for key, value in part.items()} for step in zip(*rows.values(), strict=True)
+        ]
+        return [{key: step[key] for key in self.profile.action} for step in together]
+
+    def begin(self, connection: Any) -> None:
+        self._language = connection.language
+        if self._layout != "n1.5":
+            deadline = time.monotonic() + self.profile.deadline_s
+            connection.ask("reset", {"options": None}, deadline, self._interrupted)
+
+    def _compare(self, connection: GrootConnection, config: Any) -> None:
+        """Compare the server's modalities with the profile.
+
+        Raises:
+            PolicyServerError: other cameras, parts or horizon, or frames of the past, which this client does not keep.
+        """
+        profile = self.profile
+        wanted = {
+            "video": [picture_key(each) for each in profile.cameras],
+            "state": list(self._state),
+            "action": list(self._action),
+        }
+        for modality, mine in wanted.items():
+            names, deltas = _modality(config, modality)
+            if names is not None:
+                compare(f"modality {modality}", sorted(names), sorted(mine))
+            if modality == "action":
+                if deltas is not None and profile.chunk is not None:
+                    compare("horizon", len(deltas), profile.chunk)
+            elif deltas not in (None, [0]):
+                raise PolicyServerError(
+                    f"the server wants {modality} of the steps {deltas}, and gets the present alone"
+                )
+        names, _ = _modality(config, "language")
+        self._language = connection.language = names[0] if names else LANGUAGE
+
+
+def _modality(config: Any, modality: str) -> tuple[list[str] | None, list[int] | None]:
+    """Return the keys and the steps of a modality, None where none are stated."""
+    stated = config.get(modality) if isinstance(config, Mapping) else None
+    if not isinstance(stated, Mapping):
+        return None, None
+    names, deltas = stated.get("modality_keys"), stated.get("delta_indices")
+    plain = modality + "." if modality != "language" else ""
+    return (
+        [str(name).removeprefix(plain) for name in names] if isinstance(names, list) else None,
+        deltas if isinstance(deltas, list) else None,
+    )
+
+
+def _parts_of(profile: Profile, name: str, wanted: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Return the parts that have the keys of state or action.
+
+    Raises:
+        ValidationError: a key in no part or in two, or a part of which only some keys are in it.
+    """
+    where = f"profile {profile.name}: parts"
+    found = {part: keys for part, keys in profile.parts.items() if set(keys) & set(wanted)}
+    for part, keys in found.items():
+        if strange := [key for key in keys if key not in wanted]:
+            raise ValidationError(f"{where}.{part} has {', '.join(strange)}, which {name} lacks.")
+    named = [key for each in found.values() for key in each]
+    if sorted(named) != sorted(wanted):
+        raise ValidationError(f"{where} must name each key of {name} once, {', '.join(wanted)}, not {shown(named)}.")
+    return found
+
+
+def _encoded(value: Any) -> Any:
+    """Return an array as GR00T's map."""
+    numpy = _module("numpy")
+    if not isinstance(value, numpy.ndarray):
+        raise TypeError(f"an observation cannot have {shown(value)}")
+    file = io.BytesIO()
+    numpy.save(file, value, allow_pickle=False)
+    return {"__ndarray_class__": True, "as_npy": file.getvalue()}
+
+
+def _decoded(found: dict[Any, Any]) -> Any:
+    """Decode GR00T's arrays and modalities.
+
+    Raises:
+        ValueError: an array of objects, or bytes that are no array.
+    """
+    if "__ndarray_class__" in found:
+        array = _module("numpy").load(io.BytesIO(found.get("as_npy", b"")), allow_pickle=False)
+        if array.dtype.kind not in _KINDS:
+            raise ValidationError(f"an array of the kind {array.dtype.kind}")
+        return array
+    if "__ModalityConfig_class__" in found:
+        stated = found.get("as_json", found.get("as_dict"))
+        return json.loads(stated) if isinstance(stated, str) else stated
+    return found
+
+
+def _module(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as exc:
+        raise missing_extra("The groot policy", "groot") from exc
