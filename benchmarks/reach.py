@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 
-import mujoco
 import numpy as np
+from fixtures.reach_targets import reachable
 from numpy.typing import NDArray
 
+from benchmarks import reach_network
 from benchmarks.table import Row
 from strands_robots.kinematics import grasp
-from strands_robots.kinematics.chain import Chain, TipPose, built_in
+from strands_robots.kinematics.chain import built_in
 from strands_robots.kinematics.grasp import Held, SeenObject
 from strands_robots.kinematics.inverse import TipGoal, solve
 from strands_robots.kinematics.motion import Motion
@@ -41,6 +42,7 @@ def run(*, quick: bool = False) -> list[Row]:
         grasping("so100", cubes, 0.003, 95.0),
         grasping("so101", cubes, 0.0, 95.0),
         holding(tries),
+        *reach_network.rows(quick=quick),
     ]
 
 
@@ -63,19 +65,6 @@ def inverse(arm: str, count: int) -> Row:
         f">= {SOLVED[arm]:g} %, p95 <= {P95_MS:g} ms",
         solved >= SOLVED[arm] and p95 <= P95_MS,
     )
-
-
-def reachable(chain: Chain, count: int) -> list[TipPose]:
-    """Return poses of random joints without contact, the tip above 10 mm."""
-    draw = np.random.default_rng(7)
-    poses: list[TipPose] = []
-    while len(poses) < count:
-        data = chain.data(chain.lows + (chain.highs - chain.lows) * draw.random(len(chain.joints)))
-        mujoco.mj_collision(chain.model, data)
-        pose = chain.tip(data)
-        if pose.position[2] > 0.01 and not data.ncon:
-            poses.append(pose)
-    return poses
 
 
 def grasping(arm: str, count: int, error_m: float, must: float) -> Row:

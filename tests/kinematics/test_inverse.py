@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pytest
+from fixtures.reach_targets import reachable
 
-from strands_robots.kinematics.chain import Chain, TipPose, built_in
+from strands_robots.kinematics.chain import built_in
 from strands_robots.kinematics.inverse import TipGoal, nearest, rolled, solve
 
 ARMS = ("so100", "so101")
-
-
-def reachable(chain: Chain, count: int) -> list[TipPose]:
-    """Poses of random joints, without contact, the tip above 10 mm."""
-    draw = np.random.default_rng(7)
-    poses = []
-    while len(poses) < count:
-        data = chain.data(chain.lows + (chain.highs - chain.lows) * draw.random(len(chain.joints)))
-        mujoco.mj_collision(chain.model, data)
-        pose = chain.tip(data)
-        if pose.position[2] > 0.01 and not data.ncon:
-            poses.append(pose)
-    return poses
 
 
 @pytest.mark.parametrize("arm", ARMS)

@@ -173,13 +173,28 @@ def test_available_backend_is_chosen_without_a_display(
         gl.prepare.cache_clear()
 
 
+@pytest.mark.parametrize(("display", "chosen"), [("", "osmesa"), (":0", "glfw")])
+def test_windowed_backend_is_taken_only_where_there_is_a_display(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, display: str, chosen: str
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.setattr(gl, "loads", lambda backend: backend == "osmesa")
+    gl.prepare.cache_clear()
+    try:
+        assert gl.prepare() == chosen
+        assert ("needs a display" in caplog.text) is (not display)
+    finally:
+        gl.prepare.cache_clear()
+
+
 @pytest.mark.parametrize("configured", ["egl", "osmesa", "glfw"])
 def test_configured_backend_that_cannot_load_is_disabled(monkeypatch: pytest.MonkeyPatch, configured: str) -> None:
     monkeypatch.setenv("MUJOCO_GL", configured)
     monkeypatch.setattr(gl, "loads", lambda backend: False)
     gl.prepare.cache_clear()
     try:
-        assert gl.prepare() == ("glfw" if configured == "glfw" else "disable")
+        assert gl.prepare() == "disable"
     finally:
         gl.prepare.cache_clear()
 

@@ -17,7 +17,7 @@ from strands_robots import settings
 PACKAGES = "libegl1 libgl1 libgl1-mesa-dri (EGL) or libosmesa6 (OSMesa)"
 """Debian packages for software rendering."""
 
-DISABLED = "disable"
+DISABLED, WINDOWED = "disable", "glfw"
 
 logger = logging.getLogger(__name__)
 
@@ -44,14 +44,24 @@ def prepare() -> str:
     """Choose the backend and set ``MUJOCO_GL``; empty stands for MuJoCo's default."""
     if not undecided():
         wanted = settings.raw("MUJOCO_GL").lower()
+        if wanted == WINDOWED and not _display():
+            # Its first picture would abort the whole process, robot and all.
+            logger.warning("MUJOCO_GL=%s needs a display, and there is none; another backend is taken.", wanted)
+            return _without_display()
         if wanted not in LIBRARIES or loads(wanted):
             return wanted
         # MuJoCo would not even import, and physics needs no pictures.
         logger.warning("MUJOCO_GL=%s cannot be loaded here; %s.", wanted, remedy())
         settings.put("MUJOCO_GL", DISABLED)
         return DISABLED
-    if platform.system() != "Linux" or settings.is_set("DISPLAY"):
-        return ""
+    return "" if _display() else _without_display()
+
+
+def _display() -> bool:
+    return platform.system() != "Linux" or settings.is_set("DISPLAY")
+
+
+def _without_display() -> str:
     for backend in LIBRARIES:
         if loads(backend):
             settings.put("MUJOCO_GL", backend)
