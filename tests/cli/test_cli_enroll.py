@@ -54,6 +54,11 @@ class SigningFleet:
         statement = signed(self.identity, purpose, device, {**fields, **self.signs})
         return success("done", locked=self.locked, lockout=rows, statement=statement)
 
+    def call_each(
+        self, calls: dict[str, dict[str, Any]], function: str, timeout: float
+    ) -> dict[str, tuple[Envelope | Exception, float]]:
+        return {device: (self.call(device, function, params, timeout), 0.001) for device, params in calls.items()}
+
 
 @pytest.fixture
 def robot(tmp_path: Path) -> SigningIdentity:

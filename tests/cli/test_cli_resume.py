@@ -52,6 +52,17 @@ class FakeFleet:
         epochs.remove(assertion["epoch"])
         return success("free of it", locked=bool(epochs))
 
+    def call_each(
+        self, calls: dict[str, dict[str, Any]], function: str, timeout: float
+    ) -> dict[str, tuple[Envelope | Exception, float]]:
+        answers: dict[str, tuple[Envelope | Exception, float]] = {}
+        for device, params in calls.items():
+            try:
+                answers[device] = self.call(device, function, params, timeout), 0.001
+            except DeviceTimeoutError as exc:
+                answers[device] = exc, timeout
+        return answers
+
 
 @pytest.fixture
 def fleet(monkeypatch: pytest.MonkeyPatch) -> FakeFleet:

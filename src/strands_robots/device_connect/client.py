@@ -10,6 +10,7 @@ import asyncio
 import json
 import queue
 import threading
+import time
 import uuid
 from collections.abc import Callable, Coroutine, Generator, Mapping
 from concurrent.futures import Future
@@ -25,12 +26,15 @@ from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.stopping import Outcome, explain, grade
-from strands_robots.utils import device_id, shown, text
+from strands_robots.utils import ValidationError, device_id, shown, text
 
 T = TypeVar("T")
 
 COLLECT_MARGIN_S = 3.0
 """Seconds that a discovery may last beyond its own deadline, on a loaded machine."""
+
+IN_FLIGHT = 64
+"""Calls of :meth:`FleetClient.call_each` that wait for an answer at a time."""
 
 EVENTS_MAX = 10_000
 """Events that wait for a slow reader; a further one displaces the oldest."""
@@ -148,6 +152,39 @@ class FleetClient:
             MessagingError: the network cannot carry the call.
         """
         return self.run(self._call(device, function, dict(params or {}), timeout), timeout + 3.0)
+
+    def call_each(
+        self, calls: Mapping[str, Mapping[str, Any]], function: str, timeout: float = 10.0
+    ) -> dict[str, tuple[Envelope | Exception, float]]:
+        """Call a function of many devices at once; return answers or errors, and seconds.
+
+        No thread is started, and at most :data:`IN_FLIGHT` calls wait at a time: the next one leaves when an answer
+        has come.
+
+        Args:
+            calls: the arguments for each device.
+            function: its name.
+            timeout: seconds in which a device has to answer.
+        """
+        answers: dict[str, tuple[Envelope | Exception, float]] = {}
+        waiting = iter(calls.items())
+
+        async def work() -> None:
+            for device, params in waiting:
+                began = time.monotonic()
+                answer: Envelope | Exception
+                try:
+                    answer = await self._call(device, function, dict(params), timeout)
+                except (LookupError, TimeoutError, RuntimeError, MessagingError, ValidationError) as exc:
+                    answer = exc
+                answers[device] = answer, time.monotonic() - began
+
+        async def all_of_them() -> None:
+            await asyncio.gather(*(work() for _ in range(min(IN_FLIGHT, len(calls)))))
+
+        turns = -(-len(calls) // IN_FLIGHT)
+        self.run(all_of_them(), turns * timeout + 3.0)
+        return {device: answers[device] for device in calls}
 
     def events(
         self, device: str = "*", timeout: float | None = None, ready: threading.Event | None = None

@@ -26,7 +26,7 @@ from strands_robots.errors import StrandsRobotsError
 logger = logging.getLogger(__name__)
 
 PROBE_EVERY_S = 0.25
-"""Seconds between two probes while peers are collected."""
+"""Seconds between the first two probes while peers are collected; then twice as many each time."""
 
 PROBE_AGAIN_S = 0.04
 """Seconds from a new link to a second probe: the first may leave before both sides know their subscriptions."""
@@ -192,12 +192,14 @@ class Discovery:
         began = self._changed_at = loop.time()
         listing = asyncio.create_task(self._list(within))
         try:
-            probe_at, links = began, 0
+            probe_at, pause, links = began, PROBE_EVERY_S, 0
             while (now := loop.time()) < began + within:
                 if (linked := self._messaging.links) > links:
                     probe_at = self._changed_at = now
                 if now >= probe_at:
-                    probe_at = now + (PROBE_AGAIN_S if linked > links else PROBE_EVERY_S)
+                    probe_at = now + (PROBE_AGAIN_S if linked > links else pause)
+                    # Hundreds of devices answer each probe.
+                    pause *= 1 if linked > links else 2
                     await self._messaging.publish(f"{self._root}.discovery.probe", b'{"probe": true}')
                 links = linked
                 if named and self._registry_heard(listing, now - began) and now - self._changed_at >= settled:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from device_connect_edge.drivers import DeviceDriver, rpc
 from fixtures.nats_server import NatsServer
-from fixtures.toy_robots import ToyWorld
+from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.device_connect import (
@@ -199,3 +199,34 @@ def answers(fleet: FleetClient) -> bool:
         return fleet.call("arm-1", "getStatus", timeout=5)["status"] == "success"
     except Exception:  # noqa: BLE001 - any failure means not yet
         return False
+
+
+def test_many_devices_are_asked_without_a_thread_for_each() -> None:
+    link = loopback_config(free_port())
+    robots = [ToyRobot(f"arm-{number}") for number in range(3)]
+    runtimes = [init_device_connect_sync(each, peer_id=each.tool_name_str, link=link) for each in robots]
+    try:
+        with FleetClient(link, "tester") as fleet:
+            eventually(lambda: len(fleet.peers()) == 3)
+            names = [*(each.tool_name_str for each in robots), *(f"absent-{number}" for number in range(200))]
+            most, over = [threading.active_count()], threading.Event()
+
+            def count() -> None:
+                while not over.wait(0.005):
+                    most.append(threading.active_count())
+
+            counting = threading.Thread(target=count)
+            counting.start()
+            answers = fleet.call_each({name: {} for name in names}, "getStatus", 5.0)
+            over.set()
+            counting.join()
+            assert list(answers) == names
+            assert all(isinstance(answers[f"arm-{each}"][0], dict) for each in range(3))
+            assert all(isinstance(answers[f"absent-{each}"][0], NoSuchDeviceError) for each in range(200))
+            # The counter, and a worker for each robot that is read.
+            assert max(most) <= most[0] + 1 + 2 * len(robots)
+    finally:
+        for runtime in runtimes:
+            stop_device_connect(runtime)
+        for robot in robots:
+            robot.close()
