@@ -155,7 +155,12 @@ _declare(
         "",
         "Ed25519 keys (base64url) of consoles on other machines that may move real hardware on the mesh.",
     ),
-    Setting("STRANDS_MESH_POLICY_HOST_ALLOW", "list", "", "Hosts and CIDRs of policy servers besides loopback."),
+    Setting(
+        "STRANDS_MESH_POLICY_HOST_ALLOW",
+        "list",
+        "",
+        "Hosts and CIDRs of policy servers besides loopback; a name is resolved once.",
+    ),
     Setting("STRANDS_MESH_HF_REPO_ALLOW", "list", "", "Hub organisations of checkpoints besides the built-in three."),
     Setting("STRANDS_MESH_POSE_HZ", "number", "10", "Pose messages a second.", -1, 1000),
     Setting("STRANDS_MESH_IMU_HZ", "number", "10", "IMU messages a second.", -1, 1000),

@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
+from strands_robots import settings
 from strands_robots.safety.approval import state_dir
 
 if TYPE_CHECKING:
@@ -75,6 +76,35 @@ def meeting_problem(link: LinkConfig) -> str:
     if kind == "stranger":
         return f"{where}, which is no robot process: robots of other processes are not found. {remedy}"
     return f"{where}: its robots and this one share a network, and either user can drive both. {remedy}"
+
+
+def mesh_problems() -> list[str]:
+    """Return one sentence for each reason why a robot on the mesh is not ready."""
+    return [each for each in (mesh_port_problem(), state_problem()) if each]
+
+
+def mesh_port_problem(*, answers: bool = True) -> str:
+    """Return who else has the mesh's port; empty for a robot process of this user.
+
+    Args:
+        answers: a mesh answers there. A Zenoh router in Python is then not told from a robot process.
+    """
+    stated = (settings.raw(name) for name in ("ZENOH_CONNECT", "ZENOH_LISTEN"))
+    if any(stated) or settings.raw("STRANDS_MESH_BACKEND").lower() not in ("", "zenoh", "bridge"):
+        return ""
+    number = settings.integer("STRANDS_MESH_PORT")
+    uid, holder = port_holder(number)
+    where = f"The mesh's port {number} is held by {holder}"
+    remedy = "End it, or choose another port with --port or STRANDS_MESH_PORT."
+    if not answers:
+        held = f"{where}, and no mesh answers there: robots of other processes are not found. {remedy}"
+        return "" if uid is None else held
+    if uid not in (None, os.getuid()):
+        return f"{where}: its robots and this one share a mesh, and either user can stop and see both. {remedy}"
+    program = holder.partition("(")[2]
+    if uid is not None and program and not program.startswith(("python", "strands-robots")):
+        return f"{where}, which is no robot process: robots of other processes may not be found. {remedy}"
+    return ""
 
 
 def port_holder(port: int) -> tuple[int | None, str]:

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +22,7 @@ from strands_robots import settings
 from strands_robots.cli.command import OnMesh, assignments, command, parse_ports
 from strands_robots.cli.network import Network, describe, mesh_peer
 from strands_robots.cli.output import CliError, Screen, first_line, label, plain, table
-from strands_robots.cli.readiness import shortcomings
+from strands_robots.cli.readiness import mesh_port_problem, mesh_problems, shortcomings
 from strands_robots.cli.record import record_robot
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import text_of
@@ -198,8 +198,16 @@ def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, pi
 
 @contextmanager
 def _on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> Iterator[str]:
-    with mesh_peer(body, peer_id, mode) as mesh:
-        screen.data({"event": "serving", "peer_id": mesh.peer_id, "network": "mesh", "pid": os.getpid()})
+    with ExitStack() as joined:
+        try:
+            mesh = joined.enter_context(mesh_peer(body, peer_id, mode))
+        except CliError as exc:
+            raise CliError(f"{exc} {mesh_port_problem(answers=False)}".strip(), exc.code) from exc
+        lacking = mesh_problems()
+        facts = {"peer_id": mesh.peer_id, "network": "mesh", "pid": os.getpid(), "not_ready": lacking}
+        screen.data({"event": "serving", **facts})
+        for each in lacking:
+            screen.say(f"NOT READY. {each}", "bold red")
         screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: strands-robots peers --mesh", "green")
         screen.say("Ctrl-C stops the robot, then takes it off the mesh.")
         yield mesh.peer_id

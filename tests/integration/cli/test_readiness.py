@@ -15,7 +15,14 @@ import zenoh
 from fixtures.command_line import WITHIN_S, Machine
 from fixtures.waiting import eventually, free_port
 
-from strands_robots.cli.readiness import driver_problem, meeting_problem, port_holder, state_problem
+from strands_robots.cli import readiness
+from strands_robots.cli.readiness import (
+    driver_problem,
+    meeting_problem,
+    mesh_port_problem,
+    port_holder,
+    state_problem,
+)
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.backends.zenoh_session import acquire, release
 from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
@@ -52,6 +59,24 @@ def test_served_robot_names_the_program_that_has_its_meeting_port(held: int, tmp
         (why,) = ready["not_ready"]
     assert f"port {held} is held by pid {os.getpid()} " in why
     assert "no robot process" in why
+
+
+def test_robot_on_the_mesh_names_the_program_that_has_its_port(held: int, tmp_path: Path) -> None:
+    machine = Machine(tmp_path, STRANDS_MESH_PORT=str(held))
+    done = machine.run("serve", "so100", "--mesh", "--peer-id", "arm-1")
+    assert done.returncode == 1
+    said = " ".join((done.stdout + done.stderr).split())
+    assert f"The mesh's port {held} is held by pid {os.getpid()} " in said
+    assert "no mesh answers there" in said
+
+
+def test_port_of_the_mesh_that_another_user_or_program_has_is_named(held: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_PORT", str(held))
+    assert mesh_port_problem() == ""
+    monkeypatch.setattr(readiness, "port_holder", lambda port: (os.getuid() + 1, "pid 7 (python) of user other"))
+    assert f"port {held} is held by pid 7 (python) of user other: its robots and this one share" in mesh_port_problem()
+    monkeypatch.setattr(readiness, "port_holder", lambda port: (os.getuid(), "pid 7 (rmw_zenohd) of user me"))
+    assert "pid 7 (rmw_zenohd) of user me, which is no robot process" in mesh_port_problem()
 
 
 def test_router_on_the_meeting_port_is_named_and_a_robot_process_is_none() -> None:
