@@ -40,3 +40,5 @@ def test_a_strands_agent_puts_the_cube_on_the_plate(site: McpSite) -> None:
     assert cube[1]["y"] == pytest.approx(PLATE[1], abs=0.03), cube
     seen = str(model.seen[-1])
     assert "image" in seen, "the model was shown no picture"
+    # Its threads began in this test.
+    site.close_arm()
