@@ -6,7 +6,10 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from click.testing import Result
+
+from strands_robots.policies.mock import MockPolicy
 
 Run = Callable[..., Result]
 
@@ -23,3 +26,13 @@ def test_the_command_prints_the_rates_and_keeps_a_recording_of_each_episode(run:
     again = run(*arguments, "--output", str(folder))
     assert again.exit_code == 2
     assert "must be a new folder" in again.output + again.stderr
+
+
+def test_a_failing_policy_is_told_with_exit_code_1(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(policy: MockPolicy, observation: object) -> None:
+        raise OSError("no GPU")
+
+    monkeypatch.setattr(MockPolicy, "act", lost)
+    result = run("eval", "--policy", "mock", "--task", "reach", "--episodes", "1", "--output", str(tmp_path / "out"))
+    assert result.exit_code == 1
+    assert "mock failed: OSError: no GPU" in result.output + result.stderr

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.checkpoints import write_dataset
 
 from strands_robots import policies
 from strands_robots.policies.base import PolicyError
-from strands_robots.policies.bench import measure
+from strands_robots.policies.bench import StillBody, measure
 from strands_robots.policies.profiles import Profile, load_profiles
 
 KEYS = ["pan", "lift"]
@@ -56,6 +58,11 @@ def test_the_figures_of_a_policy_that_is_fast_enough(profile: Profile) -> None:
     assert rows["latency"].budget == "200 ms, the steps that are played"
     assert found.loop["inferences"] >= 4
     assert found.loop["latency_p50_ms"] >= 20
+
+
+def test_the_body_stands_in_the_middle_of_the_data(profile: Profile, tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", KEYS, low=10.0, high=30.0)
+    assert StillBody(replace(profile, dataset=str(data))).get_joints() == dict.fromkeys(KEYS, 20.0)
 
 
 def test_a_policy_slower_than_its_steps_misses_its_budget(profile: Profile, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,6 +50,8 @@ class Counting:
 class Continuing(Counting):
     """Notes what it is told for real-time chunking."""
 
+    continues = True
+
     def __init__(self) -> None:
         super().__init__()
         self.told: list[tuple[int, int]] = []

@@ -11,7 +11,7 @@ import typer
 
 from strands_robots import settings
 from strands_robots.cli.command import command
-from strands_robots.cli.output import Screen, table
+from strands_robots.cli.output import CliError, Screen, table
 from strands_robots.cli.policy import PoliciesFile
 from strands_robots.utils import ValidationError, missing_extra, number, whole
 
@@ -83,3 +83,6 @@ def evaluate(
     write_plot(plot, f"{task} on {robot}, {count} episodes", found)
     screen.show(table("", HEADINGS, rows_of(found)))
     screen.say(f"Recordings and plot: {folder}/")
+    failed = {name: error for name, each in found.items() if (error := next((e.error for e in each if e.error), ""))}
+    if failed:
+        raise CliError("; ".join(f"{name} failed: {error}" for name, error in failed.items()))

@@ -13,7 +13,7 @@ from typing import Any
 from strands_robots.contract import RolloutEvent
 from strands_robots.policies import create_policy
 from strands_robots.policies.base import Action, PolicyError, Ranges
-from strands_robots.policies.check import RobotFacts
+from strands_robots.policies.check import RobotFacts, statements_of
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.rollout import Rollout, RolloutObservers
@@ -50,7 +50,7 @@ class BenchResult:
 
 
 class StillBody:
-    """Body of a profile's keys that stands still, and notes when it is written to."""
+    """Body of a profile's keys that stands still, and notes each look and each write."""
 
     name = "bench"
     speeds: Mapping[str, float] = {}
@@ -58,11 +58,17 @@ class StillBody:
     def __init__(self, profile: Profile) -> None:
         self._profile = profile
         self._joints = dict.fromkeys((*profile.state, *profile.environment, *profile.action), 0.0)
+        for each in statements_of(profile):
+            if each.state_range is not None and len(each.state_range[0]) == len(profile.state):
+                # In the middle of the data, or the check refuses to begin.
+                middle = [(low + high) / 2 for low, high in zip(*each.state_range, strict=True)]
+                self._joints |= dict(zip(profile.state, middle, strict=True))
         self._pictures: dict[str, Any] = {}
         if profile.cameras:
             numpy = import_module("numpy")
             for camera in profile.cameras:
                 self._pictures[camera.camera] = numpy.zeros((*(camera.size or PICTURE), 3), numpy.uint8)
+        self.observed: list[float] = []
         self.written: list[float] = []
 
     @property
@@ -70,9 +76,10 @@ class StillBody:
         return dict.fromkeys(self._profile.action, (-1e9, 1e9))
 
     def get_observation(self) -> dict[str, Any]:
-        return {**self._joints, **self._pictures}
+        return {**self.get_joints(), **self._pictures}
 
     def get_joints(self) -> dict[str, float]:
+        self.observed.append(time.perf_counter())
         return dict(self._joints)
 
     def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
@@ -119,17 +126,18 @@ def measure(profile: Profile, hz: float, seconds: float) -> BenchResult:
         observers=observers,
         policy_name=profile.name,
     )
+    body.observed.clear()
     rollout.run()
     if rollout.error:
         raise PolicyError(rollout.error)
-    return BenchResult(_rows(profile, hz, loaded_s, body.written, finished[0].loop), finished[0].loop)
+    return BenchResult(_rows(profile, hz, loaded_s, body.observed, finished[0].loop), finished[0].loop)
 
 
 def _rows(
-    profile: Profile, hz: float, loaded_s: float, written: list[float], loop: Mapping[str, float]
+    profile: Profile, hz: float, loaded_s: float, observed: list[float], loop: Mapping[str, float]
 ) -> tuple[BenchRow, ...]:
     period_ms = 1000 / hz
-    gaps = sorted(1000 * (after - before) for before, after in itertools.pairwise(written)) or [0.0]
+    gaps = sorted(1000 * (after - before) for before, after in itertools.pairwise(observed)) or [0.0]
     p99 = gaps[int(0.99 * (len(gaps) - 1))]
     steps = profile.horizon or profile.chunk
     budget_ms = 1000 * steps / (profile.rate or hz) if steps else 1000 * profile.deadline_s

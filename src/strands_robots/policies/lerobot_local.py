@@ -52,6 +52,8 @@ class LeRobotPolicy:
         self._checkpoint = str(Path(profile.checkpoint).expanduser())
         self.uses_cameras = bool(profile.cameras)
         self.every_tick = _needs_every_tick(Path(self._checkpoint))
+        self.continues = profile.rtc
+        self._answered: Any = None
         self._instruction = ""
         self._loaded: tuple[Any, Any, Any] | None = None
 
@@ -64,12 +66,20 @@ class LeRobotPolicy:
         self._loaded = _MODELS.take(self._key, self._load)
         for each in self._loaded:
             each.reset()
-        self._instruction = instruction
+        self._instruction, self._answered = instruction, None
 
     def act(self, observation: Mapping[str, Any]) -> list[Action]:
         if self._loaded is None:
             raise PolicyError("it was not reset")
         return self._computed(self._loaded, observation, self._instruction)
+
+    def act_on(self, observation: Mapping[str, Any], *, played: int, delay: int) -> list[Action]:
+        """Return a chunk that goes on from the last one; see :class:`RealTimeChunking`."""
+        if self._loaded is None:
+            raise PolicyError("it was not reset")
+        left = None if self._answered is None else self._answered[:, played:]
+        chunk = {"inference_delay": delay, "prev_chunk_left_over": left}
+        return self._computed(self._loaded, observation, self._instruction, **chunk)
 
     def interrupt(self) -> None:
         """Do nothing: a forward pass cannot be interrupted."""
@@ -80,8 +90,8 @@ class LeRobotPolicy:
             _MODELS.give(self._key, loaded)
 
     @property
-    def _key(self) -> tuple[str, str]:
-        return self._checkpoint, self._profile.device
+    def _key(self) -> tuple[str, str, bool]:
+        return self._checkpoint, self._profile.device, self.continues
 
     def _load(self) -> tuple[Any, Any, Any]:
         """Return model and processors, after one inference that is thrown away.
@@ -95,6 +105,8 @@ class LeRobotPolicy:
             config.device = self._profile.device
         # Strictly: a weight that is missing would be a random one, with a line in the log.
         model = factory.get_policy_class(config.type).from_pretrained(self._checkpoint, config=config, strict=True)
+        if self.continues:
+            _enable_rtc(model, config)
         # A checkpoint that was saved on CUDA has processors that ask for it.
         on_device = {"device_processor": {"device": config.device}}
         before, after = factory.make_pre_post_processors(
@@ -118,7 +130,9 @@ class LeRobotPolicy:
             blank[camera.key.removeprefix(IMAGES)] = numpy.zeros((height, width, 3), numpy.uint8)
         return blank
 
-    def _computed(self, loaded: tuple[Any, Any, Any], seen: Mapping[str, Any], task: str) -> list[Action]:
+    def _computed(
+        self, loaded: tuple[Any, Any, Any], seen: Mapping[str, Any], task: str, **chunking: Any
+    ) -> list[Action]:
         """Return the chunk that the checkpoint answers, by the profile's action keys."""
         model, before, after = loaded
         numpy, torch, profile = import_module("numpy"), import_module("torch"), self._profile
@@ -127,9 +141,11 @@ class LeRobotPolicy:
             frame[ENVIRONMENT] = numpy.array([seen[key] for key in profile.environment], numpy.float32)
         frame |= {_feature(camera.key): seen[camera.key.removeprefix(IMAGES)] for camera in profile.cameras}
         utils = import_module("lerobot.policies.utils")
-        with torch.inference_mode():
+        # Real-time chunking differentiates, which inference mode forbids.
+        with torch.no_grad() if self.continues else torch.inference_mode():
             batch = before(utils.prepare_observation_for_inference(frame, torch.device(model.config.device), task, ""))
-            answer = model.select_action(batch) if self.every_tick else model.predict_action_chunk(batch)
+            answer = model.select_action(batch) if self.every_tick else model.predict_action_chunk(batch, **chunking)
+            self._answered = answer
             chunk = after(answer).to("cpu", torch.float64).numpy()
         chunk = chunk[0] if chunk.ndim == 3 else chunk
         if chunk.ndim != 2 or chunk.shape[1] != len(profile.action):
@@ -140,6 +156,18 @@ class LeRobotPolicy:
         if not numpy.isfinite(chunk).all():
             raise PolicyError("the checkpoint answered actions that are no finite numbers")
         return [dict(zip(profile.action, map(float, row), strict=True)) for row in chunk]
+
+
+def _enable_rtc(model: Any, config: Any) -> None:
+    """Have the model's chunks go on from one another.
+
+    Raises:
+        PolicyError: policies of its type cannot.
+    """
+    if not hasattr(config, "rtc_config") or not hasattr(model, "init_rtc_processor"):
+        raise PolicyError(f"a policy of the type {config.type} has no real-time chunking; leave rtc out")
+    config.rtc_config = import_module("lerobot.policies.rtc.configuration_rtc").RTCConfig(enabled=True)
+    model.init_rtc_processor()
 
 
 def _feature(key: str) -> str:

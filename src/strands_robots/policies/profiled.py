@@ -35,6 +35,9 @@ GRACE_S = 0.1
 class RealTimeChunking(Protocol):
     """Policy that makes a chunk go on from its last one, so that there is no seam."""
 
+    continues: bool
+    """False where this one does not."""
+
     def act_on(self, observation: Mapping[str, Any], *, played: int, delay: int) -> Sequence[Action] | None:
         """Return the next chunk.
 
@@ -198,7 +201,7 @@ class ProfiledPolicy:
         seen, pictures, played, delay = request
         for camera, given in pictures.items():
             seen[camera.key.removeprefix("observation.images.")] = picture(camera, given)
-        if isinstance(self._inner, RealTimeChunking):
+        if isinstance(self._inner, RealTimeChunking) and self._inner.continues:
             answer: object = self._inner.act_on(seen, played=played, delay=delay)
         else:
             answer = self._inner.act(seen)

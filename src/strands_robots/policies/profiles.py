@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from strands_robots import settings
-from strands_robots.utils import ValidationError, choice, identifier, mapping, number, shown, text, whole
+from strands_robots.utils import ValidationError, choice, flag, identifier, mapping, number, shown, text, whole
 
 UNITS = ("degrees", "radians", "normalized", "percent", "metres")
 LAYOUTS = ("libero", "droid", "aloha", "n1.5", "n1.6", "n1.6-flat")
@@ -61,6 +61,7 @@ class Profile:
         units: unit of the policy's numbers by key; the entry ``""`` is that of all others.
         rate: control steps a second at which the data was recorded; None where nothing states it.
         horizon: actions that are played of each answer; None for all.
+        rtc: make each chunk go on from the last one, where the checkpoint can.
         layout: form of a server's observation, of :data:`LAYOUTS`; empty for the provider's first.
         parts: the keys in each of a GR00T server's parts, in its order.
         task: the text that the policy was trained with; empty takes the caller's instruction.
@@ -84,6 +85,7 @@ class Profile:
     rate: float | None = None
     chunk: int | None = None
     horizon: int | None = None
+    rtc: bool = False
     layout: str = ""
     parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     task: str = ""
@@ -275,6 +277,7 @@ _ENTRIES: dict[str, Callable[[str, object], Any]] = {
     "rate": lambda name, value: number(name, value, low=0.1, high=RATE_MAX),
     "chunk": lambda name, value: whole(name, value, low=1, high=10_000),
     "horizon": lambda name, value: whole(name, value, low=1, high=10_000),
+    "rtc": flag,
     "layout": lambda name, value: choice(name, value, LAYOUTS),
     "parts": lambda name, value: {part: _order(f"{name}.{part}", keys) for part, keys in mapping(name, value).items()},
     "task": _text(2000),

@@ -132,6 +132,46 @@ def test_a_policy_that_needs_every_observation_gets_every_one(make: Make, tmp_pa
     assert policy.counts()["underruns"] == 0
 
 
+FRONT = "observation.images.front"
+WEBCAM = f'[tiny.cameras.webcam]\nkey = "{FRONT}"\nsize = [64, 64]'
+
+
+def test_smolvla_plays_its_chunks_and_is_told_the_task(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    checkpoint = tiny.smolvla(tmp_path / "smolvla", images={FRONT: (64, 64)})
+    policy = make(checkpoint, cameras=WEBCAM, task="pick up the cube", horizon=5)
+    written = played(policy, 12, webcam=numpy.zeros((64, 64, 3), numpy.uint8))
+    assert (len(written), policy.counts()["inferences"]) == (12, 3)
+
+
+def test_with_real_time_chunking_a_chunk_goes_on_from_the_last_one(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    checkpoint = tiny.smolvla(tmp_path / "smolvla", images={FRONT: (64, 64)})
+    image = numpy.zeros((64, 64, 3), numpy.uint8)
+    seams = {}
+    for rtc in (False, True):
+        torch.manual_seed(3)
+        policy = make(checkpoint, cameras=WEBCAM, task="pick up the cube", rtc=rtc)
+        policy.reset("x", dict.fromkeys(JOINTS, (-1000000000.0, 1000000000.0)))
+        inner, seen = policy._inner, {**STATE, "front": image}
+        first = inner.act_on(seen, played=0, delay=0) if rtc else inner.act(seen)
+        second = inner.act_on(seen, played=5, delay=4) if rtc else inner.act(seen)
+        old, new = ([list(action.values()) for action in part] for part in (first[5:9], second[:4]))
+        seams[rtc] = float(numpy.abs(numpy.array(old) - numpy.array(new)).max())
+        policy.close()
+    # SmolVLA draws its noise anew for each chunk; with chunking, what is played meanwhile stays as it was.
+    assert seams[True] < 0.2 * seams[False]
+
+
+def test_a_type_without_real_time_chunking_says_so(make: Make, tmp_path: Path) -> None:
+    with pytest.raises(PolicyError, match="type act has no real-time chunking"):
+        make(tiny.act(tmp_path / "act"), rtc=True)
+
+
 def test_absent_weights_are_refused_and_never_random(make: Make, tmp_path: Path) -> None:
     checkpoint = tiny.act(tmp_path / "act")
     weights = load_file(checkpoint / "model.safetensors")
