@@ -42,7 +42,12 @@ def _declare(*settings: Setting) -> None:
 _declare(
     # The framework's own names, honoured as it documents them.
     Setting("DEVICE_CONNECT_ALLOW_INSECURE", "boolean", "false", "Opt in to a transport without authentication."),
-    Setting("DEVICE_CONNECT_DISCOVERY_MODE", "text", "d2d", "Discovery of devices: d2d (presence) or registry."),
+    Setting(
+        "DEVICE_CONNECT_DISCOVERY_MODE",
+        "text",
+        "d2d",
+        "Discovery of devices: d2d (device to device, by presence) or registry.",
+    ),
     Setting("MESSAGING_BACKEND", "text", "zenoh", "Transport of Device Connect: zenoh or nats."),
     Setting("MESSAGING_URLS", "list", "", "Broker or peer URLs of Device Connect."),
     Setting("MESSAGING_CREDENTIALS_FILE", "path", "", "Device Connect credentials file (JSON)."),
@@ -54,7 +59,7 @@ _declare(
     Setting("NATS_CREDENTIALS_FILE", "path", "", "NATS credentials file."),
     Setting("ZENOH_CONNECT", "list", "", "Zenoh endpoints to connect to, such as tcp/127.0.0.1:7447."),
     Setting("ZENOH_LISTEN", "list", "", "Zenoh endpoints to listen on."),
-    Setting("TENANT", "text", "default", "Device Connect tenant."),
+    Setting("TENANT", "text", "default", "Device Connect tenant: a fleet that sees no other one."),
     Setting("OTEL_EXPORTER_OTLP_ENDPOINT", "text", "", "Endpoint for traces of calls. Unset: none are recorded."),
     # Ours, on Device Connect.
     Setting(

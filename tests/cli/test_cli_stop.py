@@ -1,15 +1,18 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Collection
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 from tests.cli.conftest import FakeFleet, Run
 
-from strands_robots.cli.output import Exit
-from strands_robots.cli.stop import exit_code, progress_rows, report_rows, summary
+from strands_robots.cli.network import Network
+from strands_robots.cli.output import Exit, Screen
+from strands_robots.cli.stop import exit_code, progress_rows, report_rows, show_resume, summary
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
@@ -153,3 +156,39 @@ def test_stop_of_an_unknown_device_names_the_near_ones(run: Run, fleet: FakeFlee
     result = run("stop", "amr-1")
     assert result.exit_code == 3
     assert "Near it: arm-1." in result.stderr
+
+
+@pytest.fixture
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A state directory without a key, and a working directory of its own."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path / "state"))
+    return tmp_path / "state"
+
+
+def printed_commands(capsys: pytest.CaptureFixture[str], flags: str) -> list[str]:
+    show_resume(Screen(), None, flags)
+    return [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+
+
+def test_printed_resume_names_the_operators_key_that_is_found(state: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    state.mkdir()
+    (state / "operator.pem").touch()
+    network = Network(connect=["tcp/10.0.0.1:7447"], tenant="lab 1", insecure=True)
+    assert printed_commands(capsys, network.flags) == [
+        f"strands-robots resume --key {state}/operator.pem --connect tcp/10.0.0.1:7447 --tenant 'lab 1' --insecure"
+    ]
+
+
+def test_without_an_operators_key_the_line_that_makes_it_is_printed(
+    state: Path, tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here, making = printed_commands(capsys, "")
+    assert here == "strands-robots resume --local"
+    passphrase = tmp_path / "passphrase"
+    passphrase.write_text("Correct-Horse-7-Battery\n")
+    passphrase.chmod(0o600)
+    assert run(*shlex.split(making)[1:], "--passphrase-file", str(passphrase)).exit_code == 0
+    [then] = printed_commands(capsys, "")
+    assert then == f"strands-robots resume --key {state}/operator.pem"

@@ -13,6 +13,7 @@ import typer
 
 from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Exit, Screen
+from strands_robots.safety.approval import state_dir
 from strands_robots.safety.ed25519 import keygen, load_signing_key
 
 T = TypeVar("T")
@@ -135,6 +136,11 @@ def acl(
     screen.copyable(f"export STRANDS_MESH_ACL_FILE={shlex.quote(str(file.resolve()))}")
 
 
+def operator_key() -> Path:
+    """Return the usual place of the operator's key."""
+    return state_dir() / "operator.pem"
+
+
 def signing_key(path: Path, passphrase_file: Path | None = None) -> Any:
     """Return the private key in ``path``.
 
@@ -171,6 +177,8 @@ def _make_key(screen: Screen, file: Path, passphrase_file: Path | None, setting:
     if passphrase_file is None and _passphrase("Again: ") != passphrase:
         raise CliError("The two passphrases differ.", Exit.USAGE)
     try:
+        if file == operator_key():
+            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         public = keygen(file, passphrase)
     except OSError as exc:
         raise CliError(f"{file} was not written: {exc}") from exc

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
@@ -52,7 +53,7 @@ class Network:
     )
     multicast: Annotated[bool, _option("--multicast", "Find peers on the local network by multicast.")] = False
     port: Annotated[int | None, _option("--port", "Loopback port where local robots meet.", min=1, max=65535)] = None
-    tenant: Annotated[str | None, _option("--tenant", "Device Connect tenant.")] = None
+    tenant: Annotated[str | None, _option("--tenant", "Device Connect tenant: a fleet that sees no other one.")] = None
     insecure: Annotated[bool, _option("--insecure", "Accept a transport without authentication.")] = False
     tls_ca: Annotated[Path | None, _option("--tls-ca", "Authority that peers are checked against (PEM).")] = None
     tls_cert: Annotated[Path | None, _option("--tls-cert", "This side's certificate (PEM).")] = None
@@ -95,6 +96,18 @@ class Network:
                 yield fleet
         except MessagingError as exc:
             raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
+
+    @property
+    def flags(self) -> str:
+        """The flags as given, without passwords, for another command."""
+        words = []
+        for each in fields(self):
+            value, flag = getattr(self, each.name), f"--{each.name.replace('_', '-')}"
+            if isinstance(value, list):
+                words += [word for one in value for word in (flag, redacted(one))]
+            elif value is not None and value is not False:
+                words += [flag] if value is True else [flag, str(value)]
+        return "".join(f" {shlex.quote(word)}" for word in words)
 
     def use_mesh(self) -> None:
         """Apply the flags to the native mesh, which takes only ``--port``.
@@ -177,7 +190,7 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
 
 
 def near_devices(fleet: FleetClient, device: str) -> str:
-    """Return a sentence with the ids that resemble one that is not there, else empty."""
+    """Return a sentence with the ids that resemble an absent one."""
     names = [peer.id for peer in fleet.peers(1.0)]
     return "" if device in names else _near(device, names)
 

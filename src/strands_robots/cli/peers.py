@@ -13,6 +13,7 @@ from rich.text import Text
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, first_line, label, plain, table
+from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
 from strands_robots.utils import WAIT_S, number
 
@@ -51,8 +52,12 @@ def peers(
         found = [peer for peer in found if peer.id == device]
     if not found:
         who = "No robot" if device is None else f"No {device!r}"
-        raise CliError(f"{who} answered. {describe(fleet.link)}", Exit.SILENT, peers=[], stale=fleet.stale)
-    screen.data({"status": "success", "peers": [_facts(peer) for peer in found], "stale": fleet.stale})
+        said = f"{who} answered. {describe(fleet.link)} {other_user(fleet.link)}".rstrip()
+        raise CliError(said, Exit.SILENT, peers=[], stale=fleet.stale)
+    whose = other_user(fleet.link)
+    screen.data({"status": "success", "peers": [_facts(peer) for peer in found], "stale": fleet.stale, "whose": whose})
+    if whose:
+        screen.say(whose, "yellow")
     if device is not None:
         _show_functions(screen, found[0])
         return
@@ -86,6 +91,7 @@ def call(
 ) -> None:
     """Call a function of a device. A value is read as JSON where that is possible, else as text."""
     params = assignments(arguments or [])
+    whose = ""
     seconds = number("--timeout", _usual_wait(function) if timeout is None else timeout, above=0, high=3600)
     if on_mesh:
         from strands_robots.tools.networks import NativeMesh  # noqa: PLC0415 - loaded when a network is used
@@ -94,9 +100,14 @@ def call(
         answer = NativeMesh().call(device, function, params, seconds)
     else:
         with network.fleet(source) as fleet:
-            answer = call_device(fleet, device, function, params, seconds)
+            whose = other_user(fleet.link)
+            try:
+                answer = call_device(fleet, device, function, params, seconds)
+            except CliError as failure:
+                raise CliError(f"{failure.reason} {whose}".rstrip(), failure.code, **failure.fields) from failure
     if is_error(answer):
-        raise CliError(plain(text_of(answer) or f"{device} refused {function}.", 2000), Exit.REFUSED, answer=answer)
+        said = f"{text_of(answer) or f'{device} refused {function}.'} {whose}".rstrip()
+        raise CliError(plain(said, 2000), Exit.REFUSED, answer=answer)
     screen.data(answer)
     screen.say(text_of(answer) or f"{device} answered {function}.", "green")
     for key, value in answer.items():

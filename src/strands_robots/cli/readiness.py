@@ -107,6 +107,20 @@ def mesh_port_problem(*, answers: bool = True) -> str:
     return ""
 
 
+def other_user(link: LinkConfig) -> str:
+    """Return who else serves robots at the meeting port, or empty."""
+    uid, holder = (None, "") if link.meet_port is None else port_holder(link.meet_port)
+    if uid is None or uid == os.getuid():
+        return ""
+    return f"Robots at the meeting port {link.meet_port} are served by {holder} (uid {uid}), not by you."
+
+
+def meeting_user(link: LinkConfig) -> str:
+    """Return the name of another user at the meeting port, or empty."""
+    uid = None if link.meet_port is None else port_holder(link.meet_port)[0]
+    return "" if uid is None or uid == os.getuid() else _user(uid)
+
+
 def port_holder(port: int) -> tuple[int | None, str]:
     """Return the user id and a description of what listens on a local TCP port.
 
@@ -114,7 +128,7 @@ def port_holder(port: int) -> tuple[int | None, str]:
     """
     for uid, inode in _listeners(port):
         who = f"user {_user(uid)}"
-        process = _process(inode)
+        process = _process(inode) or _robot_processes(uid)
         return uid, f"{process} of {who}" if process else f"a process of {who}"
     return None, "another program"
 
@@ -142,6 +156,17 @@ def _process(inode: str) -> str:
                 words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
                 return f"pid {folder.name} ({' '.join(Path(each).name for each in words[:3] if each)})"
     return ""
+
+
+def _robot_processes(uid: int) -> str:
+    """Return pid and command of a user's robot processes, or empty."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it ended
+            words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
+            if folder.stat().st_uid == uid and any("strands" in Path(each).name for each in words):
+                found.append(f"pid {folder.name} ({' '.join(Path(each).name for each in words[:4] if each)})")
+    return " or ".join(sorted(found)[:3])
 
 
 def _user(uid: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import threading
 from collections.abc import Mapping
 from concurrent.futures import Future, wait
@@ -12,9 +13,10 @@ import typer
 from rich.table import Table
 
 from strands_robots.cli.command import OnMesh, Timeout, command
-from strands_robots.cli.keys import PassphraseFile, signing_key
+from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
 from strands_robots.cli.network import SOURCE, Network, describe, near_devices
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
+from strands_robots.cli.readiness import meeting_user
 from strands_robots.envelope import Envelope, text_of
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import DEADLINE_S, Progress, SafetyController, StopReport
@@ -32,11 +34,9 @@ LATE_MS = 1000.0
 """A stop that left later than this after the press says so."""
 
 LOCKED = "They are locked until they are resumed:"
-LOCKED_HERE = "strands-robots resume --local"
-LOCKED_REMOTE = "strands-robots resume --key FILE, or resume --local at the machine of each"
-LOCKED_MESH = (
-    "They are locked until they are resumed: strands-robots resume --mesh --key FILE, or resume --local where they run."
-)
+LOCKED_THERE = "They are locked until they are resumed, at the machine of each robot:"
+BY_KEY = "Or from here, once the robots know the key that this makes (docs/safety.md):"
+RESUME_HERE = "strands-robots resume --local"
 CLAIMED = "Claimed is not proven: no enrolled robot signed it. Enroll robots with strands-robots enroll."
 LINK_WAIT_S = 2.0
 
@@ -118,7 +118,8 @@ def estop(
             raise CliError("estop --mesh stops every robot, and takes no DEVICE.", Exit.USAGE)
         network.use_mesh()
         on_key = None if key is None else signing_key(key, passphrase_file)
-        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason, on_key), f" {LOCKED_MESH}")
+        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason, on_key))
+        show_resume(screen, key, f" --mesh{network.flags}")
         return
     expected = [device_id("DEVICE", each) for each in devices or []]
     seconds = number("--deadline", deadline, above=0, high=600)
@@ -155,8 +156,31 @@ def estop(
         where = "" if report.link else f" {describe(link)}"
         raise CliError(plain(f"{answer['reason']}{where}", 2000), code, **facts)
     screen.data({"status": "success", **facts})
-    screen.say(LOCKED)
-    screen.copyable(f"  {LOCKED_HERE if link.loopback_only else LOCKED_REMOTE}")
+    if link.loopback_only:
+        user = meeting_user(link)
+        screen.say(LOCKED)
+        screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
+    else:
+        show_resume(screen, key, network.flags)
+
+
+def show_resume(screen: Screen, key: Path | None, flags: str) -> None:
+    """Print the command that frees robots of other machines.
+
+    Args:
+        screen: where.
+        key: the key that signed the stop; it is not an operator's.
+        flags: the network's.
+    """
+    held = next((each for each in (Path("operator.pem"), operator_key()) if each.is_file() and each != key), None)
+    if held is not None:
+        screen.say(LOCKED)
+        screen.copyable(f"  strands-robots resume --key {shlex.quote(str(held.resolve()))}{flags}")
+        return
+    screen.say(LOCKED_THERE)
+    screen.copyable(f"  {RESUME_HERE}")
+    screen.say(BY_KEY)
+    screen.copyable(f"  strands-robots keys resume {shlex.quote(str(operator_key()))}")
 
 
 class RunningStop:
@@ -322,7 +346,7 @@ def _show_outcomes(screen: Screen, outcomes: Mapping[str, tuple[bool | None, str
     screen.show(table("", ("robot", "answer", "what it said"), rows))
 
 
-def _report_mesh_stop(screen: Screen, answer: Envelope, then: str = "") -> None:
+def _report_mesh_stop(screen: Screen, answer: Envelope) -> None:
     """Print the mesh's answers; raise :class:`CliError` unless all confirmed."""
     moving, silent = answer.get("not_stopped", []), answer.get("silent", [])
 
@@ -334,7 +358,7 @@ def _report_mesh_stop(screen: Screen, answer: Envelope, then: str = "") -> None:
     if answer["status"] != "success":
         raise CliError(plain(text_of(answer), 2000), Exit.REFUSED if moving else Exit.SILENT, **facts)
     screen.data({"status": "success", **facts})
-    screen.say(f"{text_of(answer)}{then}", "green")
+    screen.say(text_of(answer), "green")
 
 
 def _facts(answer: Envelope) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from strands_robots.cli.readiness import (
     driver_problem,
     meeting_problem,
     mesh_port_problem,
+    other_user,
     port_holder,
     state_problem,
 )
@@ -51,6 +52,14 @@ def test_holder_of_a_port_is_told_with_process_and_user(held: int) -> None:
     assert uid == os.getuid()
     assert f"pid {os.getpid()} (" in holder
     assert f"user {getpass.getuser()}" in holder
+
+
+def test_second_user_is_told_whose_process_serves_the_robot(held: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    link, user = loopback_config(held), getpass.getuser()
+    assert other_user(link) == ""
+    monkeypatch.setattr(os, "getuid", lambda: 4321)
+    assert other_user(link).startswith(f"Robots at the meeting port {held} are served by pid {os.getpid()} (")
+    assert f"of user {user} (uid " in other_user(link)
 
 
 def test_served_robot_names_the_program_that_has_its_meeting_port(held: int, tmp_path: Path) -> None:
