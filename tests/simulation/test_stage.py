@@ -143,7 +143,7 @@ def test_broken_file_is_refused_and_the_world_is_unchanged(empty: Simulation, tm
     empty.add_robot("so100")
     answer = empty.add_robot("other", str(path))
     assert answer["status"] == "error"
-    assert "cannot be loaded" in answer["reason"]
+    assert "is no XML" in answer["reason"]
     assert empty.list_robots() == ["so100"]
 
 

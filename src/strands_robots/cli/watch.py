@@ -76,6 +76,8 @@ def watch(
         with fleet.subscription(device, signs.take):
             frames = follow(signs, longest, device)
             if screen.machine:
+                for function, answer in _present_answers(fleet, device):
+                    screen.data({"device": device, "event": function, "payload": answer})
                 for events, _ in frames:
                     for event in events:
                         screen.data({"device": event.device, "event": event.name, "payload": dict(event.payload)})
@@ -292,10 +294,16 @@ def _finite(value: object) -> TypeGuard[int | float]:
 def _present_state(fleet: FleetClient, device: str, limits: Mapping[str, Range]) -> DeviceView:
     """Return a view of the device now; an idle robot may send no joints."""
     view = DeviceView(device, limits)
+    for _, answer in _present_answers(fleet, device):
+        view.take_state(answer)
+    return view
+
+
+def _present_answers(fleet: FleetClient, device: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield its present state by function; an idle one sends none for 10 s."""
     for function in ("getState", "getStatus"):
         with contextlib.suppress(CliError):  # a device answers one of the two
-            view.take_state(call_device(fleet, device, function, {}, 3.0))
-    return view
+            yield function, call_device(fleet, device, function, {}, 3.0)
 
 
 def _draw_live(screen: Screen, view: DeviceView, frames: Iterator[Frame]) -> None:

@@ -88,11 +88,16 @@ def test_second_robot_of_the_same_id_is_refused(machine: Machine, arm: dict[str,
     assert "arm-1" in said["reason"]
 
 
-def test_watch_prints_one_json_value_a_line(machine: Machine, arm: dict[str, Any]) -> None:
+def test_watch_prints_the_present_state_then_events_as_one_json_value_a_line(
+    machine: Machine, arm: dict[str, Any]
+) -> None:
+    assert machine.run("call", "arm-1", "execute", "instruction=wave", "duration=60").returncode == 0
     result = machine.run("watch", "arm-1", "--for", "4", "--json")
-    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert machine.run("stop", "arm-1").returncode == 0
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
     assert result.returncode == 0
-    assert {"observationUpdate"} <= {event["event"] for event in events}
+    assert lines[0]["event"] in {"getState", "getStatus"}
+    assert "observationUpdate" in {line["event"] for line in lines}
 
 
 def test_watched_robot_that_is_killed_is_silent_and_exit_3(machine: Machine) -> None:
