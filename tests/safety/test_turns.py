@@ -7,9 +7,10 @@ from collections.abc import Collection, Iterator
 
 import pytest
 
+from strands_robots.safety import controller as controller_module
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.estop_listener import OnEvent, OnState
-from strands_robots.safety.turns import SWITCH_S, shorten_turns
+from strands_robots.safety.turns import SWITCH_S, ShortTurns
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +35,8 @@ class NoLink:
 
 
 def test_turns_are_short_until_the_last_of_their_users_has_ended() -> None:
-    first, second = shorten_turns(), shorten_turns()
+    turns = ShortTurns()
+    first, second = turns.begin(), turns.begin()
     first()
     first()
     assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
@@ -44,13 +46,15 @@ def test_turns_are_short_until_the_last_of_their_users_has_ended() -> None:
 
 def test_turns_that_are_shorter_already_stay() -> None:
     sys.setswitchinterval(0.0001)
-    end = shorten_turns()
+    end = ShortTurns().begin()
     assert sys.getswitchinterval() == pytest.approx(0.0001, rel=0.05)
     end()
     assert sys.getswitchinterval() == pytest.approx(0.0001, rel=0.05)
 
 
-def test_open_safety_controller_has_short_turns() -> None:
+def test_open_safety_controller_has_short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Whatever ran before in this process may have shortened its turns already.
+    monkeypatch.setattr(controller_module, "shorten_turns", ShortTurns().begin)
     controller = SafetyController("safety-1", NoLink)
     assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
     controller.close()
