@@ -98,9 +98,11 @@ def test_unknown_spelling_is_no_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
         insecure_opt_in(None, LinkConfig(), stated=False)
 
 
-def test_stated_loopback_link_is_an_opt_in_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+def test_stated_loopback_link_is_an_opt_in_that_is_logged_without_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
     assert insecure_opt_in(None, loopback_config(7000), stated=True)
     assert "127.0.0.1" in caplog.text
+    assert all(record.levelno == logging.INFO for record in caplog.records)
     with pytest.raises(ValidationError):
         insecure_opt_in(None, loopback_config(7000), stated=False)
     with pytest.raises(ValidationError):
