@@ -117,6 +117,17 @@ async def test_subscription_that_ended_is_handed_over_no_more() -> None:
     assert client.taken == [(OWN, "a.b", "", b"late", None)]
 
 
+@pytest.mark.parametrize("subject", [b"a.\xff", b"a.\x0b7", b"a.\x0b\x0b1\x0c", b"\x0b", b"a\x0c1\x0c2\x0c3"])
+@pytest.mark.parametrize("number", [OWN, OTHER])
+@pytest.mark.parametrize("head", [b"", b"NATS/1.0\r\n\r\n"])
+async def test_subject_that_is_no_text_loses_no_message_behind_it(subject: bytes, number: int, head: bytes) -> None:
+    made, client, received = parser()
+    verb, sizes = (b"HMSG", b"%d %d" % (len(head), len(head) + 3)) if head else (b"MSG", b"3")
+    await made.parse(b"%s %s %d %s\r\n%sabc\r\n" % (verb, subject, number, sizes, head) + framed(OWN, "a.b", b"next"))
+    assert received == [("a.b", "", b"next")]
+    assert client.taken == []
+
+
 @pytest.mark.parametrize("line", [b"MSG a 1 -3\r\n", b"MSG a\r\n", b"HMSG a 1 b 2 3 x\r\n", b"\r\n", b"NOISE\r\n"])
 async def test_another_protocol_is_an_error(line: bytes) -> None:
     made, _, _ = parser()
