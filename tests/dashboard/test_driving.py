@@ -118,6 +118,21 @@ async def test_page_that_has_gone_halts_what_it_held_even_without_a_jog(page: Pa
     assert page.feed.stops == 1
 
 
+@pytest.mark.parametrize("verb", ["acquireControl", "takeControl"])
+async def test_robot_that_is_given_to_a_page_that_has_gone_is_given_back(page: Page, verb: str) -> None:
+    if verb == "takeControl":
+        busy = error("agent-1 holds control", code="not_holder")
+        page.feed.answers["acquireControl"] = [busy, success("yours", lease_id="lease-1")]
+    page.feed.slow[verb] = asyncio.Event()
+    taking = asyncio.create_task(page.take())
+    await until(lambda: page.feed.asked(verb))
+    await page.control.leave()
+    page.feed.slow[verb].set()
+    assert is_error(await taking)
+    assert page.feed.asked("releaseControl") == [{"lease_id": "lease-1"}]
+    assert not page.control.holds(KEY)
+
+
 async def test_command_that_the_stop_may_have_overtaken_is_stopped_again(page: Page) -> None:
     await page.take()
     page.feed.slow["moveJoints"] = asyncio.Event()

@@ -140,6 +140,7 @@ class HandControl:
         self._tell = tell
         self._held: dict[str, HeldRobot] = {}
         self._taking: set[str] = set()
+        self._gone = False
 
     def lease(self, key: str) -> dict[str, str]:
         """Return the lease as an argument of a motion; empty where the robot is not held."""
@@ -167,7 +168,12 @@ class HandControl:
             lease = answer.get(LEASE_ID)
             if is_error(answer) or not isinstance(lease, str):
                 return answer if is_error(answer) else error(f"{robot} gave no lease.")
-            held = self._held[key] = HeldRobot(feed, robot, part, lease)
+            held = HeldRobot(feed, robot, part, lease)
+            if self._gone:
+                # Nobody is there to drive it, and nobody would ever give it back.
+                await feed.call(robot, "releaseControl", self._lease_of(held), ANSWER_S)
+                return error(f"The page has gone; {robot} was given back.")
+            self._held[key] = held
             held.renewing = asyncio.create_task(self._renew(key, held))
         finally:
             self._taking.discard(key)
@@ -211,6 +217,7 @@ class HandControl:
 
     async def leave(self) -> None:
         """Halt each robot that is held and give it back: the page has gone."""
+        self._gone = True
         held = list(self._held.items())
         for _, each in held:
             if each.jog is not None:
