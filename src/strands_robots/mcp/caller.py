@@ -16,7 +16,8 @@ from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import RUNNING
 from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
-from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.envelope import Envelope, error, is_error, text_of
+from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.verbs import LEASE_ID
 from strands_robots.tools.networks import stop_and_lock
 from strands_robots.utils import ValidationError
@@ -89,7 +90,7 @@ class Caller:
             answer = await motion.begin(verb, arguments, ANSWER_S + WAIT_S)
             while wait and str(answer.get("task_status", "")).lower() in RUNNING:
                 task = {"task_id": answer.get("task_id", ""), **_named(params)}
-                answer = await self._call(robot, "wait", task, ANSWER_S + WAIT_S)
+                answer = await self._followed(robot, "wait", task, ANSWER_S + WAIT_S)
             return answer
 
         return await self._halting(target, to_the_end)
@@ -105,7 +106,7 @@ class Caller:
             one = str(answer.get("robot_name") or params.get("robot_name") or "")
             while wait and not is_error(answer):
                 await asyncio.sleep(POLL_S)
-                answer = await self._call(robot, "getStatus", {}, ANSWER_S)
+                answer = await self._followed(robot, "getStatus", {}, ANSWER_S)
                 if not runs(answer, one):
                     break
             return answer
@@ -169,11 +170,13 @@ class Caller:
         (self._moving.discard if ended else self._moving.add)(motion)
 
     async def _halting(self, target: Target, work: Callable[[_Halting], Awaitable[Envelope]]) -> Envelope:
+        halting = _Halting(self, target)
         try:
-            async with _Halting(self, target) as motion:
+            async with halting as motion:
                 return await work(motion)
-        except DeviceTimeoutError as exc:
-            return error(f"{exc} What the call began was told to stop.")
+        except (DeviceTimeoutError, NoSuchDeviceError, MessagingError) as exc:
+            confirmed = f", which is not confirmed: {halting.moves}" if halting.moves else "."
+            return error(f"{exc} What the call began was told to stop{confirmed}")
 
     async def _renew(self) -> None:
         renewed_at = time.monotonic()
@@ -186,8 +189,8 @@ class Caller:
             await asyncio.gather(*(self._renew_one(target) for target in tuple(self._leases)))
 
     async def _renew_one(self, target: Target) -> None:
-        held = self._leases[target]
-        if held.live:
+        held = self._leases.get(target)
+        if held is not None and held.live:
             named = {"robot_name": target[1]} if target[1] else {}
             answer = await self.read(target[0], "renewControl", {LEASE_ID: held.lease_id, **named})
             # A motion carries it all the same: the robot's refusal says who has taken control.
@@ -213,6 +216,13 @@ class Caller:
         except (CallRefusedError, ValidationError, MessagingError) as exc:
             return error(str(exc))
 
+    async def _followed(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
+        """Ask about a motion that was begun; no answer ends its block, which halts it."""
+        try:
+            return await self.fleet.call_async(robot, verb, params, seconds)
+        except (CallRefusedError, ValidationError) as exc:
+            return error(str(exc))
+
     def _holds(self, target: Target) -> bool:
         held = self._leases.get(target)
         return held is not None and held.live
@@ -227,6 +237,8 @@ class _Halting:
 
     def __init__(self, caller: Caller, target: Target) -> None:
         self.target = target
+        self.moves = ""
+        """Why the robot may still move after the halt; empty once it has confirmed its stop."""
         self._caller = caller
         self._begun: asyncio.Task[Envelope] | None = None
 
@@ -250,11 +262,12 @@ class _Halting:
         with anyio.CancelScope(shield=True):
             for _attempt in range(STOPS_MAX):
                 answered = begun.done()
-                await self._caller.stop(*self.target)
+                stop = await self._caller.stop(*self.target)
+                self.moves = "" if grade(stop) is Outcome.STOPPED else text_of(stop)
                 # A stop may overtake the command that it is meant for, so one more follows until that is answered.
-                if answered:
+                if answered and not self.moves:
                     break
-                await asyncio.wait([begun], timeout=SETTLE_S)
+                await (asyncio.sleep(SETTLE_S) if answered else asyncio.wait([begun], timeout=SETTLE_S))
             begun.cancel()
 
 
