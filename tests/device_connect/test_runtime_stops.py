@@ -60,6 +60,22 @@ async def test_devices_of_a_link_share_one_subscription_that_outlives_its_holder
     assert not any(each.callbacks for each in clients)
 
 
+async def test_stop_that_comes_while_the_subscription_changes_hands_is_taken() -> None:
+    old, new = Device(Messaging()), Device(Messaging())
+    for each in (old, new):
+        await stops_of(LINK).join(each)
+    subscribe = new.runtime.messaging.subscribe_with_subject
+
+    async def slow(*args: Any, **options: Any) -> Any:
+        await old.runtime.messaging.callbacks[0](json.dumps({"params": {"reason": "x"}}).encode(), SUBJECT, None)
+        return await subscribe(*args, **options)
+
+    new.runtime.messaging.subscribe_with_subject = slow
+    await stops_of(LINK).leave(old)
+    assert new.stops == [("safety-1", {"reason": "x"})]
+    await stops_of(LINK).leave(new)
+
+
 @pytest.mark.parametrize("data", [b"no JSON", b"[1]", b"{}", b'"params"'])
 async def test_stop_that_cannot_be_read_is_left_to_the_listener(data: bytes) -> None:
     client = Messaging()

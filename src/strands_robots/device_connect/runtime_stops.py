@@ -87,8 +87,9 @@ class RuntimeStops:
         except (ValueError, KeyError, TypeError, RecursionError):
             logger.warning("An emergency stop on %s is not to be read; the e-stop listener judges it.", subject)
             return
-        if self._holder is not None:
-            await self._holder.on_estop(parts(subject)[2], payload)
+        # Not the holder: while the subscription passes from one device to the next there is none.
+        for device in self._devices[:1]:
+            await device.on_estop(parts(subject)[2], payload)
 
 
 _STOPS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], RuntimeStops] = {}
