@@ -44,7 +44,7 @@ def test_token_gives_its_role_and_no_other_token_gives_one() -> None:
     access = Access(HERE, {"secret-1": OPERATOR, "secret-2": VIEWER})
     assert access.role("secret-1", local=False) == OPERATOR
     assert access.role("secret-2", local=False) == VIEWER
-    for wrong in ("", "secret", None, 7, "sécret", ["secret-1"]):
+    for wrong in ("", "secret", None, 7, "sécret", "\ud800", ["secret-1"]):
         assert access.role(wrong, local=False) is None
     assert access.role("wrong", local=True) is None
 

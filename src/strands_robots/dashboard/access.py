@@ -75,7 +75,8 @@ class Access:
         given = token if isinstance(token, str) else ""
         found = None
         for known, role in self.tokens.items():
-            if hmac.compare_digest(known.encode(), given.encode()):
+            # JSON can carry what UTF-8 cannot, such as half of a surrogate pair.
+            if hmac.compare_digest(known.encode(), given.encode(errors="replace")):
                 found = role
         if found is None and local and not given:
             return self.local_role
