@@ -18,7 +18,8 @@ from strands_robots.device_connect.backends import loopback_config
 ARMS = ("arm-1", "arm-2", "arm-3")
 
 
-@pytest.fixture(scope="session")
+# Not of the session: Playwright's loop counts as running on this thread, where later tests run loops of their own.
+@pytest.fixture(scope="module")
 def chrome() -> Iterator[Any]:
     pytest.importorskip("playwright.sync_api")
     assert chromium(), "Chromium is not installed; run: make system"
