@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from strands_robots.safety import head_witness
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness, chosen
 
@@ -44,6 +46,15 @@ def test_three_machines_are_chosen_and_all_of_them_choose_alike() -> None:
     # It is spread: no machine witnesses all the others.
     counts = [sum(each in chosen(subject, audits) for subject in audits) for each in audits]
     assert max(counts) < 10
+
+
+@pytest.mark.parametrize("name", ["\ud800" * 32, "z" * 32, "A" * 32, "0" * 31 + "\n"])
+def test_head_of_a_log_with_an_impossible_name_is_left_out(name: str) -> None:
+    clock, written = Clock(), list[Any]()
+    receiver = witness(clock, written)
+    assert not receiver.receive("stranger", {"audit": {**answer(1)["audit"], "log": name}}, by="me")
+    assert receiver.receive("arm-2", answer(2), by="me")
+    assert written == [("me", "arm-2", 1, False)]
 
 
 def test_each_audit_of_a_fleet_is_written_by_three_machines() -> None:

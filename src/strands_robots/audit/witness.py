@@ -8,6 +8,7 @@ witness names.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -17,6 +18,8 @@ from strands_robots.audit.head import Anchor, log_id
 from strands_robots.audit.journal import Journal, parse
 
 WITNESS = "audit_witness"
+
+_LOG, _DIGEST = re.compile(r"[0-9a-f]{32}\Z"), re.compile(r"[0-9a-f]{64}\Z")
 
 
 def stated_head(head: Anchor | None) -> dict[str, Any] | None:
@@ -31,7 +34,7 @@ def witnessed(value: object) -> Anchor | None:
     log, count, last = (value.get(name) for name in ("log", "count", "last"))
     if not (isinstance(log, str) and isinstance(last, str) and isinstance(count, int)) or isinstance(count, bool):
         return None
-    return Anchor(log, count, last) if len(log) == 32 and len(last) == 64 and 0 < count < 2**53 else None
+    return Anchor(log, count, last) if _LOG.match(log) and _DIGEST.match(last) and 0 < count < 2**53 else None
 
 
 def compare(journal: Journal, files: Iterable[Path]) -> tuple[int, list[dict[str, Any]]]:
