@@ -222,6 +222,20 @@ def test_lease_ends_in_time_without_a_call() -> None:
     eventually(lambda: not watch.running, what="the end of the watch")
 
 
+def test_robot_that_fails_to_halt_keeps_no_other_lease_from_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    def fail(reason: str) -> None:
+        raise RuntimeError("no bus")
+
+    halted = threading.Event()
+    watch = LeaseWatch()
+    ControlLease("arm-1", fail, lambda: False, watched=watch.add).acquire("agent-a", "agent", 0.5)
+    other = ControlLease("arm-2", lambda reason: halted.set(), lambda: False, watched=watch.add)
+    other.acquire("agent-b", "agent", 0.7)
+    assert halted.wait(10.0)
+    assert "was not halted" in caplog.text
+    eventually(lambda: not watch.running, what="the end of the watch")
+
+
 @pytest.fixture
 def robot() -> Iterator[ToyRobot]:
     toy = ToyRobot()
