@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
+
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.dashboard import fleet_model
 from strands_robots.dashboard.fleet_model import FleetModel
@@ -44,6 +46,13 @@ def test_page_gets_only_what_changed_since_its_last_message() -> None:
     assert fleet.changes(number) == (number, "")
     fleet.task("dc", "arm-2", state="running", instruction="wave")
     assert [row["id"] for row in json.loads(fleet.changes(number)[1])["rows"]] == ["arm-2"]
+
+
+@pytest.mark.parametrize("left", [float("nan"), float("inf"), -float("inf"), 10**400, "soon", None])
+def test_impossible_time_of_a_check_in_ends_no_message_of_the_page(left: Any) -> None:
+    fleet = model()
+    fleet.report("dc", LockoutReport("arm-1", facts={"check_in": {"required": True, "time_left_s": left}}))
+    assert rows(fleet)[0]["check_in"] == {"left_s": 0.0}
 
 
 def test_steps_and_signs_of_life_are_left_for_the_slow_turn() -> None:

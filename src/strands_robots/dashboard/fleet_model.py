@@ -366,8 +366,12 @@ def _control(facts: object) -> dict[str, Any]:
     return {"held": True, "holder": _cut(holders[0].get("holder")), "kind": _cut(holders[0].get("kind"))}
 
 
+LEFT_MAX_S = 1e9
+
+
 def _check_in(facts: object) -> dict[str, Any] | None:
     if not isinstance(facts, Mapping) or facts.get("required") is not True:
         return None
     left = facts.get("time_left_s")
-    return {"left_s": round(float(left), 1) if isinstance(left, int | float) else 0.0}
+    # A number that JSON has no word for would end the messages of every page.
+    return {"left_s": round(float(left), 1) if isinstance(left, int | float) and abs(left) < LEFT_MAX_S else 0.0}
