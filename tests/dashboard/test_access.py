@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 
 from strands_robots.dashboard.access import OPERATOR, VIEWER, Access, is_local, loopback_origins
+from strands_robots.dashboard.listening import remote_address
+from strands_robots.utils import ValidationError
 
 HERE = loopback_origins(8800)
 PAGE = {"host": "127.0.0.1:8800", "origin": "http://127.0.0.1:8800"}
@@ -60,3 +62,9 @@ def test_loopback_needs_no_token_and_may_be_a_viewer() -> None:
 )
 def test_local_is_an_address_of_loopback(client: object, local: bool) -> None:
     assert is_local(client) is local
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "localhost", "LOCALHOST"])
+def test_loopback_is_refused_as_a_second_address_of_the_page(address: str) -> None:
+    with pytest.raises(ValidationError, match=r"--listen must be an address besides .* served anyway"):
+        remote_address(address, 8800)

@@ -195,6 +195,12 @@ def test_unsigned_takeover_is_refused(bench: Bench, assertion: object) -> None:
     assert bench.lease.take("mallory", "because", "arm-1", assertion)["code"] == "not_proven"
 
 
+@pytest.mark.parametrize("assertion", [None, {}])
+def test_takeover_without_an_assertion_is_told_the_command_that_signs_one(bench: Bench, assertion: object) -> None:
+    answer = bench.lease.take("mallory", "because", "arm-1", assertion)
+    assert "strands-robots take --key FILE" in answer["content"][0]["text"]
+
+
 def test_assertion_of_another_key_is_refused(bench: Bench) -> None:
     forged = sign_take(Ed25519PrivateKey.generate(), "arm-1", 0, clock=bench.clock)
     assert bench.lease.take("mallory", "because", "arm-1", forged)["code"] == "not_proven"

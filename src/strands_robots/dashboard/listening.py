@@ -15,6 +15,7 @@ from strands_robots.safety.approval import state_dir
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 FOLDER = "dashboard-keys"
+SERVED_ANYWAY = frozenset({"127.0.0.1", "localhost"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,8 @@ def remote_address(address: str, port: int) -> RemoteAddress:
     """Return the address with a certificate of ``mesh keys init`` and ``issue``.
 
     Raises:
-        ValidationError: ``address`` is no address or name of this machine, or means all of them.
+        ValidationError: ``address`` is no address or name of this machine, means all of them, or is where the page
+            is served anyway.
     """
     host = address.strip().strip("[]").lower()
     try:
@@ -67,6 +69,8 @@ def remote_address(address: str, port: int) -> RemoteAddress:
     else:
         if parsed.is_unspecified:
             raise ValidationError(f"--listen must be one address of this machine, not all of them ({address}).")
+    if host in SERVED_ANYWAY:
+        raise ValidationError(f"--listen must be an address besides {host}, where the page is served anyway.")
     folder = state_dir() / FOLDER
     if not (folder / CA_CERT).exists() or not (folder / CA_KEY).exists():
         init(folder, "strands-robots dashboard")

@@ -439,6 +439,8 @@ class ControlLease:
             if not self._hardware:
                 return None
             return "no operator's key is configured here (STRANDS_MESH_RESUME_PUBLIC_KEY; strands-robots keys resume)"
+        if not assertion:
+            return "it needs the operator's signature (assertion; strands-robots take --key FILE)"
         if not isinstance(assertion, Mapping) or set(assertion) != TAKE_FIELDS:
             return f"assertion must have exactly the fields {', '.join(sorted(TAKE_FIELDS))}"
         body = {name: value for name, value in assertion.items() if name != "sig"}
