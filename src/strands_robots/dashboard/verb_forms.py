@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from math import isfinite
 from typing import Any
 
 from strands_robots.serving.control_verbs import CONTROL_VERBS
@@ -62,7 +63,7 @@ def _form(name: object, kind: str, summary: object, parameters: list[dict[str, A
 
 def _field(name: object, schema: Mapping[str, Any], required: bool) -> dict[str, Any]:
     default = schema.get("default")
-    if not isinstance(default, str | int | float | bool) or default != default:  # noqa: PLR0124 - NaN
+    if not isinstance(default, str | int | float | bool) or (isinstance(default, float) and not isfinite(default)):
         default = None
     elif isinstance(default, str):
         default = default[:TEXT_MAX]
