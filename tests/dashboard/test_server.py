@@ -216,6 +216,22 @@ def test_viewer_may_look_and_stop_and_move_nothing(make: Make) -> None:
     assert {name for _, name, _ in site.feed.calls} == {"getPose"}
 
 
+def test_page_whose_state_cannot_be_sent_any_more_loses_its_connection(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = make()
+    with site.open("/state") as socket:
+        hello(socket)
+
+        def broken(*_: object) -> tuple[int, str]:
+            raise ValueError("Out of range float values are not JSON compliant")
+
+        monkeypatch.setattr(site.model, "changes", broken)
+        with pytest.raises(WebSocketDisconnect) as closed:
+            received(socket, "never")
+        assert closed.value.code == 1011
+
+
 def test_verb_that_the_robot_does_not_describe_is_not_called(make: Make) -> None:
     site = make()
     with site.open("/state") as socket:

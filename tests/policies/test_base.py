@@ -40,6 +40,10 @@ def test_action_without_known_keys_is_refused(bad: object) -> None:
         checked_action(bad, RANGES)
 
 
+def test_numbers_leaves_out_what_no_float_can_be() -> None:
+    assert numbers({"huge": 10**400, "nan": float("nan"), "inf": float("-inf"), "pan": 1}) == {"pan": 1.0}
+
+
 def test_numbers_leaves_out_images_flags_and_text() -> None:
     observation = {"a": np.float64(1), "b": 2, "c": True, "d": "x", "e": np.zeros((2, 2)), "f": math.nan, "g": None}
     assert numbers(observation) == {"a": 1.0, "b": 2.0}

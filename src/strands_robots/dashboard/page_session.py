@@ -119,20 +119,30 @@ class PageSession:
 
     async def _send_changes(self) -> None:
         """Send what changed, 20 times a second, and to a slow reader the newest."""
+        try:
+            await self._follow_changes()
+        except (WebSocketDisconnect, RuntimeError) as gone:
+            logger.debug("A page is gone: %s", type(gone).__name__)
+        except Exception:
+            # A page that goes on showing its last state would lie; without its connection it says so and comes again.
+            logger.exception("What changed could not be sent to a page; its connection is closed.")
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await self._socket.close(code=1011)
+
+    async def _follow_changes(self) -> None:
         model, since, ticks_since, tick = self._server.model, 0, 0, 0
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            while True:
-                tick += 1
-                slow = tick % SLOW_TICKS == 0
-                since, message = model.changes(since, ticks_since if slow else None)
-                ticks_since = since if slow else ticks_since
-                if message:
-                    await self._send_text(message)
-                while not self._waiting.empty():
-                    await self._send(self._waiting.get_nowait())
-                if self._watched and tick % JOINTS_TICKS == 0:
-                    await self._send_joints()
-                await asyncio.sleep(TICK_S)
+        while True:
+            tick += 1
+            slow = tick % SLOW_TICKS == 0
+            since, message = model.changes(since, ticks_since if slow else None)
+            ticks_since = since if slow else ticks_since
+            if message:
+                await self._send_text(message)
+            while not self._waiting.empty():
+                await self._send(self._waiting.get_nowait())
+            if self._watched and tick % JOINTS_TICKS == 0:
+                await self._send_joints()
+            await asyncio.sleep(TICK_S)
 
     async def _send_joints(self) -> None:
         joints = self._server.model.joints(self._watched, self._joints_at)

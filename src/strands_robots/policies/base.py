@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -113,7 +114,7 @@ def numbers(observation: Mapping[str, object]) -> dict[str, float]:
     plain = observation.joints if isinstance(observation, Observation) else observation
     for key, value in plain.items():
         scalar = _plain(value)
-        if isinstance(scalar, int | float) and not isinstance(scalar, bool) and math.isfinite(scalar):
+        if isinstance(scalar, int | float) and not isinstance(scalar, bool) and abs(scalar) <= sys.float_info.max:
             finite[key] = float(scalar)
     return finite
 
