@@ -129,23 +129,27 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
             bringup_timeout,
         )
     )
-    if isinstance(driver, RobotDriver):
-        # The runtime reads the status when it is made, on the loop, where a robot that blocks would hold all others.
-        await driver.read_activity()
 
     async def before_live(messaging: Any) -> None:
         await refuse_duplicate(name, reach, messaging)
         # Before it can be called, it can be stopped.
         await asyncio.shield(registration)
 
-    runtime = Runtime(
-        driver=driver,
-        device_id=name,
-        link=reach,
-        allow_insecure=insecure,
-        discovery=settings.raw("DEVICE_CONNECT_DISCOVERY_MODE").lower(),
-        before_live=before_live,
-    )
+    try:
+        if isinstance(driver, RobotDriver):
+            # The runtime reads the status when it is made, on the loop, where a robot that blocks holds all others.
+            await driver.read_activity()
+        runtime = Runtime(
+            driver=driver,
+            device_id=name,
+            link=reach,
+            allow_insecure=insecure,
+            discovery=settings.raw("DEVICE_CONNECT_DISCOVERY_MODE").lower(),
+            before_live=before_live,
+        )
+    except BaseException:
+        await asyncio.shield(_leave(registration))
+        raise
     if isinstance(driver, RobotDriver):
         runtime.set_heartbeat_provider(driver.heartbeat)
         runtime.lives = lambda: driver.lives

@@ -40,6 +40,7 @@ from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.memory import MemoryLink
+from strands_robots.safety.plane import plane
 from strands_robots.utils import ValidationError
 
 
@@ -251,6 +252,17 @@ def test_twenty_failed_bring_ups_leave_nothing(world: ToyWorld) -> None:
             init_device_connect_sync(Broken(world), link=link)
     settles(before, spare=2)
     no_device_thread_is_left()
+
+
+def test_bring_up_that_fails_before_its_runtime_leaves_no_robot_registered(link: LinkConfig, world: ToyWorld) -> None:
+    class Unreadable(SimulationDeviceDriver):
+        async def read_activity(self) -> None:
+            await asyncio.to_thread(eventually, lambda: "unread-1" in plane().robot_ids())
+            raise OSError("no such bus")
+
+    with pytest.raises(OSError, match="no such bus"):
+        init_device_connect_sync(Unreadable(world), peer_id="unread-1", link=link)
+    assert "unread-1" not in plane().robot_ids()
 
 
 def test_bring_up_that_timed_out_never_comes_online_later(world: ToyWorld) -> None:
