@@ -592,16 +592,10 @@ class FleetSafety:
     def on_check_in(self, sample: Sample) -> None:
         """Record the check-in of a controller; a refused one is audited."""
         context = self._context
-        try:
-            body = wire.decode(sample.payload, topics.BY_NAME["checkin"].max_bytes)
-            source = identifier("peer_id", body.get("peer_id"))
-        except (wire.WireError, ValidationError) as exc:
-            context.audit("checkin_rejected", reason=str(exc))
+        stated = self._stated(sample, "checkin", "peer_id", topics.check_in)
+        if stated is None:
             return
-        bound = context.registry.session_of(source)
-        if sample.key != topics.check_in(source) or (bound is not None and bound != sample.session):
-            context.audit("checkin_rejected", source, reason="the topic or the session is another peer's")
-            return
+        source, body = stated
         why = self._adapter.check_in(source, body)
         if why is not None:
             context.audit("checkin_rejected", source, reason=why)
@@ -612,24 +606,34 @@ class FleetSafety:
 
     def on_check_in_answer(self, sample: Sample) -> None:
         """Write down the head of a robot's audit, if this peer is its witness."""
-        context = self._context
         if not self._heads.first((sample.key, sample.payload)):
             return
-        try:
-            body = wire.decode(sample.payload, topics.BY_NAME["checkin_answer"].max_bytes)
-            source = identifier("device_id", body.get("device_id"))
-        except (wire.WireError, ValidationError) as exc:
-            context.audit("checkin_answer_rejected", reason=str(exc))
+        stated = self._stated(sample, "checkin_answer", "device_id", topics.check_in_answer)
+        if stated is None:
             return
-        bound = context.registry.session_of(source)
-        if sample.key != topics.check_in_answer(source) or (bound is not None and bound != sample.session):
-            context.audit("checkin_answer_rejected", source, reason="the topic or the session is another peer's")
-            return
+        source, body = stated
         # A robot reads no file here: its stops arrive on this thread.
         key = None if self._robot else (enrolled_peers() or {}).get(source)
         proof = proof_of(Purpose.CHECK_IN_ANSWER, source, body, key)
         if proof is not Proof.WRONG:
-            self._witness.receive(source, body, by=context.peer_id, proven=proof is Proof.SIGNED)
+            self._witness.receive(source, body, by=self._context.peer_id, proven=proof is Proof.SIGNED)
+
+    def _stated(
+        self, sample: Sample, topic: str, name: str, key: Callable[[str], str]
+    ) -> tuple[str, dict[str, Any]] | None:
+        """Return the sender and the body; None, audited, if it is not its own."""
+        context, rejected = self._context, f"{topic}_rejected"
+        try:
+            body = wire.decode(sample.payload, topics.BY_NAME[topic].max_bytes)
+            source = identifier(name, body.get(name))
+        except (wire.WireError, ValidationError) as exc:
+            context.audit(rejected, reason=str(exc))
+            return None
+        bound = context.registry.session_of(source)
+        if sample.key != key(source) or (bound is not None and bound != sample.session):
+            context.audit(rejected, source, reason="the topic or the session is another peer's")
+            return None
+        return source, body
 
     def _signed(self, fields: dict[str, Any], purpose: Purpose, signing_key: Any) -> dict[str, Any]:
         """Return the fields with the time; with a key also signed."""
