@@ -66,10 +66,8 @@ class ModelBoundError(StrandsRobotsError, ValueError):
 def check_model(path: Path) -> None:
     """Check a model's XML and the files that it names against the bounds.
 
-    What is no XML is left to MuJoCo, which says where it is wrong.
-
     Raises:
-        ModelBoundError: a bound is exceeded.
+        ModelBoundError: a bound is exceeded, or a file is no XML.
         OSError: a file cannot be read.
     """
     _Model(path.parent, _Totals()).read(path)
