@@ -29,7 +29,7 @@ dashboard: venv  ## The operator's page in a browser, on four simulated robots
 	@$(BIN)/strands-robots dashboard --demo $(ARGS)
 
 test: venv  ## Everything that needs nothing but wheels
-	@$(BIN)/python -m pytest -m "not system" $(WORKERS) $(ARGS)
+	@./scripts/tests.sh $(BIN)/python -m "not system" $(WORKERS) $(ARGS)
 
 system:
 	@./scripts/system-packages.sh $(GL_PACKAGES) mosquitto iproute2 chromium fonts-dejavu-core
@@ -47,40 +47,40 @@ system:
 	@./scripts/dds-security.sh
 
 test-all: venv system  ## What needs Debian or npm packages besides
-	@$(BIN)/python -m pytest -m system $(ARGS)
-	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
-	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
-	@.venv-mcp/bin/python -m pytest tests/integration/mcp $(ARGS)
-	@.venv-bridge/bin/python -m pytest tests/integration/device_connect/test_agents.py $(ARGS)
-	@$(DDS_SECURITY)/python -m pytest $(DDS_TESTS) $(ARGS)
+	@./scripts/tests.sh $(BIN)/python -m system $(ARGS)
+	@./scripts/tests.sh $(REAL_ARM)/python tests/integration/hardware $(ARGS)
+	@./scripts/tests.sh $(MODELS)/python tests/integration/simulation $(ARGS)
+	@./scripts/tests.sh .venv-mcp/bin/python tests/integration/mcp $(ARGS)
+	@./scripts/tests.sh .venv-bridge/bin/python tests/integration/device_connect/test_agents.py $(ARGS)
+	@./scripts/tests.sh $(DDS_SECURITY)/python $(DDS_TESTS) $(ARGS)
 
 mcp:  ## The MCP server on the newest MCP SDK, in .venv-mcp, and its tests
 	@./scripts/mcp.sh
-	@.venv-mcp/bin/python -m pytest tests/integration/mcp $(ARGS)
+	@./scripts/tests.sh .venv-mcp/bin/python tests/integration/mcp $(ARGS)
 
 bridge:  ## The framework's own MCP bridge, in .venv-bridge, and its test
 	@./scripts/venv.sh .venv-bridge requirements/bridge.lock
-	@.venv-bridge/bin/python -m pytest tests/integration/device_connect/test_agents.py $(ARGS)
+	@./scripts/tests.sh .venv-bridge/bin/python tests/integration/device_connect/test_agents.py $(ARGS)
 
 dds-security:  ## DDS Security on a Cyclone DDS that has it, in .venv-dds-security, and its tests
 	@./scripts/dds-security.sh
-	@$(DDS_SECURITY)/python -m pytest $(DDS_TESTS) $(ARGS)
+	@./scripts/tests.sh $(DDS_SECURITY)/python $(DDS_TESTS) $(ARGS)
 
 real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot, and its tests
 	@./scripts/real-arm.sh
-	@$(REAL_ARM)/python -m pytest tests/integration/hardware $(ARGS)
+	@./scripts/tests.sh $(REAL_ARM)/python tests/integration/hardware $(ARGS)
 
 models:  ## The models of four other projects in a world of ours, in .venv-models, and their test
 	@./scripts/models.sh
-	@$(MODELS)/python -m pytest tests/integration/simulation $(ARGS)
+	@./scripts/tests.sh $(MODELS)/python tests/integration/simulation $(ARGS)
 
 lerobot:  ## LeRobot 0.4.4 with torch, in .venv-policies, and the tests of policies that are computed here
 	@./scripts/lerobot.sh
-	@$(POLICIES)/python -m pytest tests/integration/policies $(ARGS)
+	@./scripts/tests.sh $(POLICIES)/python tests/integration/policies $(ARGS)
 
 real-arm-next:  ## The same on LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-lerobot-0.6.1
 	@./scripts/real-arm.sh 0.6.1
-	@.venv-lerobot-0.6.1/bin/python -m pytest tests/integration/hardware $(ARGS)
+	@./scripts/tests.sh .venv-lerobot-0.6.1/bin/python tests/integration/hardware $(ARGS)
 
 soak: venv  ## A hundred robots at 10 Hz on the page for ten minutes (SECONDS=600)
 	@$(BIN)/python -m benchmarks.soak $(or $(SECONDS),600)
