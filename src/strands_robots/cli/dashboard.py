@@ -25,6 +25,7 @@ from strands_robots.safety.ed25519 import keygen
 from strands_robots.utils import device_id, missing_extra
 
 if TYPE_CHECKING:
+    from strands_robots.cli.demo.processes import RobotProcess
     from strands_robots.dashboard.feed import FleetFeed
     from strands_robots.dashboard.fleet_model import FleetModel
     from strands_robots.dashboard.listening import RemoteAddress
@@ -84,9 +85,10 @@ def dashboard(
     except ModuleNotFoundError as exc:
         raise missing_extra("The page", "dashboard") from exc
     with ExitStack() as stack:
+        robots: DemoRobots | None = None
         if demo:
-            meet, operator_key = stack.enter_context(_demo_robots(screen))
-            network = replace(network, tenant=DEMO_TENANT)
+            robots = stack.enter_context(_demo_robots(screen))
+            meet, operator_key, network = robots.port, robots.key, replace(network, tenant=DEMO_TENANT)
         sockets = [stack.enter_context(_bound("127.0.0.1", port))]
         port = int(sockets[0].getsockname()[1])
         remote = None if listen is None else remote_address(listen, port)
@@ -103,7 +105,7 @@ def dashboard(
             signed=signer is not None,
         )
         stack.callback(page.close)
-        _serve(screen, page, sockets, remote, browser=not no_browser)
+        _serve(screen, page, sockets, remote, robots, browser=not no_browser)
 
 
 def _feeds(
@@ -139,9 +141,15 @@ def _bound(host: str, port: int) -> Iterator[socket.socket]:
 
 
 def _serve(
-    screen: Screen, page: Dashboard, sockets: list[socket.socket], remote: RemoteAddress | None, *, browser: bool
+    screen: Screen,
+    page: Dashboard,
+    sockets: list[socket.socket],
+    remote: RemoteAddress | None,
+    robots: DemoRobots | None,
+    *,
+    browser: bool,
 ) -> None:
-    """Serve until Ctrl-C or SIGTERM."""
+    """Serve until Ctrl-C or SIGTERM; the demo's robots start once the page is there."""
     from strands_robots.dashboard.server import QuietServer, configured  # noqa: PLC0415 - as above
     from strands_robots.device_connect.shutdown import StopSignal  # noqa: PLC0415 - as above
 
@@ -166,8 +174,11 @@ def _serve(
             if browser and screen.live:
                 with contextlib.suppress(webbrowser.Error):  # the address is on the screen
                     webbrowser.open(url)
+            if robots is not None:
+                robots.start()
             while thread.is_alive() and signals.wait(0.2) is None:
-                pass
+                if robots is not None:
+                    robots.check()
         finally:
             for each in servers:
                 each.should_exit = True
@@ -195,16 +206,48 @@ def _announce(screen: Screen, url: str, remote: RemoteAddress | None) -> None:
     screen.say("Space stops all robots. Ctrl-C here ends the page, not the robots.")
 
 
+class DemoRobots:
+    """Robots to try the page with, and their operator's key.
+
+    Args:
+        key: file of the operator's key.
+        port: loopback port where they meet.
+    """
+
+    def __init__(self, key: Path, port: int) -> None:
+        self.key, self.port = key, port
+        self._started: list[RobotProcess] = []
+        self._stack = ExitStack()
+
+    def start(self) -> None:
+        """Start them side by side; they appear on the page as they are found."""
+        from strands_robots.cli.demo.processes import started_robot  # noqa: PLC0415 - the demo only
+
+        for name, scene in DEMO_ROBOTS.items():
+            robot = started_robot("so100", scene, name, self.port, DEMO_TENANT)
+            self._started.append(self._stack.enter_context(robot))
+
+    def check(self) -> None:
+        """Raise :class:`CliError` when one has ended."""
+        for each in self._started:
+            each.check()
+
+    def close(self) -> None:
+        """End them, all at once."""
+        for each in self._started:
+            each.process.terminate()
+        self._stack.close()
+
+
 @contextmanager
-def _demo_robots(screen: Screen) -> Iterator[tuple[int, Path]]:
-    """Serve the demo's robots with an operator's key; yield their port and the key."""
+def _demo_robots(screen: Screen) -> Iterator[DemoRobots]:
+    """Make the demo's operator's key and settings; its robots end with the block."""
     import tempfile  # noqa: PLC0415 - the demo only
 
     from strands_robots.cli.demo import free_port  # noqa: PLC0415 - the demo only
-    from strands_robots.cli.demo.processes import served_robot  # noqa: PLC0415 - the demo only
 
     passphrase = f"Demo-{secrets.token_hex(8)}"
-    with tempfile.TemporaryDirectory(prefix="strands-dashboard-") as folder, ExitStack() as stack:
+    with tempfile.TemporaryDirectory(prefix="strands-dashboard-") as folder:
         key = Path(folder) / "operator.pem"
         settings.put("STRANDS_MESH_RESUME_PUBLIC_KEY", keygen(key, passphrase))
         settings.put("STRANDS_STATE_DIR", folder)
@@ -213,9 +256,8 @@ def _demo_robots(screen: Screen) -> Iterator[tuple[int, Path]]:
             settings.put(name, "")
         settings.put("STRANDS_CHECKIN_TIMEOUT_S", "0")
         port = free_port()
-        screen.say("Starting four simulated robots...")
-        for name, scene in DEMO_ROBOTS.items():
-            stack.enter_context(served_robot("so100", scene, name, port, DEMO_TENANT))
+        screen.say("Four simulated robots start while you open the page.")
         screen.data({"event": "demo", "passphrase": passphrase, "meet": port})
         screen.say(f"To free a robot that was stopped, the page asks for this passphrase: {passphrase}", "yellow")
-        yield port, key
+        with contextlib.closing(DemoRobots(key, port)) as robots:
+            yield robots

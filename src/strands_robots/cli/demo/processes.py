@@ -37,12 +37,37 @@ class RobotProcess:
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.process = process
+        self._lines: queue.Queue[str] = queue.Queue()
+        self._complaints: list[str] = []
+        # They read to the end: a full pipe would hold the robot up.
+        readers = ((process.stdout, self._lines.put), (process.stderr, self._complaints.append))
+        self._readers = [threading.Thread(target=_read_lines, args=each, daemon=True) for each in readers]
+        for reader in self._readers:
+            reader.start()
 
     def check(self) -> None:
         """Raise :class:`CliError` when the process has ended."""
         code = self.process.poll()
         if code is not None:
-            raise CliError(f"The robot's process ended with exit code {code}.")
+            raise CliError(f"The robot's process ended with exit code {code}{self._last_words()}.")
+
+    def wait_ready(self) -> None:
+        """Wait until it is on the network.
+
+        Raises:
+            CliError: it is not within :data:`READY_S` seconds.
+        """
+        deadline = time.monotonic() + READY_S
+        while time.monotonic() < deadline:
+            with contextlib.suppress(queue.Empty):
+                message = json.loads(self._lines.get(timeout=0.1))
+                if message.get("status") == "error":
+                    raise CliError(f"The robot could not be served: {message.get('reason')}")
+                if message.get("event") == "serving":
+                    return
+            if self.process.poll() is not None and self._lines.empty():
+                self.check()
+        raise CliError(f"The robot was not on the network within {READY_S:g} s.")
 
     def leave(self) -> None:
         """Ask it to stop the robot and depart, and wait for its end.
@@ -58,6 +83,11 @@ class RobotProcess:
         if code not in (Exit.OK, Exit.INTERRUPTED):
             raise CliError(f"The robot's process ended with exit code {code}.")
 
+    def _last_words(self) -> str:
+        self._readers[1].join(1.0)
+        last = ["", *"".join(self._complaints).strip().splitlines()][-1]
+        return f": {last}" if last else ""
+
 
 @contextmanager
 def served_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -> Iterator[RobotProcess]:
@@ -66,6 +96,14 @@ def served_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -
     Raises:
         CliError: it is not on the network within :data:`READY_S` seconds.
     """
+    with started_robot(robot, scene, peer_id, port, tenant) as started:
+        started.wait_ready()
+        yield started
+
+
+@contextmanager
+def started_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -> Iterator[RobotProcess]:
+    """Start what :func:`served_robot` serves, and do not wait until it is on the network."""
     furnished = ("--set", f"scene={scene}") if scene else ()
     where = (*furnished, "--peer-id", peer_id, "--port", str(port), "--tenant", tenant)
     process = subprocess.Popen(
@@ -78,7 +116,6 @@ def served_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -
         start_new_session=True,
     )
     try:
-        _wait_ready(process)
         yield RobotProcess(process)
     finally:
         if process.poll() is None:
@@ -91,30 +128,6 @@ def served_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):  # the process is gone, as it should be
                     pipe.close()
-
-
-def _wait_ready(process: subprocess.Popen[str]) -> None:
-    lines: queue.Queue[str] = queue.Queue()
-    complaints: list[str] = []
-    readers = (
-        threading.Thread(target=_read_lines, args=(process.stdout, lines.put), daemon=True),
-        threading.Thread(target=_read_lines, args=(process.stderr, complaints.append), daemon=True),
-    )
-    for reader in readers:
-        reader.start()
-    deadline = time.monotonic() + READY_S
-    while time.monotonic() < deadline:
-        with contextlib.suppress(queue.Empty):
-            message = json.loads(lines.get(timeout=0.1))
-            if message.get("status") == "error":
-                raise CliError(f"The robot could not be served: {message.get('reason')}")
-            if message.get("event") == "serving":
-                return
-        if process.poll() is not None and lines.empty():
-            readers[1].join(1.0)
-            last = ["", *"".join(complaints).strip().splitlines()][-1]
-            raise CliError(f"The robot's process ended with exit code {process.returncode}: {last}")
-    raise CliError(f"The robot was not on the network within {READY_S:g} s.")
 
 
 def _read_lines(pipe: IO[str] | None, take: Any) -> None:

@@ -100,7 +100,7 @@ export function ageText(fleet, row) {
   const age = fleet.age(row);
   if (age === null) return S.neverHeard;
   const link = row.link_ms === null ? "" : ` · ${S.roundTrip(row.link_ms)}`;
-  return `${S.heard(age < 10 ? age.toFixed(1) : Math.round(age))}${link}`;
+  return `${age < 1 ? S.heardNow : S.heard(Math.floor(age))}${link}`;
 }
 
 export function controlText(fleet, row) {

@@ -64,6 +64,7 @@ export const S = {
   idle: "idle",
   does: (what) => what,
   step: (n) => `step ${n}`,
+  heardNow: "heard within 1 s",
   heard: (s) => `heard ${s} s ago`,
   neverHeard: "not heard yet",
   roundTrip: (ms) => `link ${ms} ms`,
