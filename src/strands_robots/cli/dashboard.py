@@ -149,7 +149,7 @@ def _serve(
     *,
     browser: bool,
 ) -> None:
-    """Serve until Ctrl-C or SIGTERM; the demo's robots start once the page is there."""
+    """Serve until Ctrl-C or SIGTERM; the demo's robots start after the page."""
     from strands_robots.dashboard.server import QuietServer, configured  # noqa: PLC0415 - as above
     from strands_robots.device_connect.shutdown import StopSignal  # noqa: PLC0415 - as above
 
@@ -220,7 +220,7 @@ class DemoRobots:
         self._stack = ExitStack()
 
     def start(self) -> None:
-        """Start them side by side; they appear on the page as they are found."""
+        """Start them side by side; the page shows each as it is found."""
         from strands_robots.cli.demo.processes import started_robot  # noqa: PLC0415 - the demo only
 
         for name, scene in DEMO_ROBOTS.items():
@@ -241,7 +241,7 @@ class DemoRobots:
 
 @contextmanager
 def _demo_robots(screen: Screen) -> Iterator[DemoRobots]:
-    """Make the demo's operator's key and settings; its robots end with the block."""
+    """Make the demo's key and settings; its robots end with the block."""
     import tempfile  # noqa: PLC0415 - the demo only
 
     from strands_robots.cli.demo import free_port  # noqa: PLC0415 - the demo only

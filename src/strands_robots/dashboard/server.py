@@ -223,7 +223,7 @@ def _files() -> dict[str, Path]:
 
 
 def _file(path: Path) -> Any:
-    """Return a handler that answers from memory: on the loop, without a thread for each of the page's files."""
+    """Return a handler that answers from memory, without a thread a file."""
     content, kind = path.read_bytes(), TYPES[path.suffix]
 
     async def serve(request: Request) -> Response:

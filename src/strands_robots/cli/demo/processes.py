@@ -103,7 +103,7 @@ def served_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -
 
 @contextmanager
 def started_robot(robot: str, scene: str, peer_id: str, port: int, tenant: str) -> Iterator[RobotProcess]:
-    """Start what :func:`served_robot` serves, and do not wait until it is on the network."""
+    """Start a robot as :func:`served_robot` does, and wait for nothing."""
     furnished = ("--set", f"scene={scene}") if scene else ()
     where = (*furnished, "--peer-id", peer_id, "--port", str(port), "--tenant", tenant)
     process = subprocess.Popen(

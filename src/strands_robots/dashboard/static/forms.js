@@ -2,6 +2,9 @@
 import { el, setText } from "./dom.js";
 import { S } from "./strings.js";
 
+// A stop needs no leave to move: viewers have it, too.
+const STOPS = ["stop", "stopMotion"];
+
 function field(verb, parameter) {
   const id = `p-${verb}-${parameter.name}`;
   let input;
@@ -40,7 +43,7 @@ export function valueOf(parameter, text) {
 export function verbForm(form, ask, canMove) {
   const fields = form.parameters.map((parameter) => [parameter, ...field(form.name, parameter)]);
   const said = el("p", { class: "said", role: "status" });
-  const run = el("button", { type: "submit", text: S.run, disabled: form.kind !== "read" && !canMove });
+  const run = el("button", { type: "submit", text: S.run, disabled: form.kind !== "read" && !canMove && !STOPS.includes(form.name) });
   const node = el("form", { novalidate: true }, el("p", { text: form.summary }), ...fields.map((each) => each[2]), run, said);
   node.addEventListener("submit", async (event) => {
     event.preventDefault();

@@ -32,7 +32,8 @@ export class RobotView {
     this.chosen.addEventListener("change", () => this.showCamera());
     this.pictures = el("section", { class: "panel pictures", "aria-labelledby": "camera-title" },
       el("div", { class: "tools" }, el("h3", { id: "camera-title", text: S.camera }), el("label", { for: "camera-name", class: "hidden", text: S.camera }), this.chosen),
-      this.camera, this.poseTitle = el("h3", { text: S.pose }), this.pose, this.noCamera = el("p", { text: S.noCamera }));
+      this.camera, this.poseTitle = el("h3", { text: S.pose }), this.pose, this.noPose = el("p", { class: "small", text: S.noPose }),
+      this.noCamera = el("p", { text: S.noCamera }));
     this.joints = el("div", { class: "bars" });
     const canvas = el("canvas", { class: "plot", role: "img", "aria-label": S.plot });
     this.plot = new Plot(canvas);
@@ -56,7 +57,7 @@ export class RobotView {
     this.timeline = new Timeline(fleet);
     this.node = el("div", { id: "robot" },
       el("p", {}, el("a", { href: "#/", text: S.back })),
-      el("div", { class: "head" }, el("div", {}, this.title, this.kind), this.stop),
+      el("div", { class: "head" }, el("div", {}, this.title, this.kind), el("div", { class: "stop-own" }, this.stop, el("p", { class: "small", text: S.stopOneWhy }))),
       this.task, this.lock, this.verdict, this.age, this.forget,
       el("div", { class: "columns" }, el("div", {}, this.pictures, this.jointsPanel), el("div", {}, this.drive, this.verbs)), this.timeline.node);
     state.addEventListener("robot", ({ detail }) => { if (detail.key === this.key) this.details(detail); });
@@ -115,7 +116,8 @@ export class RobotView {
     for (const node of [this.camera, this.chosen]) node.hidden = none;
     this.showCamera();
     const pose = names.includes("overview");
-    for (const node of [this.pose, this.poseTitle]) node.hidden = !pose;
+    this.pose.hidden = !pose;
+    this.noPose.hidden = pose;
     if (pose) this.show(this.pose, "overview");
   }
 

@@ -7,6 +7,7 @@ export const S = {
   stopRegion: "Emergency stop",
   stopOne: (id) => `STOP. All robots stop; ${id} has to answer.`,
   stopOneShort: "STOP all",
+  stopOneWhy: "An emergency stop knows no single robot: it stops and locks all. To halt this one alone, without a lockout, run its verb stop below.",
   connecting: "Connecting to the page's server...",
   connected: "Connected",
   noServer:
@@ -79,6 +80,7 @@ export const S = {
   forgetHint: "It is gone: a stop expects no answer of it any more",
   camera: "Camera",
   pose: "3-D pose",
+  noPose: "Not shown: it is drawn where the robot's server simulates it, and this robot offers no such picture.",
   noCamera: "This robot has no camera.",
   pictureOf: (id, camera) => `Camera ${camera} of ${id}`,
   joints: "Joints",
