@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from strands_robots import __version__
+from strands_robots.cli._compat import convert_when_needed
 from strands_robots.cli.owners import other_owners, owner_remedy
 from strands_robots.utils import DISTRIBUTION
 
@@ -63,6 +64,7 @@ def build(word: str = "") -> typer.Typer:
     Args:
         word: the command that is wanted; then only its module is loaded, which saves a third of a command's start.
     """
+    convert_when_needed()
     app = typer.Typer(
         name="strands-robots",
         help=HELP,

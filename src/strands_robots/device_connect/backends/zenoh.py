@@ -34,6 +34,9 @@ logger = logging.getLogger(__name__)
 REPLY_TTL_S = 60.0
 """Seconds a query outside a command waits for its reply before it is given up."""
 
+FIRST_RETRY_S = 0.005
+"""Seconds until a peer asks again where no device answered; doubled at each try. Links here come up in milliseconds."""
+
 LARGE_BYTES = 2**16
 """From here on, which is more than one batch, a message goes out on a thread: it may have to wait for the link."""
 
@@ -129,19 +132,22 @@ class ZenohBackend(Backend):
             RequestTimeoutError: a device does, but gave no reply within ``timeout`` seconds.
             NotConnectedError: closed, or a client without its router.
         """
-        deadline = time.monotonic() + timeout
-        remaining, tries = timeout, self._tries if self._link.is_peer else 1
+        began = time.monotonic()
+        deadline, linked_by = began + timeout, began + (self._tries - 1) * self._retry_delay
+        remaining, pause = timeout, min(FIRST_RETRY_S, self._retry_delay)
         while True:
             try:
                 return await self.request_once(subject, data, remaining)
             except NoResponderError:
-                tries, remaining = tries - 1, deadline - time.monotonic() - self._retry_delay
-                if tries <= 0 or remaining <= 0:
+                again = time.monotonic() + pause
+                remaining = deadline - again
+                if not self._link.is_peer or again > linked_by or remaining <= 0:
                     raise
             except RequestTimeoutError as error:
                 raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
             # A peer that links at this very moment is not known here yet.
-            await asyncio.sleep(self._retry_delay)
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, self._retry_delay)
 
     async def request_once(self, subject: str, data: bytes, within: float) -> bytes:
         """Return the first reply to ``data``, asking the devices that are linked now."""
@@ -183,7 +189,7 @@ class ZenohBackend(Backend):
         return key_of(subject)
 
     def configure_d2d_retry(self, retries: int = 3, delay: float = 0.3) -> None:
-        """Set a peer's retries of an unanswered request, and the seconds between."""
+        """Set a peer's retries of an unanswered request, and the longest pause."""
         self._tries, self._retry_delay = retries, delay
 
     def _connected(self) -> zenoh_session.SharedSession:
