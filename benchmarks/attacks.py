@@ -1,8 +1,7 @@
-"""Attacks: floods on the way of a stop, and strangers that want to move hardware on the mesh."""
+"""Attacks: floods on the way of a stop, robots that lie, strangers that want to move hardware on the mesh."""
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -15,11 +14,10 @@ from fixtures.nats_server import NatsServer
 from fixtures.plane_process import planned
 from fixtures.stop_controller import controller
 from fixtures.waiting import eventually, free_port
-from fixtures.zenoh_router import ZenohRouter
 
+from benchmarks.attacks_robots import attacked_link, files_row, foreign_row, state_folder
 from benchmarks.safety import Figures, Fleet, Hiccups, row
 from benchmarks.table import Row
-from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety import ed25519
 
 STOPS, STOPS_QUICK = 500, 20
@@ -41,6 +39,8 @@ def run(quick: bool = False) -> list[Row]:
             rows.append(_forged(transport, url, f"{name}: forged signatures under 2,000 names", OTHERS, stops, 0.1))
             rows.append(_forged(transport, url, f"{name}: those under the controller's name", ["safety-1"], stops, 0.5))
             rows.append(_flooded(transport, url, name, seconds))
+            rows.append(foreign_row(transport, url, name, stops))
+        rows.append(files_row(stops))
     return [*rows, *_strangers(TRIES_QUICK if quick else TRIES), machine.row()]
 
 
@@ -48,7 +48,7 @@ def _strangers(tries: int) -> list[Row]:
     """Tries of strangers to move approved hardware on a mesh of one machine without certificates."""
     rows = []
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-strangers-")))
+        folder = state_folder(stack)
         port = free_port()
         console, arm = (_peer(stack, folder, port, *each) for each in (("console", "none"), ("arm-1", "arm")))
         console.sees("arm-1")
@@ -98,12 +98,7 @@ def _forged(transport: str, url: str, what: str, names: Sequence[str], stops: in
 def _flooded(transport: str, url: str, name: str, seconds: float) -> Row:
     """True stops, and the memory of the robots' process, in a flood of unsigned stops with fresh ids."""
     with ExitStack() as stack:
-        if transport == "nats":
-            link = LinkConfig(transport="nats", connect=(url,))
-        else:
-            link = LinkConfig(connect=(stack.enter_context(ZenohRouter()).endpoint,), mode="client")
-        state = stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-attacks-"))
-        Path(state).chmod(0o700)
+        link, state = attacked_link(stack, transport, url), str(state_folder(stack))
         robots = stack.enter_context(planned(ARMS, link, STRANDS_STATE_DIR=state))
         hand, flooder = (stack.enter_context(controller(link, each)) for each in ("safety-1", "flooder"))
         eventually(lambda: hand.ask("stop", ARMS, 5.0)["ok"], 30, "the first stop")

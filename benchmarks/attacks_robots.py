@@ -25,14 +25,22 @@ STOPS_A_CLEARING = 50
 """A robot tells 64 stops apart, so its lockouts are cleared before."""
 
 
+def attacked_link(stack: ExitStack, transport: str, url: str) -> LinkConfig:
+    """Return the link to the NATS server at ``url``, or to a Zenoh router started here."""
+    if transport == "nats":
+        return LinkConfig(transport="nats", connect=(url,))
+    return LinkConfig(connect=(stack.enter_context(ZenohRouter()).endpoint,), mode="client")
+
+
+def state_folder(stack: ExitStack) -> Path:
+    """Return a state directory of its own."""
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-attacks-")))
+
+
 def foreign_row(transport: str, url: str, name: str, stops: int) -> Row:
     """Stops of foreign robots that stop nothing, and say so, or the opposite, or nothing."""
     with ExitStack() as stack:
-        if transport == "nats":
-            link = LinkConfig(transport="nats", connect=(url,))
-        else:
-            link = LinkConfig(connect=(stack.enter_context(ZenohRouter()).endpoint,), mode="client")
-        state = stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-attacks-"))
+        link, state = attacked_link(stack, transport, url), str(state_folder(stack))
         site = stack.enter_context(liars(link, STRANDS_STATE_DIR=state, STRANDS_HALT_DEADLINE_S="0.1"))
         hand = stack.enter_context(controller(link, environment={"STRANDS_STATE_DIR": state}))
         eventually(lambda: site.ask("up") and hand.ask("up"))
@@ -57,7 +65,7 @@ def files_row(stops: int) -> Row:
     names = [[f"arm-{process}-{number}" for number in range(ROBOTS_EACH)] for process in range(PROCESSES)]
     stopped = kept = 0
     with ExitStack() as stack, ThreadPoolExecutor(PROCESSES) as pool:
-        state = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-attacks-")))
+        state = state_folder(stack)
         children = [
             stack.enter_context(child)
             for child in pool.map(lambda part: planned(part, STRANDS_STATE_DIR=str(state)), names)
