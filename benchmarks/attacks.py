@@ -1,4 +1,4 @@
-"""Attacks: floods on the way of a stop, robots that lie, strangers that want to move hardware on the mesh."""
+"""Attacks: floods, robots that lie, many lockouts, strangers on the mesh."""
 
 from __future__ import annotations
 

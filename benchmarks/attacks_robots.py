@@ -26,7 +26,7 @@ STOPS_A_CLEARING = 50
 
 
 def attacked_link(stack: ExitStack, transport: str, url: str) -> LinkConfig:
-    """Return the link to the NATS server at ``url``, or to a Zenoh router started here."""
+    """Return a link to the NATS server at ``url``, or to a new Zenoh router."""
     if transport == "nats":
         return LinkConfig(transport="nats", connect=(url,))
     return LinkConfig(connect=(stack.enter_context(ZenohRouter()).endpoint,), mode="client")

@@ -16,7 +16,7 @@ from fixtures.waiting import eventually
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.contract import RolloutEvent
 from strands_robots.hardware import HardwareRobot
-from strands_robots.hardware.settling import RANGES_PER_S, SETTLE_HZ
+from strands_robots.policies.settling import RANGES_PER_S, SETTLE_HZ
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.utils import ValidationError
 

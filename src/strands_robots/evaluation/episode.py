@@ -158,7 +158,7 @@ def run_episode(
         PolicyError: the policy could not be loaded.
     """
     task = task_of(task_name)
-    world = Simulation("evaluation", realtime=False)
+    world = Simulation("evaluation", realtime=False, stop_level="hold")
     try:
         answer = world.add_robot(ROBOT, robot)
         if is_error(answer):

@@ -162,6 +162,10 @@ class DeviceBody:
         with self.lock:
             return self._joints(tries)
 
+    def get_positions(self) -> dict[str, float]:
+        """Read the joints, which are called as the action keys are."""
+        return self.get_joints()
+
     def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
         with self.lock:
             if not permit.valid:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 from strands_robots import settings
 from strands_robots.arm_mixin import ArmMixin, motion_rollout
@@ -20,13 +20,13 @@ from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.hardware.body import READ_TRIES, DeviceBody
 from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
-from strands_robots.hardware.settling import Settling, checked_rest_pose
 from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action, is_velocity, numbers
 from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options, unfollowed
+from strands_robots.policies.settling import Settling, checked_rest_pose
 from strands_robots.recording.cameras import LazyFrames
 from strands_robots.safety.gate import (
     REFUSALS,
@@ -40,8 +40,7 @@ from strands_robots.safety.gate import (
 )
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor, through_executor
-from strands_robots.safety.stopping import STOP_LEVELS, StopLevel, StopVerdict, halt_each
-from strands_robots.safety.stopping import stop_level as configured_level
+from strands_robots.safety.stopping import StopLevel, StopVerdict, checked_level, halt_each
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
 
@@ -53,9 +52,6 @@ logger = logging.getLogger(__name__)
 
 WIND_DOWN_S = 5.0
 """Seconds beyond its duration that :meth:`HardwareRobot.run_task` waits for a task."""
-
-OLD_LEVELS = {"release": "limp"}
-"""Earlier names of stop levels."""
 
 IDLE_WAIT_S = 1.0
 """Seconds that a read of the state waits for the bus while nothing drives the robot."""
@@ -100,8 +96,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
     ) -> None:
         name = text("tool_name", tool_name, longest=128)
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
-        asked = configured_level() if stop_level is None else OLD_LEVELS.get(stop_level, stop_level)
-        level = cast(StopLevel, choice("stop_level", asked, STOP_LEVELS))
+        level = checked_level(stop_level, rest_pose)
         self.tool_name_str = name
         self.control_hz = number("control_hz", rate, low=1, high=2000)
         self.device = device
@@ -454,13 +449,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         """Wait for the end of a settling, at most 6 s; return a sentence on it."""
         if self._settling is None:
             return ""
-        state = self._settling.wait()
-        ends = {
-            "settled": "is at its rest pose, and limp",
-            "stopped": "was stopped again while it settled, and holds its position",
-            "failed": f"did not settle, and keeps its position with torque: {self._settling.error}",
-        }
-        end = ends.get(state, "")
+        self._settling.wait()
+        end = self._settling.ending()
         return end and f"{self.tool_name_str} {end}."
 
     def cleanup(self) -> Envelope:
@@ -496,13 +486,15 @@ class HardwareRobot(ArmMixin, TeleopMixin):
                 self._ready = True
 
     def _made_to_settle(self, level: StopLevel, rest_pose: object) -> Settling | None:
-        if level != "settle" and rest_pose is None:
-            return None
         if rest_pose is None:
-            raise ValidationError("stop_level (or STRANDS_ESTOP_TORQUE) settle needs a rest_pose.")
+            return None
         ranges = {key: each for key, each in self._body.bounds.items() if not is_velocity(key)}
         pose = checked_rest_pose(rest_pose, ranges)
-        return Settling(self._body, self.gate, pose, ranges, self.observers) if level == "settle" else None
+        if level != "settle":
+            return None
+        settling = Settling(self._body, self.gate, pose, ranges, self.observers)
+        self.gate.watch(settling.note_motion)
+        return settling
 
     def _moving(self) -> list[str]:
         task = ["task"] if self.occupied(self.tool_name_str) else []

@@ -16,12 +16,15 @@ from typing import Literal, cast
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.utils import shown
+from strands_robots.utils import ValidationError, choice, shown
 
 logger = logging.getLogger(__name__)
 
 StopLevel = Literal["hold", "limp", "settle"]
 STOP_LEVELS = ("hold", "limp", "settle")
+
+OLD_LEVELS = {"release": "limp"}
+"""Earlier names of stop levels."""
 
 
 class Outcome(Enum):
@@ -91,6 +94,19 @@ def stop_level() -> StopLevel:
         logger.warning("STRANDS_ESTOP_TORQUE=%s is none of %s; hold is used.", shown(level), ", ".join(STOP_LEVELS))
         return "hold"
     return cast(StopLevel, level)
+
+
+def checked_level(level: object, rest_pose: object) -> StopLevel:
+    """Return the level that a robot is made with; None asks for the configured one.
+
+    Raises:
+        ValidationError: no such level, or ``settle`` without a rest pose.
+    """
+    asked = stop_level() if level is None else level
+    chosen = choice("stop_level", OLD_LEVELS.get(asked, asked) if isinstance(asked, str) else asked, STOP_LEVELS)
+    if chosen == "settle" and rest_pose is None:
+        raise ValidationError("stop_level (or STRANDS_ESTOP_TORQUE) settle needs a rest_pose.")
+    return cast(StopLevel, chosen)
 
 
 def grade(answer: object) -> Outcome:

@@ -108,13 +108,15 @@ class WorldStop:
         # The halt comes first: a policy that hangs would have the others move on while its own stop waits for it.
         # It has its own deadline, so that one that hangs leaves the rollouts their own stops.
         rest = stop_executor().halt(world, world.tool_name_str, reason)
-        asked = [name for name in running if name not in rest.not_stopped]
+        # A world that settles has answered for its rollouts, and a second stop would freeze it.
+        asked = [] if rest.settling else [name for name in running if name not in rest.not_stopped]
         rollouts = halt_each({name: RobotStop(world, name).stop for name in asked})
         return StopVerdict(
-            (*rollouts.halted, *(name for name in rest.halted if name not in running)),
+            (*rollouts.halted, *(name for name in rest.halted if name not in asked)),
             {**rest.not_stopped, **rollouts.not_stopped},
             {**rest.unknown, **rollouts.unknown, **unlisted},
             rest.elapsed_ms + rollouts.elapsed_ms,
+            rest.settling,
         )
 
 
@@ -159,9 +161,11 @@ def world_stop_answer(verdict: StopVerdict) -> Envelope:
     """Return the verdict on a world as the answer to ``stop``."""
     refused = {**verdict.unknown, **verdict.not_stopped}
     stopped = list(verdict.halted)
-    fields = {"stopped": stopped, "not_stopped": sorted(refused), "reasons": refused}
+    fields: dict[str, Any] = {"stopped": stopped, "not_stopped": sorted(refused), "reasons": refused}
     if refused:
         return error(f"Not everything stopped: {'; '.join(f'{n}: {why}' for n, why in refused.items())}", **fields)
+    if verdict.settling:
+        fields["settling"] = True
     return success(f"Stopped {', '.join(stopped)}." if stopped else "Nothing was moving.", **fields)
 
 

@@ -55,6 +55,8 @@ class RobotBody:
         self._physics = physics
         self._clock = clock
         self._speed_limit = speed_limit
+        self.on_motion: Callable[[], None] = lambda: None
+        """Called before each action."""
 
     @property
     def parts(self) -> RobotParts:
@@ -121,6 +123,13 @@ class RobotBody:
         snapshot, parts = self._present()
         return snapshot.observation(parts)
 
+    def get_positions(self) -> dict[str, float]:
+        """Return the command of each position servo that would keep it where it is."""
+        snapshot, parts = self._present()
+        lengths = snapshot.lengths
+        servos = (each for each in parts.actuators.values() if each.servo)
+        return {each.key: each.still(float(lengths[each.index])) for each in servos}
+
     def get_observation(self) -> Observation:
         """Return the joints, and 640 x 480 pictures of :attr:`cameras` of that moment.
 
@@ -139,6 +148,8 @@ class RobotBody:
             PermitVoidError: ``permit`` is void; nothing was written.
         """
         checked = {key: number(f"action[{key!r}]", value) for key, value in mapping("action", action).items()}
+        if permit is None or permit.valid:
+            self.on_motion()
         sent = self._physics.command(self.name, checked, permit)
         self._clock.commanded()
         return sent
@@ -146,6 +157,15 @@ class RobotBody:
     def hold(self, permit: Permit | None = None) -> None:
         """Freeze the robot, unless ``permit`` was revoked: then that halt froze it."""
         self._physics.hold(self.name, permit)
+
+    def let_go(self, permit: Permit | None = None) -> None:
+        """Switch the torque off until the next action, which begins where it is then.
+
+        Raises:
+            PermitVoidError: ``permit`` is void; nothing was changed.
+        """
+        self._physics.release(self.name, permit)
+        self._clock.commanded()
 
     def running(self) -> AbstractContextManager[None]:
         """Return a context in which physics keeps real time."""

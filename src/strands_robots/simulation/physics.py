@@ -18,6 +18,7 @@ Pictures are drawn from a snapshot, on a thread of their own, without any of the
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -85,6 +86,8 @@ class Physics:
         self._model = stage.model
         self._data = mujoco.MjData(stage.model)
         self._setpoints = stage.start_ctrl.copy()
+        self._limp: frozenset[str] = frozenset()
+        self._without_torque: frozenset[str] = frozenset()
         self.snapshot = self._start(stage)
 
     @property
@@ -103,9 +106,16 @@ class Physics:
         with self._step_lock:
             with self._command_lock:
                 self._data.ctrl[:] = self._setpoints
+                limp = self._limp
+            if limp != self._without_torque:
+                self._without_torque, self._model = limp, _without_torque(self.stage, limp)
             mujoco.mj_step(self._model, self._data, nstep=steps)
             self._steps += steps
             self.snapshot = self._copy_state(self.stage)
+            if limp:
+                with self._command_lock:
+                    # The targets go along, so that torque that comes back keeps the robot where it is.
+                    self._keep_present(self._robot(name) for name in self._limp)
 
     def command(self, robot_name: str, action: Mapping[str, float], permit: Permit | None = None) -> dict[str, float]:
         """Set targets of one robot, clamped to each actuator's range, and return them.
@@ -124,6 +134,7 @@ class Physics:
                 sent[key] = actuator.clamp(value)
             if permit is not None and not permit.valid:
                 raise PermitVoidError(f"{robot_name} was halted")
+            self._limp -= {robot_name}
             for key, value in sent.items():
                 self._setpoints[actuators[key].index] = value
             return sent
@@ -140,11 +151,23 @@ class Physics:
             robots: Iterable[RobotParts] = (
                 self.stage.robots.values() if robot_name is None else (self._robot(robot_name),)
             )
-            lengths = self.snapshot.lengths
-            for robot in robots:
-                for actuator in robot.actuators.values():
-                    still = float(lengths[actuator.index]) if actuator.servo else 0.0
-                    self._setpoints[actuator.index] = actuator.clamp(still)
+            self._keep_present(robots)
+
+    def release(self, robot_name: str | None = None, permit: Permit | None = None) -> None:
+        """Switch the torque of one robot off, or of all, until its next command.
+
+        Raises:
+            PermitVoidError: ``permit`` is void; nothing was changed.
+        """
+        with self._command_lock:
+            if permit is not None and not permit.valid:
+                raise PermitVoidError(f"{robot_name} was halted")
+            self._limp |= frozenset(self.stage.robots if robot_name is None else (self._robot(robot_name).name,))
+
+    @property
+    def limp(self) -> frozenset[str]:
+        """Names of the robots without torque."""
+        return self._limp
 
     def reset(self, permit: Permit) -> None:
         """Go back to the start state; the step count goes on.
@@ -160,7 +183,8 @@ class Physics:
         """Switch to another stage; what both have by name keeps its state and setpoint."""
         with self._step_lock, self._command_lock:
             old_model, old_data, old_setpoints = self._model, self._data, self._setpoints
-            self._model = stage.model
+            self._model, self._without_torque = stage.model, frozenset()
+            self._limp &= frozenset(stage.robots)
             self._data = mujoco.MjData(stage.model)
             self._setpoints = stage.start_ctrl.copy()
             self._data.qpos[:] = stage.start_qpos
@@ -183,7 +207,14 @@ class Physics:
             raise ValidationError(f"robot_name must be one of {list(self.stage.robots)}, not {shown(name)}.")
         return robot
 
+    def _keep_present(self, robots: Iterable[RobotParts]) -> None:
+        lengths = self.snapshot.lengths
+        for robot in robots:
+            for actuator in robot.actuators.values():
+                self._setpoints[actuator.index] = actuator.still(float(lengths[actuator.index]))
+
     def _start(self, stage: Stage) -> Snapshot:
+        self._limp = frozenset()
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = stage.start_qpos
         self._data.ctrl[:] = stage.start_ctrl
@@ -195,6 +226,20 @@ class Physics:
         data = self._data
         lengths = data.actuator_length.copy()
         return Snapshot(stage, data.time, self._steps, data.qpos.copy(), data.qvel.copy(), lengths)
+
+
+def _without_torque(stage: Stage, robots: Iterable[str]) -> Any:
+    """Return the model of a stage with actuators of ``robots`` that exert no force."""
+    if not robots:
+        return stage.model
+    model = copy.copy(stage.model)
+    for name in robots:
+        for actuator in stage.robots[name].actuators.values():
+            at = actuator.index
+            model.actuator_gaintype[at] = mujoco.mjtGain.mjGAIN_FIXED
+            model.actuator_biastype[at] = mujoco.mjtBias.mjBIAS_NONE
+            model.actuator_gainprm[at], model.actuator_biasprm[at] = 0.0, 0.0
+    return model
 
 
 def _carry_state(old_model: Any, old: Any, new_model: Any, new: Any) -> None:

@@ -31,13 +31,22 @@ SUNK_M = 0.003
 
 @dataclass(frozen=True, slots=True)
 class Actuator:
-    """One action key: index in ``ctrl``, range; ``servo`` marks a position servo."""
+    """One action key: index in ``ctrl``, range; ``servo`` marks a position servo.
+
+    A servo keeps a length with the command ``offset + slope * length``.
+    """
 
     key: str
     index: int
     low: float
     high: float
     servo: bool
+    offset: float = 0.0
+    slope: float = 1.0
+
+    def still(self, length: float) -> float:
+        """Return the command that keeps a position, or stops everything else."""
+        return self.clamp(self.offset + self.slope * length if self.servo else 0.0)
 
     def clamp(self, value: float) -> float:
         """Return the nearest value within the range."""
@@ -135,6 +144,14 @@ def in_floor(data: Any, owner: str) -> dict[str, float]:
     return depths
 
 
+def sunk_sentence(depths: dict[str, float]) -> str:
+    """Return a sentence about bodies in the floor, empty without one."""
+    if not depths:
+        return ""
+    deep = ", ".join(f"{name} by {depth:g} m" for name, depth in depths.items())
+    return f" In the floor: {deep}; place it higher."
+
+
 def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats], dict[str, float]]:
     """Put ``child`` into ``spec``; return its home pose and controls by full name."""
     try:
@@ -198,7 +215,8 @@ def _start(model: Any, homes: dict[str, Floats], controls: dict[str, float]) -> 
         wanted = controls.get(name)
         if wanted is None:
             # A servo without a given target starts at its present position.
-            wanted = float(data.actuator_length[index]) if _is_servo(model, index) else 0.0
+            offset, slope = _servo_line(model, index)
+            wanted = offset + slope * float(data.actuator_length[index]) if _is_servo(model, index) else 0.0
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-np.inf, np.inf)
         ctrl[index] = min(max(wanted, low), high)
     return np.array(data.qpos), ctrl
@@ -232,7 +250,7 @@ def _map_robot(model: Any, name: str, label: str) -> RobotParts:
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-UNBOUNDED, UNBOUNDED)
         # MuJoCo computes an inherited range, which leaves 2.0 as 2.0000000000000004.
         bounds = round(float(low), 12), round(float(high), 12)
-        actuators[key] = Actuator(key, index, *bounds, _is_servo(model, index))
+        actuators[key] = Actuator(key, index, *bounds, _is_servo(model, index), *_servo_line(model, index))
     cameras = tuple(n for n in (model.camera(i).name for i in range(model.ncam)) if n.startswith(prefix))
     return RobotParts(name, label, joints, actuators, cameras, tip_site(model, prefix), _root(model, prefix), base)
 
@@ -240,6 +258,15 @@ def _map_robot(model: Any, name: str, label: str) -> RobotParts:
 def _is_servo(model: Any, index: int) -> bool:
     """Return True for a position servo: its bias pulls back with its length."""
     return bool(model.actuator_biasprm[index][1] < 0.0)
+
+
+def _servo_line(model: Any, index: int) -> tuple[float, float]:
+    """Return offset and slope of the command by which a servo keeps its length.
+
+    Its force is gain * command + bias[0] + bias[1] * length, and zero where it stands.
+    """
+    gain, (constant, pull) = float(model.actuator_gainprm[index][0]), model.actuator_biasprm[index][:2]
+    return (-float(constant) / gain, -float(pull) / gain) if gain else (0.0, 1.0)
 
 
 def _root(model: Any, prefix: str) -> str:

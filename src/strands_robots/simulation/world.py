@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options, unfollowed
 from strands_robots.safety.gate import MotionGate, Waiting, answered
-from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.safety.stopping import StopLevel, StopVerdict, halt_each
 from strands_robots.simulation import projection
 from strands_robots.simulation.body import PICTURE, RobotBody
 from strands_robots.simulation.objects import targets_of
@@ -43,7 +43,8 @@ from strands_robots.simulation.rendering import (
     draw_path,
     picture_size,
 )
-from strands_robots.simulation.stage import compile_stage, in_floor
+from strands_robots.simulation.stage import compile_stage, in_floor, sunk_sentence
+from strands_robots.simulation.stop_torque import StopTorque
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown, text, whole
 
@@ -78,7 +79,8 @@ class Simulation(ArmMixin, TeleopMixin):
         density: of the medium, kg/m³: 0 without one, 1.2 for air, 1000 for water; at most 20,000.
         viscosity: of the medium, Pa·s, 0 to 1000.
         realtime: false if single commands shall start no clock, so that only :meth:`step` and rollouts move time.
-
+        stop_level: ``hold``, ``limp`` or ``settle``, as of a real robot; by default as ``STRANDS_ESTOP_TORQUE`` says.
+        rest_pose: where an arm that settles goes: a target for each position servo, or those by robot.
         speed_limit: greatest speed of every position servo in a rollout, radians or metres a second; None for none.
 
     Raises:
@@ -95,11 +97,14 @@ class Simulation(ArmMixin, TeleopMixin):
         viscosity: float = 0.0,
         realtime: bool = True,
         speed_limit: float | None = None,
+        stop_level: StopLevel | Literal["release"] | None = None,
+        rest_pose: Mapping[str, Any] | None = None,
     ) -> None:
         self.tool_name_str = text("tool_name", tool_name, longest=128)
         self.gate = MotionGate()
         self.starting: AbstractContextManager[Any] = threading.RLock()
         self.observers = RolloutObservers()
+        self._torque = StopTorque(stop_level, rest_pose, self.gate, self.observers)
         self.physics = Physics(compile_stage(Plan.checked(timestep, gravity, density, viscosity)))
         self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime))
         self._speed_limit = None if speed_limit is None else number("speed_limit", speed_limit, above=0, high=SPEED_MAX)
@@ -176,7 +181,7 @@ class Simulation(ArmMixin, TeleopMixin):
             parts = self.body(robot.name).parts
             sunk = self._in_floor(robot.name)
         return success(
-            f"Added {robot.name} ({robot.source.label}) with {len(parts.actuators)} actuators.{_sunk(sunk)}",
+            f"Added {robot.name} ({robot.source.label}) with {len(parts.actuators)} actuators.{sunk_sentence(sunk)}",
             robot=robot.name,
             model=robot.source.label,
             joints=list(parts.joints),
@@ -226,7 +231,7 @@ class Simulation(ArmMixin, TeleopMixin):
             self._require_idle("add_object")
             self._rebuild(self.physics.stage.plan.with_object(item))
             sunk = {} if item.fixed else self._in_floor(item.name)
-        summary = f"Added {item.shape} {item.name}.{_sunk(sunk)}"
+        summary = f"Added {item.shape} {item.name}.{sunk_sentence(sunk)}"
         return success(summary, object=item.name, position=list(item.position), in_floor=sunk)
 
     @answered
@@ -420,10 +425,10 @@ class Simulation(ArmMixin, TeleopMixin):
         rollout = self._running().get(body.name) or self.teleoperating().get(self.teleoperated_by(body.name))
         if rollout is None:
             # After a single action the servos go on to its targets.
-            body.hold()
+            self._torque.freeze_one(body)
             return success(f"{body.name} ran no policy; it is held.", robot=body.name, stopped=True, was_running=False)
         rollout.request_stop()
-        body.hold()
+        self._torque.freeze_one(body)
         stopped = bool(rollout.ended_by(time.monotonic() + STOP_JOIN_S)["stopped"])
         row = {**_row(rollout), "stopped": stopped, "was_running": True}
         if not stopped:
@@ -456,28 +461,36 @@ class Simulation(ArmMixin, TeleopMixin):
         return "" if rollout is None else f"the policy {rollout.policy_name} ({rollout.instruction!r})"
 
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop everything that moves a robot, and freeze the robots where they are.
+        """Stop everything that moves a robot, freeze all; then as the stop level says.
 
         The gate is revoked first and the setpoints are frozen second; both take microseconds, and after them no
         action is written, whatever a policy is doing. Last it waits for the loops to end, to report whether they did.
         """
         self.halt_ordered()
         self.gate.revoke()
-        return self._freeze(reason)
+        generation = self.gate.generation
+        return self._torque.after(self._freeze(reason), generation)
 
     def halt_ordered(self) -> None:
         """Note what moves; a loop whose permit is void counts as halted."""
         leaders = (f"teleoperation {name}" for name in self.teleoperating())
-        self._moved.update(dict.fromkeys([*self._running(), *leaders]))
+        settling = (f"settling {name}" for name in self._torque.settling)
+        self._moved.update(dict.fromkeys([*self._running(), *leaders, *settling]))
+
+    def wait_settled(self) -> str:
+        """Wait for the end of every settling; return a sentence on each arm."""
+        return self._torque.wait()
 
     def cleanup(self) -> Envelope:
-        """Halt, stop the clock and free the pictures. A second call does nothing."""
+        """Halt, let settle, stop the clock and free the pictures, once."""
         if self._closed:
             return success("Already cleaned up.")
         with self.starting:
             self._closed = True
             self.gate.attach(_CleanedUp())
+        self.wait_settled()
         verdict = self.halt("cleanup")
+        self.wait_settled()
         self._clock.close()
         self._renderer.close()
         return verdict.envelope()
@@ -593,6 +606,7 @@ class Simulation(ArmMixin, TeleopMixin):
         self._require_open()
         leaders = [f"{leader} leading {session.robot}" for leader, session in self.teleoperating().items()]
         moving = [f"policy on {name}" for name in self._running()] + leaders
+        moving += [f"{name}, which settles" for name in self._torque.settling]
         if moving:
             raise ValidationError(f"{verb} is refused while something moves: {', '.join(moving)}. Stop it first.")
 
@@ -608,18 +622,21 @@ class Simulation(ArmMixin, TeleopMixin):
 
     def _rebuild(self, plan: Plan) -> None:
         """Compile ``plan`` and switch to it; nothing changes when it does not compile."""
-        self.physics.replace(compile_stage(plan))
+        stage = compile_stage(plan)
+        self._torque.check(stage.robots)
+        self.physics.replace(stage)
         self._bodies = {
             r.name: self._bodies.get(r.name)
             or RobotBody(r.name, self.physics, self._clock, self._speed_limit, self._draw)
             for r in plan.robots
         }
+        self._torque.fit(self._bodies)
 
     def _in_floor(self, owner: str) -> dict[str, float]:
         """Return and log the depths of the bodies that start in the floor."""
         sunk = in_floor(self.physics.snapshot.data(), owner)
         if sunk:
-            logger.warning("%s:%s", owner, _sunk(sunk))
+            logger.warning("%s:%s", owner, sunk_sentence(sunk))
         return sunk
 
     def _running(self) -> dict[str, Rollout]:
@@ -648,7 +665,7 @@ class Simulation(ArmMixin, TeleopMixin):
 
     def _freeze(self, reason: str) -> StopVerdict:
         deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
-        self.physics.hold()
+        self._torque.freeze(self.physics, self._clock)
         moved, self._moved = self._moved, {}
         running = self._running()
         for rollout in running.values():
@@ -674,14 +691,6 @@ def _row(rollout: Rollout) -> dict[str, Any]:
 
 def _range(low: float, high: float) -> list[float] | None:
     return [low, high] if low > float("-inf") or high < float("inf") else None
-
-
-def _sunk(depths: dict[str, float]) -> str:
-    """Return a sentence about bodies in the floor, empty without one."""
-    if not depths:
-        return ""
-    deep = ", ".join(f"{name} by {depth:g} m" for name, depth in depths.items())
-    return f" In the floor: {deep}; place it higher."
 
 
 def _count(robots: dict[str, Any]) -> str:

@@ -131,7 +131,7 @@ def draw_motion(
     moves = replayed(setpoints)
     if len(moves) < 2:
         raise CliError("The agent saw too little of the motion to draw it.")
-    twin = Simulation("twin", timestep=_TIMESTEP_S, realtime=False)
+    twin = Simulation("twin", timestep=_TIMESTEP_S, realtime=False, stop_level="hold")
     try:
         twin.add_robot(robot)
         furnish(twin, scene)

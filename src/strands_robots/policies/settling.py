@@ -1,7 +1,8 @@
 """Settling: the slow way of a stopped arm to its rest pose, then limp.
 
 It is the second half of a halt, and the only motion of a locked robot. The halt alone begins it; its permit is void at
-the next halt, which freezes the arm; while it runs every other motion is refused.
+the next halt, which freezes the arm; while it runs every other motion is refused. Real and simulated arms settle alike,
+each in its own time.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import Any, Literal, Protocol
 
 from strands_robots.audit import log_safety_event
 from strands_robots.contract import SETTLE, RolloutEvent
@@ -21,9 +23,6 @@ from strands_robots.policies.base import Action, Ranges
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, Permit, PermitVoidError
 from strands_robots.utils import ValidationError, mapping, number, shown
-
-if TYPE_CHECKING:
-    from strands_robots.hardware.body import DeviceBody
 
 logger = logging.getLogger(__name__)
 
@@ -41,11 +40,35 @@ ARRIVED_SHARE = 0.02
 
 SETTLE_HZ = 50.0
 
+STALLED_S = 30.0
+"""Longest settling in real time where an arm's own time is simulated."""
+
 State = Literal["", "settling", "settled", "stopped", "failed"]
 
 
 class SettleError(StrandsRobotsError, RuntimeError):
     """The arm did not come to its rest pose."""
+
+
+class StoppedArm(Protocol):
+    """Arm that a halt has frozen, and that may settle."""
+
+    name: str
+
+    def get_positions(self) -> Mapping[str, float]:
+        """Return the present position by action key."""
+
+    def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
+        """Write targets; raise :class:`PermitVoidError` after a further stop."""
+
+    def hold(self, permit: Permit | None = None) -> None:
+        """Freeze it, unless ``permit`` was revoked."""
+
+    def let_go(self, permit: Permit) -> None:
+        """Switch the torque off; raise :class:`PermitVoidError` after a further stop."""
+
+    def running(self) -> AbstractContextManager[None]:
+        """Return a context in which its time passes."""
 
 
 def checked_rest_pose(pose: object, ranges: Ranges) -> Action:
@@ -75,20 +98,32 @@ class Settling:
         rest_pose: targets, as :func:`checked_rest_pose` returns them.
         ranges: of the keys of ``rest_pose``.
         observers: called with the beginning and the end, as of a task with the policy ``settle``.
+        clock: the arm's own time, in seconds, where that is not the real one.
+
+    Whoever makes it calls :meth:`note_motion` with each motion of the arm.
     """
 
     def __init__(
-        self, body: DeviceBody, gate: MotionGate, rest_pose: Action, ranges: Ranges, observers: RolloutObservers
+        self,
+        body: StoppedArm,
+        gate: MotionGate,
+        rest_pose: Action,
+        ranges: Ranges,
+        observers: RolloutObservers,
+        *,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self._body, self._gate, self._observers = body, gate, observers
         self._rest = rest_pose
         self._width = {key: ranges[key][1] - ranges[key][0] for key in rest_pose}
+        self._clock = clock or time.monotonic
+        self._patience_s = SETTLE_S + 1 if clock is None else STALLED_S
         self._due = False
+        self._permit: Permit | None = None
         self._ended = threading.Event()
         self._ended.set()
         self.state: State = ""
         self.error = ""
-        gate.watch(self._note_motion)
 
     @property
     def running(self) -> bool:
@@ -112,7 +147,7 @@ class Settling:
 
     def begin(self, generation: int) -> bool:
         """Start, for the halt of this ``generation``; False if no thread starts."""
-        permit = self._gate.settling(generation)
+        permit = self._permit = self._gate.settling(generation)
         self.state, self.error = "settling", ""
         self._ended.clear()
         # After the lockout, whose refusal says more.
@@ -124,20 +159,37 @@ class Settling:
             return False
         return True
 
+    def give_up(self) -> None:
+        """End a settling under way; the caller freezes the arm."""
+        if self._permit is not None:
+            self._permit.withdraw()
+
     def wait(self) -> State:
         """Wait for the end of a settling under way; return how the last one ended."""
-        self._ended.wait(SETTLE_S + 1)
+        self._ended.wait(self._patience_s + 1)
         return self.state
 
-    def _note_motion(self) -> None:
-        self._due = True
+    def ending(self) -> str:
+        """Return how the last settling ended, as the end of a sentence; empty for none."""
+        ends = {
+            "settled": "is at its rest pose, and limp",
+            "stopped": "was stopped again while it settled, and holds its position",
+            "failed": f"did not settle, and keeps its position with torque: {self.error}",
+        }
+        return ends.get(self.state, "")
+
+    def note_motion(self) -> None:
+        """Let the next halt settle the arm; its own way to the rest pose does not count."""
+        if not self.running:
+            self._due = True
 
     def _run(self, permit: Permit) -> None:
-        began = time.monotonic()
+        began = self._clock()
         self._notify("started")
         try:
-            self._travel(permit, began + SETTLE_S)
-            self._body.let_go(permit)
+            with self._body.running():
+                self._travel(permit, began + SETTLE_S, time.monotonic() + self._patience_s)
+                self._body.let_go(permit)
         except PermitVoidError:
             self._end(permit, "stopped", "another stop froze it", began)
         except BaseException as exc:  # noqa: BLE001 - a device may raise anything; the arm is held and the event says what
@@ -146,7 +198,7 @@ class Settling:
         else:
             self._end(permit, "settled", "", began)
 
-    def _travel(self, permit: Permit, deadline: float) -> None:
+    def _travel(self, permit: Permit, deadline: float, give_up: float) -> None:
         """Go along a straight line in joint space, all joints at once."""
         present = self._read(permit)
         start = {key: present[key] for key in self._rest}
@@ -155,26 +207,32 @@ class Settling:
         for step in range(1, steps + 1):
             share = step / steps
             target = {key: start[key] + share * (self._rest[key] - start[key]) for key in self._rest}
-            due = time.monotonic() + 1 / SETTLE_HZ
+            due = self._clock() + 1 / SETTLE_HZ
             self._body.send_action(target, permit)
             present = self._read(permit)
             behind = self._off(target, present, LAG_SHARE)
             if behind:
                 raise SettleError(f"{behind} of its target on the way to the rest pose: something is in its way")
-            if time.monotonic() > deadline:
+            if self._clock() > deadline:
                 raise SettleError(f"it was not at its rest pose in {SETTLE_S:g} s")
             # A late step delays the next one; catching up would be faster than the bound.
-            time.sleep(max(0.0, due - time.monotonic()))
+            self._wait(permit, due, give_up)
         while off := self._off(self._rest, present, ARRIVED_SHARE):
-            if time.monotonic() > deadline:
+            if self._clock() > deadline:
                 raise SettleError(f"{off} of the rest pose after {SETTLE_S:g} s")
-            time.sleep(1 / SETTLE_HZ)
+            self._wait(permit, self._clock() + 1 / SETTLE_HZ, give_up)
             present = self._read(permit)
 
-    def _read(self, permit: Permit) -> dict[str, float]:
+    def _wait(self, permit: Permit, until: float, give_up: float) -> None:
+        while (left := until - self._clock()) > 0 and permit.valid:
+            if time.monotonic() > give_up:
+                raise SettleError("its time stands still")
+            time.sleep(left)
+
+    def _read(self, permit: Permit) -> Mapping[str, float]:
         if not permit.valid:
             raise PermitVoidError(f"{self._body.name} was stopped")
-        joints = self._body.get_joints()
+        joints = self._body.get_positions()
         missing = [key for key in self._rest if key not in joints]
         if missing:
             raise SettleError(f"{', '.join(missing)} cannot be read")
@@ -201,7 +259,7 @@ class Settling:
             logger.critical("%s did not settle, and keeps its last position with torque: %s.", name, problem)
         else:
             logger.info("%s %s.", name, "settled and is limp" if state == "settled" else "was stopped while it settled")
-        took = 0.0 if began is None else time.monotonic() - began
+        took = 0.0 if began is None else self._clock() - began
         log_safety_event("settle_" + state, name, {"why": problem, "elapsed_s": round(took, 3)})
         self._notify("finished", took, {"settled": "completed", "stopped": "stopped"}.get(state, "error"), problem)
 
