@@ -8,7 +8,7 @@ dir=.venv-policies
 pins=(lerobot==0.4.4 torch==2.13.0 torchvision==0.28.0 transformers==4.57.6 tokenizers==0.22.2 safetensors==0.8.0
   diffusers==0.35.2 accelerate==1.15.0 datasets==4.8.5 huggingface-hub==0.35.3 numpy==2.4.6 pandas==3.1.1 av==15.1.0
   einops==0.8.2 gymnasium==1.4.0 draccus==0.10.0 jsonlines==4.0.0 deepdiff==8.6.2 imageio==2.38.1 num2words==0.5.14
-  pyserial==3.5 termcolor==3.3.0)
+  pyserial==3.5 termcolor==3.3.0 grpcio==1.85.1 protobuf==6.33.6)
 ./scripts/venv.sh "$dir" requirements/dev.lock
 stamp=$dir/.installed-lerobot
 want=$(cat "$0" "$dir"/.installed-dev.lock | sha256sum)

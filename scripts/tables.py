@@ -24,6 +24,7 @@ EXTRA_MEANINGS = {
     "bridge": "the framework's own MCP bridge (excludes `mcp`; not in `all`)",
     "dashboard": "the operator's page in a browser",
     "groot": "policies served by a GR00T server",
+    "lerobot-async": "policies served by LeRobot's asynchronous inference (not in `all`)",
     "mesh": "the native Zenoh mesh, for robots without Device Connect",
     "iot": "the mesh over AWS IoT Core (MQTT 5)",
     "reachy": "Reachy Mini",
@@ -32,7 +33,7 @@ EXTRA_MEANINGS = {
     "record": "recordings of robots as MCAP files",
     "dataset": "episodes of LeRobot's datasets as leaders (not in `all`)",
     "lerobot": "real arms through LeRobot, and its checkpoints (brings torch; not in `all`)",
-    "all": "everything but `bridge`, `dataset` and `lerobot`",
+    "all": "everything but `bridge`, `dataset`, `lerobot` and `lerobot-async`",
 }
 
 

@@ -219,6 +219,21 @@ REFUSED: dict[str, tuple[Callable[[Scene], None], str]] = {
 }
 
 
+def test_another_type_than_that_of_the_checkpoint_is_refused(scene: Scene) -> None:
+    scene.entries |= {"provider": "lerobot_async", "url": "grpc://localhost", "policy_type": "act"}
+    assert scene.check().passed
+    scene.entries["policy_type"] = "smolvla"
+    (row,) = scene.check().failures
+    assert (row.question, row.outcome, row.change) == ("policy type", "refused", 'set policy_type = "act"')
+
+
+def test_a_checkpoint_that_only_its_server_has_states_nothing(scene: Scene) -> None:
+    scene.entries |= {"provider": "lerobot_async", "url": "grpc://localhost", "policy_type": "act"}
+    scene.entries |= {"checkpoint": "somebody/act_pick_cube"}
+    found = scene.check()
+    assert {row.question for row in found.rows} & {"state order", "picture observation.images.front"} == {"state order"}
+
+
 @pytest.mark.parametrize(("change", "question"), REFUSED.values(), ids=REFUSED)
 def test_a_mismatch_is_refused_and_names_both_sides(
     scene: Scene, change: Callable[[Scene], None], question: str

@@ -18,13 +18,13 @@ def plug_in(**options: Any) -> ScriptedPolicy:
 
 
 def test_built_in_policies_have_names_and_aliases() -> None:
-    assert policy_names()[:5] == ("mock", "remote", "openpi", "groot", "lerobot_local")
+    assert policy_names()[:6] == ("mock", "remote", "openpi", "groot", "lerobot_async", "lerobot_local")
     assert resolve_provider("lerobot") == "lerobot_local"
 
 
 @pytest.mark.parametrize("provider", ["mok", "", 5, None, True, "x" * 500, ["mock"]])
 def test_unknown_provider_is_refused_with_the_known_ones(provider: Any) -> None:
-    with pytest.raises(ValidationError, match="mock, remote, openpi, groot, lerobot_local") as refused:
+    with pytest.raises(ValidationError, match="mock, remote, openpi, groot, lerobot_async, lerobot_local") as refused:
         create_policy(provider)
     assert len(str(refused.value)) < 400
 
@@ -51,7 +51,7 @@ def test_plug_in_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) ->
     entry = EntryPoint("dreamer", "tests.policies.test_policies:plug_in", policies.ENTRY_POINT_GROUP)
     wrong = EntryPoint("wrong", "builtins:dict", policies.ENTRY_POINT_GROUP)
     monkeypatch.setattr(policies, "entry_points", lambda group: [entry, wrong])
-    assert policy_names()[5:] == ("dreamer", "wrong")
+    assert policy_names()[6:] == ("dreamer", "wrong")
     monkeypatch.setattr(EntryPoint, "load", lambda self: plug_in if self.name == "dreamer" else dict)
     assert create_policy("dreamer", policy_port=3).act({}) == {"policy_port": 3}
     with pytest.raises(ValidationError, match="lacks"):

@@ -40,6 +40,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "bridge": ("fastmcp",),
     "dashboard": ("starlette", "uvicorn", "websockets", "segno"),
     "groot": ("pyzmq", "msgpack"),
+    "lerobot-async": ("grpcio",),
     "record": ("mcap", "pillow"),
     "dataset": ("pyarrow",),
     "lerobot": ("lerobot",),

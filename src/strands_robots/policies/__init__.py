@@ -26,6 +26,7 @@ _BUILT_IN = {
     "remote": ("strands_robots.policies.remote", "RemotePolicy"),
     "openpi": ("strands_robots.policies.openpi", "OpenPiPolicy"),
     "groot": ("strands_robots.policies.groot", "GrootPolicy"),
+    "lerobot_async": ("strands_robots.policies.lerobot_async", "LeRobotAsyncPolicy"),
     "lerobot_local": ("strands_robots.policies.lerobot_local", "LeRobotPolicy"),
 }
 

@@ -92,7 +92,10 @@ class PolicyCheckError(ValidationError):
 
 def statements_of(profile: Profile) -> list[Statement]:
     """Return what checkpoint and dataset on this machine state of a profile."""
-    found = checkpoint_statements(Path(profile.checkpoint).expanduser()) if profile.checkpoint else []
+    checkpoint = Path(profile.checkpoint).expanduser()
+    # What a server loads may be on its own disk alone.
+    absent = not profile.checkpoint or (profile.url and not checkpoint.is_dir())
+    found = [] if absent else checkpoint_statements(checkpoint)
     return found + ([dataset_statement(Path(profile.dataset).expanduser())] if profile.dataset else [])
 
 
@@ -100,6 +103,7 @@ def check_policy(profile: Profile, statements: Sequence[Statement], robot: Robot
     """Compare a profile and what its sources state with a robot."""
     rows = [
         *_sources(statements),
+        *_kind(profile, statements),
         *_vector("state", profile.state, [(s.source, s.state, s.state_size) for s in statements], list(robot.state)),
         *_environment(profile, statements, robot),
         *_values(profile, statements, robot),
@@ -120,6 +124,14 @@ def _sources(statements: Sequence[Statement]) -> Iterator[CheckRow]:
             yield CheckRow(
                 "checkpoint", f"{each.source}: {each.problem}", "-", "refused", "correct checkpoint or dataset"
             )
+
+
+def _kind(profile: Profile, statements: Sequence[Statement]) -> Iterator[CheckRow]:
+    for each in statements:
+        if each.kind and profile.policy_type:
+            change = f'set policy_type = "{each.kind}"'
+            fits = each.kind == profile.policy_type
+            yield _row("policy type", f"{each.kind} ({each.source})", profile.policy_type, fits, change)
 
 
 def _row(question: str, policy: str, robot: str, fits: bool, change: str) -> CheckRow:

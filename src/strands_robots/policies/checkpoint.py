@@ -36,6 +36,7 @@ class Statement:
         statistics: features whose statistics it has.
         state_range: lowest and highest value of each state in the data.
         language: it has to be told a task.
+        kind: its type, such as ``act``.
     """
 
     source: str
@@ -52,6 +53,7 @@ class Statement:
     statistics: frozenset[str] | None = None
     state_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     language: bool | None = None
+    kind: str = ""
 
 
 LANGUAGE_TYPES = frozenset({"smolvla", "pi0", "pi05", "pi0_fast", "groot", "xvla"})
@@ -113,6 +115,7 @@ def _config(config: Mapping[str, Any]) -> Statement:
         action=tuple(map(str, names)) if isinstance(names, list) and names else None,
         chunk=chunk if isinstance(chunk, int) and not isinstance(chunk, bool) else None,
         language=kind in LANGUAGE_TYPES,
+        kind=kind,
     )
 
 

@@ -20,6 +20,8 @@ UNITS = ("degrees", "radians", "normalized", "percent", "metres")
 LAYOUTS = ("libero", "droid", "aloha", "n1.5", "n1.6", "n1.6-flat")
 """Forms of a server's observation: the first three of openpi, the others of GR00T."""
 FLIPS = ("none", "180", "horizontal", "vertical")
+ASYNC = "lerobot_async"
+"""Provider whose server loads what the profile tells it."""
 CONFIRMABLE = ("units", "rate", "image size")
 """Facts that a profile may declare to be right although nothing states them."""
 
@@ -52,7 +54,9 @@ class Profile:
 
     Attributes:
         provider: the kind of policy, such as ``lerobot_local`` or ``remote``.
-        checkpoint: a local directory, or ``org/name`` on the Hub; empty for a server.
+        checkpoint: a local directory, or ``org/name`` on the Hub; empty for a server, but for one of LeRobot's, which
+            loads it.
+        policy_type: of the checkpoint that a server of LeRobot's loads, such as ``act``.
         url: of the server, ``ws://host:port``; empty for a checkpoint.
         dataset: directory of the dataset that it was trained on, for what ``meta/info.json`` states.
         state: the robot's observation keys in the policy's order.
@@ -76,6 +80,7 @@ class Profile:
     state: tuple[str, ...]
     action: tuple[str, ...]
     checkpoint: str = ""
+    policy_type: str = ""
     url: str = ""
     token_file: str = ""
     dataset: str = ""
@@ -171,8 +176,10 @@ def _profile(name: str, given: object) -> Profile:
             raise ValidationError(f"{where} needs {needed}.")
     checked = {each: check(f"{where}: {each}", entries[each]) for each, check in known.items()}
     profile = Profile(name, **checked)
-    if bool(profile.checkpoint) == bool(profile.url):
-        raise ValidationError(f"{where} needs either checkpoint or url.")
+    if profile.provider == ASYNC and not (profile.url and profile.checkpoint and profile.policy_type):
+        raise ValidationError(f"{where} needs url, checkpoint and policy_type: the server loads what it is told.")
+    if profile.provider != ASYNC and (profile.policy_type or bool(profile.checkpoint) == bool(profile.url)):
+        raise ValidationError(f"{where} needs either checkpoint or url; policy_type is of provider {ASYNC} alone.")
     keys = [camera.key for camera in profile.cameras]
     if len(keys) != len(set(keys)):
         raise ValidationError(f"{where}: cameras must have a key each, not {', '.join(keys)}.")
@@ -266,6 +273,7 @@ def _seconds(name: str, value: object) -> float:
 _ENTRIES: dict[str, Callable[[str, object], Any]] = {
     "provider": _provider,
     "checkpoint": _text(4096),
+    "policy_type": identifier,
     "url": _url,
     "token_file": _text(4096),
     "dataset": _text(4096),

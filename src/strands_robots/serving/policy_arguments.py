@@ -18,9 +18,9 @@ POLICY_TYPE_NOT_ALLOWED = "POLICY_TYPE_NOT_ALLOWED"
 
 BUILT_IN_ORGS = frozenset({"nvidia", "huggingface", "lerobot"})
 MOCK = "mock"
-PROVIDERS = frozenset({MOCK, "remote", "openpi", "groot", "lerobot_local", "lerobot"})
+PROVIDERS = frozenset({MOCK, "remote", "openpi", "groot", "lerobot_async", "lerobot_local", "lerobot"})
 FOREIGN_PROVIDERS = frozenset(
-    {"act", "cosmos", "cosmos3", "diffusion", "dreamgen", "dreamzero", "gr00t", "groot", "lerobot_async"}
+    {"act", "cosmos", "cosmos3", "diffusion", "dreamgen", "dreamzero", "gr00t"}
     | {"openvla", "pi0", "pi05", "pi0_fast", "pi0fast", "rdt", "sac", "smolvla", "sonic", "tdmpc", "vqbet", "wbc"}
 )
 """Providers of peers of other builds: they validate, and the robot answers that it has none of the name.
