@@ -46,6 +46,7 @@ def test_the_types_are_those_of_the_arguments() -> None:
         "duration": "number",
         "policy_port": "integer",
         "lease_id": "string",
+        "lease_ttl_s": "number",
     }
     assert execute["required"] == ["instruction"]
     update = next(e for e in DRIVERS[1].events if e.name == "observationUpdate").payload_schema

@@ -27,6 +27,7 @@ from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Re
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 
 KEY = Ed25519PrivateKey.generate()
+SECRET = "a secret of agent-a"
 PUBLIC = ed25519.public_half(KEY)
 
 
@@ -148,6 +149,56 @@ def test_motion_on_a_free_robot_holds_it_until_it_has_ended(bench: Bench) -> Non
     bench.lease.admit("moveTo", "agent-a", "").close()
     bench.body.moves = False
     bench.lease.admit("moveTo", "agent-b", "").close()
+
+
+def test_motion_with_a_time_is_halted_when_it_is_not_renewed(bench: Bench) -> None:
+    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).close()
+    bench.body.moves = True
+    for _ in range(3):
+        bench.clock.now += 4.0
+        bench.lease.renew(SECRET)
+    bench.clock.now += 4.9
+    bench.lease.expire()
+    assert bench.body.halts == []
+    bench.clock.now += 0.1
+    bench.lease.expire()
+    assert bench.body.halts == ["the control lease of agent-a is over"]
+    assert bench.lease.facts()["held"] is False
+
+
+def test_motion_with_a_time_that_has_ended_is_not_halted(bench: Bench) -> None:
+    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).close()
+    bench.clock.now += 5.0
+    bench.lease.expire()
+    assert bench.body.halts == []
+    assert bench.lease.facts()["held"] is False
+    bench.lease.admit("moveTo", "agent-b", SECRET + "b", 5.0).close()
+
+
+def test_motion_with_a_time_that_is_still_starting_is_halted(bench: Bench) -> None:
+    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0)
+    bench.clock.now += 5.0
+    bench.lease.expire()
+    assert bench.body.halts == ["the control lease of agent-a is over"]
+
+
+def test_motion_with_a_time_keeps_others_out_until_it_has_ended(bench: Bench) -> None:
+    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).close()
+    bench.body.moves = True
+    assert refused(bench, "agent-b")["expires_in_s"] is None
+    assert refused(bench, "agent-a", "another secret")["code"] == "not_holder"
+    bench.lease.admit("setGripper", "agent-a", SECRET, 5.0).close()
+    assert bench.lease.facts()["for_one_motion"] is True
+    bench.body.moves = False
+    bench.acquire("agent-b")
+
+
+def test_motion_of_a_holder_ends_with_the_lease_that_is_held(bench: Bench) -> None:
+    held = bench.acquire(ttl_s=60.0)
+    bench.lease.admit("moveTo", "agent-a", held, 0.5).close()
+    bench.clock.now += 59.0
+    bench.lease.expire()
+    assert bench.lease.facts()["held"] is True
 
 
 def test_motion_that_was_refused_leaves_the_robot_free(bench: Bench) -> None:
@@ -313,3 +364,24 @@ def test_leases_of_a_robot_that_is_gone_are_gone() -> None:
 
 def test_every_verb_of_the_lease_says_what_it_returns() -> None:
     assert all(verb.returns for verb in CONTROL_VERBS.values())
+
+
+@pytest.mark.parametrize("ttl_s", [-1.0, 0.1, 601.0, True, "5", float("nan")])
+def test_time_of_a_motion_outside_its_domain_is_refused(robot: ToyRobot, ttl_s: object) -> None:
+    refusal = served(pipeline(robot), "agent-a", "execute", instruction="wave", lease_id=SECRET, lease_ttl_s=ttl_s)
+    assert "lease_ttl_s" in refusal.result["content"][0]["text"]
+    assert robot.answers == []
+
+
+def test_time_of_a_motion_needs_a_secret(robot: ToyRobot) -> None:
+    refusal = served(pipeline(robot), "agent-a", "execute", instruction="wave", lease_ttl_s=5.0)
+    assert "needs a lease_id" in refusal.result["content"][0]["text"]
+    assert robot.answers == []
+
+
+def test_motion_of_a_caller_that_went_away_is_halted_in_its_time(robot: ToyRobot) -> None:
+    line = pipeline(robot)
+    begun = served(line, "agent-a", "execute", instruction="wave", duration=300.0, lease_id=SECRET, lease_ttl_s=0.5)
+    assert begun.result["status"] == "success"
+    eventually(lambda: not robot.rollouts["toy"].running, within=20.0, what="the halt")
+    assert robot.rollouts["toy"].state == "stopped"

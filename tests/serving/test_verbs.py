@@ -123,7 +123,7 @@ GO = Verb(
 
 
 def test_checked_arguments_have_their_defaults() -> None:
-    assert GO.checked({"steps": 3}) == {"steps": 3, "turns": 2, "lease_id": ""}
+    assert GO.checked({"steps": 3}) == {"steps": 3, "turns": 2, "lease_id": "", "lease_ttl_s": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -16,11 +17,11 @@ from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import RUNNING
 from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
-from strands_robots.envelope import Envelope, error, is_error, text_of
+from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.safety.stopping import Outcome, grade
-from strands_robots.serving.verbs import LEASE_ID
+from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
 from strands_robots.tools.networks import stop_and_lock
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, number
 
 ANSWER_S = 10.0
 """Longest wait for the answer to a call that does not wait for a motion."""
@@ -31,10 +32,17 @@ STOPS_MAX = 3
 
 SETTLE_S = 0.5
 
-RENEWALS = 4
-"""Renewals of a lease in its time, while its client is there."""
+SILENCE_S = 5.0
+"""Seconds after the server's last renewal at which a robot halts what the server began, as after its SIGKILL."""
 
-RENEW_MAX_S = 5.0
+RENEWALS = 4
+"""Renewals of a lease in its time at the robot."""
+
+RENEWED_S = 2.0
+"""Longest wait for the answer to a renewal: the next one is in time even so."""
+
+OVER = frozenset({"displaced", "lease_over", "not_holder"})
+"""Answers to a renewal after which the lease is another's, or nobody's."""
 
 Target = tuple[str, str]
 """A robot's id, and the name of one robot of its world or nothing."""
@@ -44,7 +52,13 @@ Target = tuple[str, str]
 class _Held:
     lease_id: str
     ttl_s: float
+    renewing: asyncio.Task[None] | None = None
     live: bool = True
+
+    def end(self) -> None:
+        """Renew it no more."""
+        if self.renewing is not None and self.renewing is not asyncio.current_task():
+            self.renewing.cancel()
 
 
 class Caller:
@@ -60,7 +74,7 @@ class Caller:
         self._leases: dict[Target, _Held] = {}
         self._first: dict[str, str] = {}
         self._moving: set[_Halting] = set()
-        self._renewing: asyncio.Task[None] | None = None
+        self._secrets: dict[str, str] = {}
         self._used_at = time.monotonic()
         # An emergency stop is never behind another call.
         self._urgent = ThreadPoolExecutor(1, "mcp-estop")
@@ -84,7 +98,7 @@ class Caller:
         target = await self._target(robot, params)
         if not wait and not self._holds(target):
             return _needs_lease()
-        arguments = {**params, "wait": wait, **self._lease(target)}
+        arguments = {**params, "wait": wait, **self._for_motion(target)}
 
         async def to_the_end(motion: _Halting) -> Envelope:
             answer = await motion.begin(verb, arguments, ANSWER_S + WAIT_S)
@@ -102,7 +116,7 @@ class Caller:
             return _needs_lease()
 
         async def to_the_end(motion: _Halting) -> Envelope:
-            answer = await motion.begin("execute", {**params, **self._lease(target)}, ANSWER_S)
+            answer = await motion.begin("execute", {**params, **self._for_motion(target)}, ANSWER_S)
             one = str(answer.get("robot_name") or params.get("robot_name") or "")
             while wait and not is_error(answer):
                 await asyncio.sleep(POLL_S)
@@ -114,26 +128,40 @@ class Caller:
         return await self._halting(target, to_the_end)
 
     async def acquire(self, robot: str, ttl_s: float, robot_name: str) -> Envelope:
-        """Acquire the control lease; motions of this client carry it from then on."""
+        """Acquire the control lease; motions of this client carry it from then on.
+
+        Args:
+            ttl_s: seconds for which it lasts after the client's last call, while the client is not there.
+        """
+        try:
+            lasts = number("ttl_s", ttl_s, low=TTL_MIN_S, high=TTL_MAX_S)
+        except ValidationError as refused:
+            return error(str(refused))
         target = await self._target(robot, {"robot_name": robot_name}, leased=True)
-        params = {"kind": "agent", "ttl_s": ttl_s, **({"robot_name": robot_name} if robot_name else {})}
+        at_robot = min(lasts, SILENCE_S)
+        params = {"kind": "agent", "ttl_s": at_robot, **({"robot_name": robot_name} if robot_name else {})}
         answer = await self.read(robot, "acquireControl", {**params, **self._lease(target)})
-        if not is_error(answer) and isinstance(answer.get(LEASE_ID), str):
-            self._leases[robot, str(answer.get("robot_name", target[1]))] = _Held(answer[LEASE_ID], ttl_s)
-            if self._renewing is None:
-                self._renewing = asyncio.ensure_future(self._renew())
+        lease_id = answer.get(LEASE_ID)
         # The secret stays here: a model has no use for it.
-        return _without_lease(answer)
+        told = {name: value for name, value in answer.items() if name != LEASE_ID}
+        if is_error(answer) or not isinstance(lease_id, str):
+            return told
+        one = robot, str(answer.get("robot_name", target[1]))
+        self._forget(one)
+        held = self._leases[one] = _Held(lease_id, lasts)
+        held.renewing = asyncio.ensure_future(self._keep(one, held, at_robot / RENEWALS))
+        return {**told, **success(f"Held until it is released, or {lasts:g} s after this client went away.")} | {
+            "expires_in_s": lasts
+        }
 
     async def release(self, robot: str, robot_name: str) -> Envelope:
         """Give the control lease back."""
         target = await self._target(robot, {"robot_name": robot_name})
         if target not in self._leases:
             return error(f"This client holds no lease of {robot}.")
-        params = {**self._lease(target), **({"robot_name": target[1]} if target[1] else {})}
-        answer = await self.read(robot, "releaseControl", params)
-        self._leases.pop(target, None)
-        return _without_lease(answer)
+        answer = await self.read(robot, "releaseControl", {**self._lease(target), **_world(target)})
+        self._forget(target)
+        return answer
 
     async def stop(self, robot: str, robot_name: str = "") -> Envelope:
         """Stop a robot, or one of a world, without a lease or a wait."""
@@ -149,9 +177,8 @@ class Caller:
 
     async def leave(self) -> None:
         """Halt what this client moves and holds, and release it."""
-        if self._renewing is not None:
-            self._renewing.cancel()
-            self._renewing = None
+        for each in self._leases.values():
+            each.end()
         with anyio.CancelScope(shield=True):
             held = tuple(self._leases)
             await asyncio.gather(*(self.stop(*target) for target in {*held, *(each.target for each in self._moving)}))
@@ -171,30 +198,41 @@ class Caller:
 
     async def _halting(self, target: Target, work: Callable[[_Halting], Awaitable[Envelope]]) -> Envelope:
         halting = _Halting(self, target)
+        renewing = None if target in self._leases else asyncio.ensure_future(self._renew_motion(target))
         try:
             async with halting as motion:
                 return await work(motion)
         except (DeviceTimeoutError, NoSuchDeviceError, MessagingError) as exc:
             confirmed = f", which is not confirmed: {halting.moves}" if halting.moves else "."
             return error(f"{exc} What the call began was told to stop{confirmed}")
+        finally:
+            if renewing is not None:
+                renewing.cancel()
 
-    async def _renew(self) -> None:
-        renewed_at = time.monotonic()
+    async def _renew_motion(self, target: Target) -> None:
+        """Renew the lease of one motion until its call ends."""
         while True:
-            times = [held.ttl_s for held in self._leases.values() if held.live]
-            await asyncio.sleep(min(*times, RENEW_MAX_S * RENEWALS, RENEW_MAX_S * RENEWALS) / RENEWALS)
-            if not self._present() and self._used_at < renewed_at:
-                continue
-            renewed_at = time.monotonic()
-            await asyncio.gather(*(self._renew_one(target) for target in tuple(self._leases)))
+            await asyncio.sleep(SILENCE_S / RENEWALS)
+            await self._renewed(target, self._secret(target[0]))
 
-    async def _renew_one(self, target: Target) -> None:
-        held = self._leases.get(target)
-        if held is not None and held.live:
-            named = {"robot_name": target[1]} if target[1] else {}
-            answer = await self.read(target[0], "renewControl", {LEASE_ID: held.lease_id, **named})
-            # A motion carries it all the same: the robot's refusal says who has taken control.
-            held.live = answer.get("code") not in {"displaced", "lease_over", "not_holder"}
+    async def _keep(self, target: Target, held: _Held, every_s: float) -> None:
+        """Renew a held lease while its client is there, and its time after."""
+        while self._present() or time.monotonic() - self._used_at < held.ttl_s:
+            await asyncio.sleep(every_s)
+            if await self._renewed(target, held.lease_id) in OVER:
+                # A motion carries it all the same: the robot's refusal says who has taken control.
+                held.live = False
+                return
+        await self.stop(*target)
+        await self.release(*target)
+
+    async def _renewed(self, target: Target, lease_id: str) -> str:
+        """Renew a lease at the robot; return the code of its refusal, or nothing."""
+        try:
+            answer = await self._call(target[0], "renewControl", {LEASE_ID: lease_id, **_world(target)}, RENEWED_S)
+        except DeviceTimeoutError:
+            return ""
+        return str(answer.get("code", ""))
 
     async def _target(self, robot: str, params: Mapping[str, Any], *, leased: bool = False) -> Target:
         """Return the robot that is meant, of a world the first where none is named."""
@@ -230,6 +268,18 @@ class Caller:
     def _lease(self, target: Target) -> dict[str, str]:
         held = self._leases.get(target)
         return {} if held is None else {LEASE_ID: held.lease_id}
+
+    def _for_motion(self, target: Target) -> dict[str, Any]:
+        """Return the held lease, else one for this motion alone."""
+        return self._lease(target) or {LEASE_ID: self._secret(target[0]), LEASE_TTL_S: SILENCE_S}
+
+    def _secret(self, robot: str) -> str:
+        return self._secrets.setdefault(robot, secrets.token_hex(16))
+
+    def _forget(self, target: Target) -> None:
+        held = self._leases.pop(target, None)
+        if held is not None:
+            held.end()
 
 
 class _Halting:
@@ -283,8 +333,8 @@ def _named(params: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in params.items() if name == "robot_name"}
 
 
-def _without_lease(answer: Envelope) -> Envelope:
-    return {name: value for name, value in answer.items() if name not in {LEASE_ID, "content"}}
+def _world(target: Target) -> dict[str, str]:
+    return {"robot_name": target[1]} if target[1] else {}
 
 
 def _needs_lease() -> Envelope:

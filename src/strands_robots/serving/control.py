@@ -35,8 +35,8 @@ logger = logging.getLogger(__name__)
 HUMAN, AGENT, POLICY = "human", "agent", "policy"
 KINDS = (HUMAN, AGENT, POLICY)
 
-TTL_MIN_S, TTL_MAX_S, TTL_S = 0.5, 600.0, 60.0
-"""Bounds of a lease's time, and the time where none is asked for."""
+TTL_S = 60.0
+"""A lease's time where none is asked for."""
 
 DISPLACED_MAX = 16
 """Former holders of a robot that are still told that they were displaced."""
@@ -67,8 +67,9 @@ class Lease:
     """One holder's lease. Times are monotonic seconds.
 
     Attributes:
-        ttl_s: it is over so long after its last use; None for the lease of one motion, which is over with it.
+        ttl_s: it is over so long after its last use; None for a lease without such a time.
         until: the moment at which it is over.
+        one_motion: it is over with the motion that it was made for.
     """
 
     holder: str
@@ -76,10 +77,11 @@ class Lease:
     lease_id: str = field(repr=False)
     ttl_s: float | None = None
     until: float | None = None
+    one_motion: bool = False
 
     def left(self, now: float) -> float | None:
         """Return the seconds left, None for the lease of one motion."""
-        return None if self.until is None else max(self.until - now, 0.0)
+        return None if self.until is None or self.one_motion else max(self.until - now, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +273,7 @@ class ControlLease:
             "holder": lease.holder,
             "kind": lease.kind,
             "epoch": self.epoch,
-            "for_one_motion": lease.until is None,
+            "for_one_motion": lease.one_motion,
             "expires_in_s": lease.left(self._clock()),
         }
 
@@ -290,7 +292,7 @@ class ControlLease:
             raise NotHolderError(text, "not_holder", holder=leader, kind=HUMAN)
         with self._changing:
             lease = self._lease
-            own = lease is not None and (_is(lease, lease_id) or (lease.until is None and lease.holder == holder))
+            own = lease is not None and (_is(lease, lease_id) or (lease.one_motion and lease.holder == holder))
             if lease is not None and not own:
                 raise self._not_holder("acquireControl", lease)
             return self._give(holder, kind, ttl_s, "acquired")
@@ -342,24 +344,35 @@ class ControlLease:
         self._halt(f"control taken by {holder}: {reason}")
         return answer
 
-    def admit(self, verb: str, caller: object, lease_id: str) -> Admission:
+    def admit(self, verb: str, caller: object, lease_id: str, ttl_s: float = 0.0) -> Admission:
         """Admit a motion of the holder, or hold a free robot for it.
+
+        Args:
+            ttl_s: on a free robot ``lease_id`` is a secret of the caller's own, and the motion is halted so long after
+                the last renewal; 0 for a motion that needs none.
 
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
         self._settle()
         with self._changing:
-            if lease_id:
-                self._used(verb, lease_id)
-                return Admission()
             holder, lease = _name(caller), self._lease
-            if lease is None:
-                # Known by its name alone; without a lease_id nobody can renew it.
-                self._lease = Lease(holder, HUMAN if verb == FOLLOW else AGENT, secrets.token_hex(16))
-            elif lease.until is not None or lease.holder != holder:
+            if lease is None and (ttl_s or not lease_id):
+                self._hold_for_motion(holder, HUMAN if verb == FOLLOW else AGENT, lease_id, ttl_s)
+            elif lease_id:
+                if not self._used(verb, lease_id).one_motion:
+                    return Admission()
+            elif lease is not None and not (lease.one_motion and lease.holder == holder):
                 raise self._not_holder(verb, lease)
             return Admission(self._starting)
+
+    def _hold_for_motion(self, holder: str, kind: str, lease_id: str, ttl_s: float) -> None:
+        if not ttl_s:
+            # Known by its name alone; without a lease_id nobody can renew it.
+            self._lease = Lease(holder, kind, secrets.token_hex(16), one_motion=True)
+            return
+        self._lease = Lease(holder, kind, lease_id, ttl_s, self._clock() + ttl_s, one_motion=True)
+        self._watched(self)
 
     def refuse_others(self, verb: str, caller: object, lease_id: str) -> None:
         """Refuse a motion of the whole world, unless it is the holder's.
@@ -370,17 +383,22 @@ class ControlLease:
         self._settle()
         with self._changing:
             lease = self._lease
-            own = lease is None or _is(lease, lease_id) or (lease.until is None and lease.holder == _name(caller))
+            own = lease is None or _is(lease, lease_id) or (lease.one_motion and lease.holder == _name(caller))
             if lease is not None and not own:
                 raise self._not_holder(verb, lease)
 
     def expire(self) -> None:
         """End a lease whose time is over, and halt what its holder began."""
+        lease = self._lease
+        if lease is None or lease.until is None or self._clock() < lease.until:
+            return
+        moves = not lease.one_motion or bool(self._starting) or self._moving()
         with self._changing:
-            lease = self._lease
-            if lease is None or lease.until is None or self._clock() < lease.until:
+            if self._lease is not lease:  # renewed or given to another meanwhile
                 return
             self._lease = None
+        if not moves:
+            return
         logger.warning("%s: the control lease of %s is over; what it moved is halted.", self._robot, lease.holder)
         self._halt(f"the control lease of {lease.holder} is over")
         self._tell("expired", lease)
@@ -389,7 +407,7 @@ class ControlLease:
         """End a lease that is over, by its time or with its motion."""
         self.expire()
         lease = self._lease
-        if lease is None or lease.until is not None or self._starting or self._moving():
+        if lease is None or not lease.one_motion or self._starting or self._moving():
             return
         with self._changing:
             if self._lease is lease and not self._starting:
@@ -535,14 +553,14 @@ class ControlLeases:
                 lease.observe(self._observers.tell)
         return lease
 
-    def admit(self, command: str, caller: object, lease_id: str, name: str | None) -> Admission:
+    def admit(self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0) -> Admission:
         """Admit a motion of the named robot; with None of all robots of the world.
 
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
         if name is not None or not isinstance(self._robot(), WorldRobot):
-            return self.of(name or "").admit(command, caller, lease_id)
+            return self.of(name or "").admit(command, caller, lease_id, ttl_s)
         for each in tuple(self._by_name.values()):
             each.refuse_others(command, caller, lease_id)
         return Admission()
@@ -614,9 +632,9 @@ class _OneOf(ControlLeases):
         """Return the lease of this robot."""
         return self._world.of(self._name)
 
-    def admit(self, command: str, caller: object, lease_id: str, name: str | None) -> Admission:
+    def admit(self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0) -> Admission:
         """Admit a motion of this robot."""
-        return self._world.admit(command, caller, lease_id, self._name)
+        return self._world.admit(command, caller, lease_id, self._name, ttl_s)
 
     def facts(self) -> dict[str, Any]:
         """Return the holder of this robot."""

@@ -4,8 +4,18 @@ from __future__ import annotations
 
 from strands_robots.contract import Robot, WorldRobot
 from strands_robots.envelope import Envelope, is_error, success
-from strands_robots.serving.control import KINDS, TTL_MAX_S, TTL_MIN_S, TTL_S, ControlLease, ControlLeases
-from strands_robots.serving.verbs import LEASE_ID, LEASE_ID_MAX, Arguments, Kind, Parameter, Verb, table
+from strands_robots.serving.control import KINDS, TTL_S, ControlLease, ControlLeases
+from strands_robots.serving.verbs import (
+    LEASE_ID,
+    LEASE_ID_MAX,
+    TTL_MAX_S,
+    TTL_MIN_S,
+    Arguments,
+    Kind,
+    Parameter,
+    Verb,
+    table,
+)
 from strands_robots.utils import choice, number, text
 
 _KIND = Parameter(

@@ -23,7 +23,7 @@ from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
 from strands_robots.serving.control import Admission, ControlLeases, NotHolderError, leases_of
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
-from strands_robots.serving.verbs import LEASE_ID, Arguments, Kind, Verb
+from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.utils import ValidationError
 
@@ -261,12 +261,16 @@ class Pipeline:
                 raise Refused(RefusalReason.CONTROL, f"{verb.name}: no robot is registered on this peer.")
             arguments |= {"caller": command.caller, "robot": self.peer_id(), "leases": leases}
             return Admission()
-        lease_id = arguments.pop(LEASE_ID, "") or "" if verb.leased else ""
-        if leases is None or not verb.leased:
+        if not verb.leased:
+            return Admission()
+        lease_id, ttl_s = arguments.pop(LEASE_ID, "") or "", arguments.pop(LEASE_TTL_S, 0.0) or 0.0
+        if ttl_s and not lease_id:
+            raise Refused(RefusalReason.ARGUMENTS, f"{LEASE_TTL_S} needs a {LEASE_ID}: a secret of the caller's own.")
+        if leases is None:
             return Admission()
         name = None if verb.of_world else arguments.get("robot_name", "")
         try:
-            return leases.admit(verb.name, command.caller, lease_id, name)
+            return leases.admit(verb.name, command.caller, lease_id, name, ttl_s)
         except NotHolderError as exc:
             raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
 

@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any
 
 from strands_robots.safety.resume import is_epoch
-from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, shown, text, whole
+from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, number, shown, text, whole
 
 Arguments = Mapping[str, Any]
 """Checked arguments, by parameter."""
@@ -71,6 +71,29 @@ _LEASE_ID = Parameter(
     default="",
 )
 
+LEASE_TTL_S = "lease_ttl_s"
+
+TTL_MIN_S, TTL_MAX_S = 0.5, 600.0
+"""Bounds of the seconds after which a silent holder loses a robot."""
+
+
+def _motion_ttl(name: str, value: object) -> float:
+    if value == 0 and not isinstance(value, bool):
+        return 0.0
+    return number(name, value, low=TTL_MIN_S, high=TTL_MAX_S)
+
+
+_LEASE_TTL = Parameter(
+    LEASE_TTL_S,
+    float,
+    f"Seconds without renewControl after which this motion is halted, {TTL_MIN_S:g} to {TTL_MAX_S:g}, 0 for never; "
+    "lease_id is then a secret of your own",
+    _motion_ttl,
+    default=0.0,
+)
+
+OF_THE_LEASE = (_LEASE_ID, _LEASE_TTL)
+
 
 def _nonce(name: str, value: object) -> str:
     if value == "" or is_epoch(value):
@@ -122,13 +145,13 @@ class Verb:
 
     def __post_init__(self) -> None:
         if self.leased and all(each.name != LEASE_ID for each in self.parameters):
-            lease_id = _LEASE_ID if not self.drops_unknown else replace(_LEASE_ID, default=None)
-            object.__setattr__(self, "parameters", (*self.parameters, lease_id))
+            more = [replace(each, default=None) if self.drops_unknown else each for each in OF_THE_LEASE]
+            object.__setattr__(self, "parameters", (*self.parameters, *more))
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
 
     @property
     def leased(self) -> bool:
-        """True for a motion of the lease's holder alone; it takes ``lease_id`` besides."""
+        """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
         return self.kind is Kind.MOTION and not self.while_locked
 
     def unfit(self, names: Collection[str]) -> str | None:
@@ -137,7 +160,7 @@ class Verb:
         missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
         if not unknown and not missing:
             return None
-        takes = ", ".join(name for name in self.by_name if name != LEASE_ID) or "no parameters"
+        takes = ", ".join(name for name in self.by_name if name not in {LEASE_ID, LEASE_TTL_S}) or "no parameters"
         problem = f"it has no {', '.join(unknown)}" if unknown else f"{', '.join(missing)} is missing"
         return f"{self.name} takes {takes}: {problem}."
 
