@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.safety.estop_listener import OnEvent, OnState, StopLink
+from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, VERDICT, OnEvent, OnState, StopLink
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends.zenoh_session import LinkedSession
@@ -34,6 +34,9 @@ LEASE_MS = 4000
 
 OVERLAP_S = 2.0
 """Time in which a replaced session still carries stops: peers learn of the new one and of one another meanwhile."""
+
+ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER))
+"""Events that answer; any other one is a stop or a check-in, and goes first."""
 
 CLOSE_S = 10.0
 """Seconds that a close waits for the link's thread."""
@@ -92,6 +95,7 @@ class ZenohStopLink:
         self._thread: threading.Thread | None = None
         self._subscribed: tuple[Collection[str], OnEvent] = ((), lambda event, source, payload: None)
         self._put_options: dict[str, Any] = {}
+        self._answer_options: dict[str, Any] = {}
 
     @property
     def up(self) -> bool:
@@ -119,12 +123,12 @@ class ZenohStopLink:
                 self._start(self._replace)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
-        sent = False
+        sent, options = False, self._answer_options if event in ANSWERS else self._put_options
         for each in self._sessions:
             if not each.remotes:
                 continue
             try:
-                each.zenoh.put(f"{self._root}/{source}/event/{event}", payload, **self._put_options)
+                each.zenoh.put(f"{self._root}/{source}/event/{event}", payload, **options)
             except Exception as exc:  # noqa: BLE001 - the binding has one error for a closed session and a bad key
                 logger.warning("%s was not sent: %s", event, exc)
             else:
@@ -171,6 +175,8 @@ class ZenohStopLink:
             "congestion_control": zenoh.CongestionControl.DROP,
             "express": True,
         }
+        # Many robots answer at once: their answers share batches, and stand before no stop.
+        self._answer_options = {**self._put_options, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": False}
         events, on_event = self._subscribed
         session = None
         while session is None:
@@ -197,7 +203,7 @@ class ZenohStopLink:
         config["connect"]["retry"] = {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2}
         config["transport"]["link"]["tx"]["lease"] = LEASE_MS
         # Answers of many robots come at once; Zenoh's own queue holds two batches and drops what does not fit.
-        config["transport"]["link"]["tx"]["queue"] = {"size": {"real_time": 16}}
+        config["transport"]["link"]["tx"]["queue"] = {"size": {"real_time": 16, "interactive_high": 16}}
         # Zenoh keeps a descriptor of each link that agreed on shared memory; a stop has no use for it.
         config["transport"]["shared_memory"] = {"enabled": False}
         if not self._link.is_peer:

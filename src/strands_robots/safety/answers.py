@@ -109,6 +109,14 @@ class Answers:
         """Return the robots that have answered and were not only claimed to."""
         return frozenset(name for name, each in self.by_robot.items() if not each.claimed)
 
+    def final(self) -> list[str]:
+        """Return the robots that stopped and have no more to say about it."""
+        return [
+            name
+            for name, each in self.by_robot.items()
+            if each.stopped and not each.claimed and each.facts.get("persisted") is not False
+        ]
+
     def unsettled(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return those of ``names`` whose own answer is missing, sorted."""
         return tuple(sorted(frozenset(names) - self.settled()))

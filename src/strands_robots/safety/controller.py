@@ -31,7 +31,7 @@ from strands_robots.safety.estop_listener import (
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.orders import REASON_MAX, new_epoch, signed_bytes
+from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, signed_bytes
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError, device_id, number
@@ -44,6 +44,9 @@ REPEAT_S = (0.005, 0.005, 0.01, 0.01, 0.02, 0.05, 0.1, 0.2)
 REPEAT_SIGNED_S = (0.005, 0.005, *[0.01] * 19, *[0.02] * 15, 0.05, 0.1, 0.2)
 """Pauses of a signed stop: every 10 to 20 ms in its first half second. Robots check signatures one by one, so that of
 many forged stops in the controller's name and the true ones only a share is served."""
+
+REPEAT_EACH_S = 0.00005
+"""Pause for each robot that has to answer, where that is longer: hundreds of halts are under way meanwhile."""
 
 UNCONFIRMED_S = 0.1
 RENEW_S = 6.0
@@ -277,7 +280,8 @@ class SafetyController:
 
     def _send(self, run: _Running) -> None:
         """Send the stop, issued now and pressed at its press."""
-        fields = {"estop_id": run.estop_id, "reason": run.reason, "pressed_at": run.press.wall}
+        fields: dict[str, Any] = {"estop_id": run.estop_id, "reason": run.reason, "pressed_at": run.press.wall}
+        fields |= answered_field(run.graded.final())
         payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
         if self._link.publish(self.controller_id, ESTOP, payload) and run.left is None:
             run.left = now
@@ -310,7 +314,7 @@ class SafetyController:
                     self._send(run)
                 again += 1
                 pause = next(pauses, pause)
-                next_send = now + pause
+                next_send = now + max(pause, REPEAT_EACH_S * len(run.expected))
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
             with self._changed:
                 seen = (self._link.up, len(run.expected))

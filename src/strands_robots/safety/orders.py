@@ -9,7 +9,7 @@ import hashlib
 import json
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,6 +35,12 @@ PARSED_MAX_BYTES = 64 * 2**10
 """A message longer than this is not read; from a source that may stop, it stops all the same."""
 
 REASON_MAX = 200
+
+ANSWERED = "answered"
+"""Field of a repeated stop: the devices that its issuer asks for no further answer."""
+
+ANSWERED_MAX_BYTES = PARSED_MAX_BYTES // 2
+"""Length of all names in :data:`ANSWERED`; what exceeds it is left out, and answers again."""
 
 REQUIRE_SIGNED = "STRANDS_ESTOP_REQUIRE_SIGNED"
 ALLOW = "DEVICE_CONNECT_ESTOP_ALLOW"
@@ -64,6 +70,7 @@ class StopOrder:
         pressed: the issuer's wall-clock seconds at the press, the same in every repetition, or None.
         received_at: this process's wall-clock seconds at receipt.
         clock_ahead_s: seconds by which this process's clock is ahead of the issuer's, or None where not measured.
+        answered: devices whose answer the issuer has; one that stopped does not repeat it.
     """
 
     epoch: str
@@ -76,6 +83,7 @@ class StopOrder:
     pressed: float | None = None
     received_at: float = field(default_factory=time.time, compare=False)
     clock_ahead_s: float | None = None
+    answered: frozenset[str] = field(default=frozenset(), compare=False)
 
     def delay_s(self, now: float) -> float | None:
         """Return the seconds from the press to wall-clock ``now``; None if not stated.
@@ -283,6 +291,7 @@ class StopRules:
             pressed=seconds_of(params.get("pressed_at")),
             received_at=received_at,
             clock_ahead_s=ahead,
+            answered=_names(params.get(ANSWERED)),
         )
 
     def signature_refusal(self, source: str, params: Mapping[str, Any], purpose: Purpose) -> str | None:
@@ -314,6 +323,21 @@ def params_of(payload: bytes) -> dict[str, Any]:
         return {}
     params = message.get("params") if isinstance(message, dict) else None
     return params if isinstance(params, dict) else {}
+
+
+def answered_field(names: Iterable[str]) -> dict[str, list[str]]:
+    """Return the field that names who has answered; empty where there is nobody."""
+    named, length = [], 0
+    for name in names:
+        length += len(name) + 4
+        if length > ANSWERED_MAX_BYTES:
+            break
+        named.append(name)
+    return {ANSWERED: named} if named else {}
+
+
+def _names(value: object) -> frozenset[str]:
+    return frozenset(each for each in value if isinstance(each, str)) if isinstance(value, list) else frozenset()
 
 
 def _text(params: Mapping[str, Any]) -> bytes:

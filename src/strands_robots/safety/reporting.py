@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
+import random
 import threading
 import time
 from collections.abc import Callable
@@ -21,6 +22,17 @@ logger = logging.getLogger(__name__)
 
 GRACE_S = 0.03
 """Lockouts are written when every robot has answered, or after this long: a slow halt delays only its own report."""
+
+UNPACED = 32
+"""Robots of a process that answer as soon as they have halted."""
+
+PACE_S = 0.001
+"""Seconds for each robot of a larger process until they answer, and as much again by chance.
+
+Other processes of the machine still halt theirs in this time: nothing of an answer is done meanwhile."""
+
+GATHER_S = 0.005
+"""Seconds between two looks at the answers that come in before any of them goes out."""
 
 KEEP_S = 0.7
 """Seconds that a report waits for the lockout file before it says ``persisted: false``.
@@ -49,6 +61,11 @@ class StopRun:
     answers: dict[str, tuple[StopVerdict, float]] = field(default_factory=dict)
     keeping_since: float | None = None
     kept: bool | None = None
+    answer_at: float = 0.0
+
+    def __post_init__(self) -> None:
+        count = len(self.robot_ids)
+        self.answer_at = self.started + (PACE_S * count * random.uniform(1.0, 2.0) if count > UNPACED else 0.0)
 
     def wait(self, timeout: float) -> bool:
         """True when every robot has been reported."""
@@ -129,6 +146,9 @@ class Reporter:
         """Return everything that has arrived; False to end."""
         with contextlib.suppress(queue.Empty):  # all taken, or it is time to look at the clock
             message = self._inbox.get(timeout=self._patience())
+            if message is not None and not isinstance(message, StopRun) and self._pacing():
+                # One look for many halts: a thread that wakes for each takes time from the next one.
+                time.sleep(GATHER_S)
             while True:
                 if message is None:
                     return False
@@ -143,6 +163,9 @@ class Reporter:
 
     def _patience(self) -> float:
         return min([self._tick_s, *(0.01 for _ in self._runs)])
+
+    def _pacing(self) -> bool:
+        return any(time.monotonic() < run.answer_at for run in self._runs)
 
     def _answered(self, answer: _Answer) -> None:
         run = answer.run
@@ -162,6 +185,8 @@ class Reporter:
 
     def _advance(self, run: StopRun, now: float) -> None:
         waiting = [each for each in run.robot_ids if each not in run.answers]
+        if now < run.answer_at:
+            return
         if run.keeping_since is None and (not waiting or now - run.started >= GRACE_S):
             run.keeping_since = now
             self._files.put(run)

@@ -403,7 +403,9 @@ class StopExecutor:
             slot = self._reserve.get()
             with self._counting:
                 self._idle -= 1
-            self._watch_now.put(None)
+                used_up = self._idle == 0
+            if used_up:
+                self._watch_now.put(None)
             if slot is not None:
                 self._serve(slot)
             del slot
