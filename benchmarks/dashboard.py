@@ -37,11 +37,14 @@ for (const name of ["pointerdown", "pointerup"]) window.addEventListener(name, (
   window[name === "pointerdown" ? "pressedAt" : "releasedAt"] = performance.timeOrigin + event.timeStamp;
 }, true);
 new MutationObserver(() => {
+  const alarm = document.getElementById("alarm");
+  if (alarm && alarm.hidden) window.alarmedAt = 0;
+  else if (alarm && !window.alarmedAt) window.alarmedAt = performance.timeOrigin + performance.now();
   if (!window.paintedAt && document.querySelectorAll(".card").length >= 4) {
     const painted = () => { window.paintedAt = window.paintedAt || performance.now(); };
     requestAnimationFrame(() => requestAnimationFrame(painted));
   }
-}).observe(document, { childList: true, subtree: true });
+}).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["hidden"] });
 """
 
 
@@ -180,6 +183,22 @@ def _hide(page: Any) -> float:
     return _monotonic(hidden)
 
 
+def _silences(bench: Bench, times: int, process: Any) -> list[float]:
+    """Milliseconds from a process's SIGSTOP until the page says that it cannot stop."""
+    took = []
+    with bench.page() as page:
+        for _ in range(times):
+            shows(page, "document.body.dataset.canStop === 'yes' && window.alarmedAt === 0", 60.0)
+            began = time.monotonic()
+            os.kill(process.pid, signal.SIGSTOP)
+            try:
+                shows(page, "window.alarmedAt > 0", 60.0)
+            finally:
+                os.kill(process.pid, signal.SIGCONT)
+            took.append((_monotonic(page.evaluate("window.alarmedAt")) - began) * 1000)
+    return took
+
+
 def _paint(bench: Bench) -> list[float]:
     took = []
     for _ in range(5):
@@ -249,7 +268,7 @@ def hundred(seconds: float, robots_: int = 100) -> list[Row]:
 
 def run(*, quick: bool = False) -> list[Row]:
     """Return the rows of the table."""
-    presses, jogs, kills = (8, 6, 2) if quick else (100, 50, 10)
+    presses, jogs, kills, silences = (8, 6, 2, 2) if quick else (50, 25, 5, 5)
     with ExitStack() as stack:
         bench = Bench(stack, FOUR, 500.0 / len(FOUR), STRANDS_DC_STREAM_HZ="10", STRANDS_DC_STATE_BUSY_HZ="5")
         rows = [
@@ -258,6 +277,8 @@ def run(*, quick: bool = False) -> list[Row]:
             _row("tab hidden during a jog to the last write", _jogs(bench, jogs, _hide), 300),
             _row("browser killed during a jog to the last write", _kills(bench, kills), 500),
             _row("first useful paint, four robots", _paint(bench), 1500),
+            _row("server hangs until the page says so", _silences(bench, silences, bench.server.process), 1000),
+            _row("network silent until the page says so", _silences(bench, silences, bench.arms), 1000),
             _weight(bench),
         ]
     return [*rows, *hundred(10.0 if quick else 60.0)]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import segno
 
 from strands_robots.dashboard.access import OPERATOR, VIEWER, Access, is_local, loopback_origins
-from strands_robots.dashboard.listening import remote_address
+from strands_robots.dashboard.listening import qr_code, remote_address
 from strands_robots.utils import ValidationError
 
 HERE = loopback_origins(8800)
@@ -68,3 +69,15 @@ def test_local_is_an_address_of_loopback(client: object, local: bool) -> None:
 def test_loopback_is_refused_as_a_second_address_of_the_page(address: str) -> None:
     with pytest.raises(ValidationError, match=r"--listen must be an address besides .* served anyway"):
         remote_address(address, 8800)
+
+
+def test_qr_code_on_a_dark_terminal_has_the_modules_of_the_address() -> None:
+    url = "https://192.0.2.10:8800/#token=" + "x" * 32
+    light = {"█": (True, True), "▀": (True, False), "▄": (False, True), " ": (False, False)}
+    rows: list[list[bool]] = []
+    for line in qr_code(url).splitlines():
+        pairs = [light[each] for each in line]
+        rows += [[not upper for upper, _ in pairs], [not lower for _, lower in pairs]]
+    modules = [[bool(each) for each in row] for row in segno.make(url, error="l").matrix]
+    assert [row[2:-2] for row in rows[1 : 1 + len(modules)]] == modules
+    assert not any(rows[0]) and not any(row[0] or row[1] or row[-1] for row in rows), "it has a light border"

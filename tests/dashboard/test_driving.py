@@ -12,7 +12,7 @@ from fixtures.waiting import until
 
 from strands_robots.dashboard import driving
 from strands_robots.dashboard.driving import BEAT_S, HandControl, JogAxis
-from strands_robots.envelope import error, is_error, success
+from strands_robots.envelope import error, is_error, success, text_of
 from strands_robots.utils import ValidationError
 
 ARM, KEY = "arm-1", "dc:arm-1"
@@ -65,7 +65,9 @@ async def test_held_robot_is_taken_from_its_holder(page: Page) -> None:
         error("agent-1 holds control", code="not_holder"),
         success("yours", lease_id="lease-3"),
     ]
-    assert not is_error(await page.take())
+    answer = await page.take()
+    assert not is_error(answer)
+    assert text_of(answer) == "Taken from agent-1, without a signature."
     assert page.feed.asked("takeControl")[0]["reason"]
     assert page.control.lease(KEY) == {"lease_id": "lease-3"}
     assert page.feed.asked("acquireControl")[1]["lease_id"] == "lease-2"

@@ -177,7 +177,8 @@ class HandControl:
             held.renewing = asyncio.create_task(self._renew(key, held))
         finally:
             self._taking.discard(key)
-        return {name: value for name, value in answer.items() if name not in (LEASE_ID, "content")}
+        told = {name: value for name, value in answer.items() if name not in (LEASE_ID, "content")}
+        return {**told, "content": [{"text": _taken(answer)}]} if "taken_from" in answer else told
 
     async def give(self, key: str) -> Envelope:
         """Stop what this page jogs there, and give the robot back."""
@@ -243,7 +244,8 @@ class HandControl:
             return answer
         # A lease that was taken lasts a minute; ours ends soon after this server.
         held = {LEASE_ID: lease, "kind": HUMAN, "ttl_s": LEASE_S, **which}
-        return await feed.call(robot, "acquireControl", held, ANSWER_S)
+        kept = await feed.call(robot, "acquireControl", held, ANSWER_S)
+        return {**kept, "taken_from": str(before.get("holder", ""))[:128], "signed": signer is not None}
 
     async def _renew(self, key: str, held: HeldRobot) -> None:
         silent_since: float | None = None
@@ -359,6 +361,11 @@ class HandControl:
     @staticmethod
     def _lease_of(held: HeldRobot) -> dict[str, str]:
         return {LEASE_ID: held.lease_id, **({"robot_name": held.part} if held.part else {})}
+
+
+def _taken(answer: Envelope) -> str:
+    by = "signed with the operator's key" if answer["signed"] else "without a signature"
+    return f"Taken from {answer['taken_from']}, {by}."
 
 
 async def _watch(jog: Jogging) -> None:

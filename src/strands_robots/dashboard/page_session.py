@@ -291,6 +291,9 @@ class PageSession:
         part = message.get("part", "")
         answer = await self._control.take(key, feed, robot, part=part if isinstance(part, str) else "", signer=signer)
         held = self._control.holds(key)
+        if held and "taken_from" in answer:
+            facts = {"from": answer["taken_from"], "signed": answer["signed"]}
+            self._server.model.note(feed.network, robot, "control taken here", facts)
         self.tell({"type": "control", "key": key, "held": held, "text": text_of(answer)})
         return answer
 

@@ -38,6 +38,9 @@ WRONG_TOKEN_S = 1.0
 LINK_S = 0.2
 """Seconds between two messages that the server is alive and reaches the network; a page that misses them says so."""
 
+LINK_LOOK_S = 0.04
+"""Seconds between two looks whether a stop would leave; a change is told at once."""
+
 REFRESH_S = 0.02
 AUDIT_S = 1.0
 AUDIT_BYTES = 256 * 2**10
@@ -170,10 +173,14 @@ class Dashboard:
             telling.cancel()
 
     async def _tell_link(self, socket: WebSocket) -> None:
+        clock, told, due = asyncio.get_running_loop().time, None, 0.0
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             while True:
-                await socket.send_text(json.dumps(self.stop.state(), allow_nan=False))
-                await asyncio.sleep(LINK_S)
+                state = self.stop.state()
+                if state["can_stop"] is not told or clock() >= due:
+                    told, due = state["can_stop"], clock() + LINK_S
+                    await socket.send_text(json.dumps(state, allow_nan=False))
+                await asyncio.sleep(LINK_LOOK_S)
 
     async def _camera(self, request: Request) -> Response:
         asked = request.query_params

@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from fixtures.command_line import Machine
 from fixtures.page_site import PageServer, browser, chromium, shows
+from fixtures.served_page import ServedPage
 from fixtures.stop_robots import robots
 from fixtures.waiting import eventually
 
-from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.backends import LinkConfig, loopback_config
 
 ARMS = ("arm-1", "arm-2", "arm-3")
 
@@ -38,7 +39,7 @@ class Cell:
         own.mkdir(mode=0o700)
         self.machine = Machine(own)
         self.port = int(self.machine.environment["STRANDS_DC_PORT"])
-        self.link = loopback_config(self.port)
+        self.link: LinkConfig = loopback_config(self.port)
         # The arms count as hardware: a caller is allowed, and its verbs are approved.
         self.settings = {
             "STRANDS_STATE_DIR": str(state),
@@ -59,7 +60,7 @@ class Cell:
         self.stack.callback(server.close)
         return server
 
-    def open(self, server: PageServer, robots: int = len(ARMS), path: str = "", **options: Any) -> Any:
+    def open(self, server: PageServer, robots: int = len(ARMS), **options: Any) -> Any:
         """A page of its own browser context that shows so many robots and could stop them."""
         context = self.chrome.new_context(**options)
         self.stack.callback(context.close)
@@ -67,7 +68,7 @@ class Cell:
         page.problems = []
         page.on("pageerror", lambda error: page.problems.append(str(error)))
         page.on("console", lambda said: page.problems.append(said.text) if said.type == "error" else None)
-        page.goto(server.url + path)
+        page.goto(server.url)
         ready = f"document.querySelectorAll('.card').length >= {robots} && document.body.dataset.canStop === 'yes'"
         shows(page, ready, 30.0)
         return page
@@ -80,3 +81,19 @@ Make = Callable[[], Cell]
 def cell(tmp_path: Path, chrome: Any) -> Iterator[Cell]:
     with ExitStack() as stack:
         yield Cell(tmp_path, chrome, stack)
+
+
+@pytest.fixture
+def served() -> Iterator[ServedPage]:
+    with ServedPage() as page:
+        yield page
+
+
+@pytest.fixture
+def page(chrome: Any, served: ServedPage) -> Iterator[Any]:
+    with ExitStack() as stack:
+        context = chrome.new_context()
+        stack.callback(context.close)
+        opened = context.new_page()
+        opened.goto(served.url)
+        yield opened

@@ -6,7 +6,7 @@ import http.server
 import json
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,22 +42,6 @@ def hostile_site() -> Iterator[str]:
     finally:
         server.shutdown()
         server.server_close()
-
-
-@pytest.fixture
-def served() -> Iterator[ServedPage]:
-    with ServedPage() as page:
-        yield page
-
-
-@pytest.fixture
-def page(chrome: Any, served: ServedPage) -> Iterator[Any]:
-    with ExitStack() as stack:
-        context = chrome.new_context()
-        stack.callback(context.close)
-        opened = context.new_page()
-        opened.goto(served.url)
-        yield opened
 
 
 def test_hostile_page_in_the_same_browser_reaches_nothing(page: Any, served: ServedPage) -> None:
@@ -177,11 +161,5 @@ def test_hundred_robots_at_ten_hertz_are_all_shown(page: Any, served: ServedPage
         shows(page, "document.querySelectorAll('.card').length === 100", 20.0)
         shows(page, "[...document.querySelectorAll('.task')].filter((t) => t.textContent.includes('step')).length > 90")
         picture(page, "hundred-robots")
-        frames = page.evaluate(
-            "() => new Promise((yes) => { let n = 0; const end = performance.now() + 3000;"
-            " const count = () => { n += 1; performance.now() < end ? requestAnimationFrame(count) : yes(n / 3); };"
-            " requestAnimationFrame(count); })"
-        )
         page.keyboard.press("Space")
         shows(page, "document.getElementById('stop-said').textContent.includes('stopped')")
-    assert frames > 5, frames

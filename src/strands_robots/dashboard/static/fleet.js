@@ -181,7 +181,7 @@ export class FleetView {
   draw() {
     const rows = this.fleet.sorted(this.search.value, this.filter.value);
     setText(this.count, S.shown(rows.length, this.fleet.rows.size));
-    setText(this.empty, this.fleet.rows.size === 0 ? S.none : rows.length === 0 ? S.noMatch : "");
+    setText(this.empty, !this.admitted ? "" : this.fleet.rows.size === 0 ? S.none : rows.length === 0 ? S.noMatch : "");
     this.empty.hidden = this.empty.textContent === "";
     for (const row of rows) {
       let card = this.cards.get(row.key);
@@ -225,7 +225,7 @@ export class FleetView {
     this.state.send({ type: "thumbnails", keys: wanted });
   }
 
-  reconnected() { this.asked = ""; this.askThumbnails(); }
+  reconnected() { this.admitted = true; this.asked = ""; this.askThumbnails(); }
 
   picture(data) {
     const length = new DataView(data).getUint16(0);

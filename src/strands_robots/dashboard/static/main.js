@@ -71,6 +71,7 @@ function draw() {
 
 state.addEventListener("hello", ({ detail }) => {
   robot.hello = resume.hello = detail;
+  setText(document.getElementById("stop-hint"), detail.signed ? S.stopAllSigned : S.stopAll);
   fleet.rows.clear();
   fleet.events = [];
   fleet.mine.clear();

@@ -32,8 +32,8 @@ export class RobotView {
     this.chosen.addEventListener("change", () => this.showCamera());
     this.pictures = el("section", { class: "panel pictures", "aria-labelledby": "camera-title" },
       el("div", { class: "tools" }, el("h3", { id: "camera-title", text: S.camera }), el("label", { for: "camera-name", class: "hidden", text: S.camera }), this.chosen),
-      this.camera, this.poseTitle = el("h3", { text: S.pose }), this.pose, this.noPose = el("p", { class: "small", text: S.noPose }),
-      this.noCamera = el("p", { text: S.noCamera }));
+      this.camera, this.noCamera = el("p", { class: "small", text: S.noCamera }), el("h3", { text: S.pose }), this.pose,
+      this.noPose = el("p", { class: "small", text: S.noPose }));
     this.joints = el("div", { class: "bars" });
     const canvas = el("canvas", { class: "plot", role: "img", "aria-label": S.plot });
     this.plot = new Plot(canvas);
@@ -158,14 +158,12 @@ export class RobotView {
     this.jog.axes = [];
     const groups = [], names = this.names || new Set();
     const moving = (this.jointNames || []).filter((name) => name !== "gripper");
-    const pair = (kind, axis, label, index) => {
+    const pair = (kind, axis, [minus, plus], index) => {
       const [up, down] = index === null ? ["", ""] : this.jog.keysOf(index);
-      return el("div", { class: "pair" },
-        this.jog.button(kind, axis, -1, S.minus(label), S.minus(label), down),
-        this.jog.button(kind, axis, 1, S.plus(label), S.plus(label), up));
+      return el("div", { class: "pair" }, this.jog.button(kind, axis, -1, minus, minus, down), this.jog.button(kind, axis, 1, plus, plus, up));
     };
-    if (names.has("moveJoints") && moving.length) groups.push(el("fieldset", {}, el("legend", { text: S.jogJoint }), ...moving.slice(0, 10).map((name, index) => pair("joint", name, name, index))));
-    if (names.has("moveBy")) groups.push(el("fieldset", {}, el("legend", { text: S.jogTip }), ...Object.entries(S.tip).map(([axis, label]) => pair("tip", axis, label, null))));
+    if (names.has("moveJoints") && moving.length) groups.push(el("fieldset", {}, el("legend", { text: S.jogJoint }), ...moving.slice(0, 10).map((name, index) => pair("joint", name, [S.minus(name), S.plus(name)], index))));
+    if (names.has("moveBy")) groups.push(el("fieldset", {}, el("legend", { text: S.jogTip }), ...Object.entries(S.tip).map(([axis, ways]) => pair("tip", axis, ways, null))));
     if (names.has("setGripper")) {
       groups.push(el("fieldset", {}, el("legend", { text: S.jogGripper }), el("div", { class: "pair" },
         this.jog.button("gripper", "", -1, S.closeGripper, S.closeGripper, ""), this.jog.button("gripper", "", 1, S.openGripper, S.openGripper, ""))));
@@ -203,7 +201,7 @@ export class RobotView {
     const age = this.fleet.age(row);
     setText(this.age, [ageText(this.fleet, row), row.check_in ? S.checkIn(row.check_in.left_s) : ""].filter(Boolean).join(" · "));
     this.forget.hidden = age !== null && age < 6;
-    setText(this.control, controlText(this.fleet, row));
+    setText(this.control, `${controlText(this.fleet, row)}${row.locked ? `. ${S.lockedHere}` : ""}`);
     const mine = this.fleet.mine.has(this.key), operator = this.hello && this.hello.role === "operator";
     setText(this.take, mine ? S.give : S.take);
     this.take.disabled = !operator;

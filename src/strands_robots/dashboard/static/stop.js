@@ -59,7 +59,7 @@ export class Stop {
     this.alarm.hidden = problem === "";
     document.body.dataset.canStop = problem === "" ? "yes" : "no";
     const link = document.getElementById("link");
-    setText(link, this.channel.alive ? S.connected : S.connecting);
+    setText(link, this.channel.alive ? S.connected : this.channel.refused ? S.notAdmitted : S.connecting);
     link.dataset.state = this.channel.alive ? "up" : "down";
     this.draw();
   }
