@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import multiprocessing
 import os
@@ -10,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from strands_robots.hardware import HardwareRobot
 from strands_robots.policies.base import Action, Ranges
 from strands_robots.policies.bench import StillBody
 from strands_robots.policies.inference import InferenceWorker
+from strands_robots.policies.lerobot_local import LeRobotPolicy
 from strands_robots.policies.openpi import OpenPiPolicy
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import CameraMap, Profile
@@ -42,7 +45,7 @@ def run(*, quick: bool = False) -> list[Row]:
     seconds, calls, stops = (10.0, 100, 20) if quick else (60.0, 500, 200)
     with server(CHUNK_S) as slow:
         rows = [
-            period("a policy in this process", Computing, profile(), seconds),
+            period(*in_process(), profile(), seconds),
             period("an openpi server in another process", None, profile(url=slow), seconds),
         ]
     with server(0.0) as fast:
@@ -77,6 +80,33 @@ class Computing:
     def interrupt(self) -> None: ...
 
     def close(self) -> None: ...
+
+
+class TinyAct(Computing):
+    """Computes chunks of a tiny ACT of LeRobot's for as long as a chunk takes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._folder = tempfile.TemporaryDirectory()
+        checkpoint = import_module("fixtures.lerobot_checkpoints").act(Path(self._folder.name) / "act")
+        joints, around = ("pan", "lift", "grip"), ("cube.x", "cube.y")
+        of = Profile("act", "lerobot_local", joints, joints, checkpoint=str(checkpoint), environment=around)
+        self._policy = LeRobotPolicy(of)
+        self._policy.reset("bench", {})
+        self._seen = dict.fromkeys((*joints, *around), 0.0)
+
+    def act(self, observation: Mapping[str, Any]) -> list[Action]:
+        until = time.monotonic() + CHUNK_S
+        while time.monotonic() < until:
+            self._policy.act(self._seen)
+        return [{"a": float(next(self._chunks))}] * STEPS
+
+
+def in_process() -> tuple[str, type[Computing]]:
+    """Return what computes here: a tiny ACT where LeRobot is installed, else products of matrices."""
+    if importlib.util.find_spec("torch") and importlib.util.find_spec("lerobot"):
+        return "a tiny ACT of LeRobot's in this process", TinyAct
+    return "products of matrices in this process (no LeRobot is installed here)", Computing
 
 
 class NotingBody(StillBody):

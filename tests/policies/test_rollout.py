@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 import threading
 import time
 from typing import Any
@@ -14,6 +15,7 @@ from fixtures.waiting import eventually
 from strands_robots.contract import RolloutEvent
 from strands_robots.policies.rollout import Clock, Rollout, RolloutObservers, rollout_options
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.turns import SWITCH_S
 from strands_robots.utils import ValidationError
 
 
@@ -47,6 +49,19 @@ def test_rollout_ends_after_its_duration() -> None:
 def test_rollout_ends_after_its_steps() -> None:
     one, body = run(ScriptedPolicy([], always={"a": 0.5}), duration=9.0, steps=3)
     assert (one.state, one.step_count, len(body.writes), body.holds) == ("completed", 3, 3, 1)
+
+
+def test_no_thread_keeps_the_interpreter_for_long_while_a_rollout_runs() -> None:
+    before, during = sys.getswitchinterval(), list[float]()
+
+    class Looking(ScriptedPolicy):
+        def act(self, observation: Any) -> Any:
+            during.append(sys.getswitchinterval())
+            return super().act(observation)
+
+    run(Looking([{"a": 0.1}]))
+    assert max(during) <= SWITCH_S * 1.01
+    assert sys.getswitchinterval() == before
 
 
 def test_rollout_options_takes_rate_and_steps_out_of_the_policy_options() -> None:

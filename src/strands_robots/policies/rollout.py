@@ -31,6 +31,7 @@ from strands_robots.policies.base import (
 )
 from strands_robots.policies.loop_counts import Counted
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
 
@@ -320,6 +321,8 @@ class Rollout:
         self.state = "running"
         self._started_at = self._clock.now()
         state: State = "stopped"
+        # A policy that computes in this process must not keep the interpreter from the control loop.
+        end_short_turns = shorten_turns()
         try:
             with self._body.running():
                 try:
@@ -343,6 +346,7 @@ class Rollout:
             state, self.error = "error", f"{type(exc).__name__}: {exc}"
             logger.exception("The rollout of %s on %s could not run.", self.policy_name, self.robot)
         finally:
+            end_short_turns()
             self._finish(state)
 
     def _log_failure(self, exc: BaseException) -> None:

@@ -1,4 +1,4 @@
-"""Turns of Python's interpreter, short while emergency stops may come or go."""
+"""Turns of Python's interpreter, short while a stop may come or a robot moves."""
 
 from __future__ import annotations
 
