@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import threading
 
+import pytest
+
+from strands_robots.safety import estop_listener
 from strands_robots.safety.estop_listener import (
     BUCKET_CAPACITY,
     BUCKETS,
+    LATER_EVERY,
     SOURCES_MAX,
     VOUCHED_MAX,
     FailureBudget,
@@ -57,6 +61,41 @@ def test_check_in_is_served_after_a_stop_and_never_displaces_one() -> None:
     for _ in range(100):
         events.put("safetyCheckIn", "s", b"", urgent=False)
     assert drained(events)[0].event == "emergencyStop"
+
+
+@pytest.mark.parametrize("vouched", [False, True])
+def test_flood_of_stops_in_one_bucket_starves_nothing_that_is_not_urgent(
+    monkeypatch: pytest.MonkeyPatch, vouched: bool
+) -> None:
+    monkeypatch.setattr(estop_listener, "BUCKETS", 1)
+    events, taken = FairQueue(), list[str]()
+    names = ("safety-1", "safety-1") if vouched else ("forger", "safety-1")
+    if vouched:
+        events.vouch("safety-1")
+    for _ in range(LATER_EVERY):
+        for _ in range(2):
+            events.put("emergencyStop", names[0], b"")
+        for _ in range(100):
+            events.put("safetyCheckIn", names[1], b"", urgent=False)
+        received = events.get()
+        assert received is not None
+        taken.append(received.event)
+    assert taken == ["emergencyStop"] * (LATER_EVERY - 1) + ["safetyCheckIn"]
+
+
+def test_two_names_that_share_a_bucket_of_one_queue_need_not_share_one_of_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(estop_listener, "BUCKETS", 2)
+
+    def kept() -> int:
+        events = FairQueue()
+        for _ in range(BUCKET_CAPACITY):
+            events.put("emergencyStop", "safety-1", b"")
+            events.put("emergencyStop", "safety-2", b"")
+        return len(drained(events))
+
+    assert {kept() for _ in range(64)} == {BUCKET_CAPACITY, 2 * BUCKET_CAPACITY}
 
 
 def test_get_waits_for_an_event_and_ends_with_the_queue() -> None:

@@ -108,11 +108,15 @@ def test_a_wedged_robot_is_reported_where_no_thread_can_start(
     with own_plane(0.3, executor=StopExecutor(start)) as plane:
         plane.register("wedged", RecordingRobot(before_halt=lambda: release.wait(60)))
         full.set()
-        for _ in range(2):
-            assert plane.emergency_stop(order())["wedged"].stopped is False
-        eventually(lambda: "wedged is stuck in its halt and no other thread can halt it" in caplog.text)
-        assert "can't start new thread" in caplog.text
-        release.set()
+        try:
+            for _ in range(2):
+                assert plane.emergency_stop(order())["wedged"].stopped is False
+            eventually(lambda: "wedged is stuck in its halt and no other thread can halt it" in caplog.text)
+            assert "can't start new thread" in caplog.text
+        finally:
+            release.set()
+            # The executor's watcher outlives this test, and is to find threads.
+            full.clear()
 
 
 @pytest.mark.parametrize(

@@ -204,6 +204,35 @@ def test_a_hundred_idle_robots_own_no_threads_and_all_halt() -> None:
     eventually(lambda: alive() <= RESERVE + 1)
 
 
+def test_lack_of_threads_is_said_once_until_there_are_threads_again(caplog: pytest.LogCaptureFixture) -> None:
+    full, refused = threading.Event(), list[str]()
+
+    def start(thread: threading.Thread) -> None:
+        if full.is_set():
+            refused.append(thread.name)
+            raise RuntimeError("can't start new thread")
+        thread.start()
+
+    def said(words: str) -> int:
+        return sum(words in each.getMessage() for each in caplog.records)
+
+    executor, robots = StopExecutor(start), [Wedged(), Wedged()]
+    executor.prepare()
+    try:
+        for times, wedged in enumerate(robots, 1):
+            full.set()
+            executor.submit(wedged, "wedged-1", "stop", within=20)
+            before = len(refused)
+            eventually(lambda before=before: len(refused) > before + 3, what="four looks of the watcher")  # type: ignore[misc]
+            assert said("No thread can be started for stops") == times
+            full.clear()
+            eventually(lambda times=times: said("complete again") == times)  # type: ignore[misc]
+    finally:
+        full.clear()
+        for wedged in robots:
+            wedged.release.set()
+
+
 def test_wedged_robots_never_use_up_the_reserve(executor: StopExecutor) -> None:
     wedged = [Wedged() for _ in range(4 * RESERVE)]
     for n, each in enumerate(wedged):

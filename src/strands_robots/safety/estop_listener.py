@@ -46,6 +46,9 @@ SOURCES_MAX = 256
 
 BUCKETS = 64
 BUCKET_CAPACITY = 16
+LATER_EVERY = 8
+"""Of so many events that are taken from a full bucket one is not urgent, so that a flood of stops starves none."""
+
 VOUCHED_MAX = 16
 """Sources with a share of their own in the queue: the first that signed validly."""
 
@@ -105,20 +108,50 @@ class StopEvent(NamedTuple):
     at: float
 
 
+class _Bucket:
+    """Events of the sources that share it: stops, and what is not urgent.
+
+    Only the listener's thread takes; appending is atomic.
+    """
+
+    __slots__ = ("_later", "_taken", "_urgent")
+
+    def __init__(self) -> None:
+        self._urgent: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY)
+        self._later: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY // 2)
+        self._taken = 0
+
+    def put(self, event: StopEvent, urgent: bool) -> None:
+        """Add an event: in place of the oldest stop, or where there is room."""
+        if urgent:
+            self._urgent.append(event)
+        elif len(self._later) < BUCKET_CAPACITY // 2:
+            self._later.append(event)
+
+    def take(self) -> StopEvent | None:
+        """Remove the newest stop, or in its turn the oldest of the others."""
+        if not (self._urgent or self._later):
+            return None
+        self._taken += 1
+        if self._later and (not self._urgent or self._taken % LATER_EVERY == 0):
+            return self._later.popleft()
+        return self._urgent.pop()
+
+
 class FairQueue:
     """Bounded queue of the listener: fair between sources, newest first.
 
     A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
-    are served in turn, one event each, the newest first. What overflows a bucket is its oldest event; a controller
+    are served in turn, one event each, the newest stop first. What overflows a bucket is its oldest stop; a controller
     repeats its stop, so a true one arrives again. A source that was vouched for has a bucket of its own, and every
     second turn is of such a one: names that are made up share the other turns. No method but :meth:`get` blocks.
     """
 
     def __init__(self) -> None:
-        self._salt = secrets.randbits(62)
-        self._buckets: list[deque[StopEvent]] = [deque(maxlen=BUCKET_CAPACITY) for _ in range(BUCKETS)]
-        self._vouched: dict[str, deque[StopEvent]] = {}
-        self._turns: tuple[deque[StopEvent], ...] = ()
+        self._salt = secrets.token_hex(8)
+        self._buckets = [_Bucket() for _ in range(BUCKETS)]
+        self._vouched: dict[str, _Bucket] = {}
+        self._turns: tuple[_Bucket, ...] = ()
         self._waiting = threading.Event()
         self._turn = self._vouched_turn = 0
         self._crowd_next = False
@@ -127,7 +160,7 @@ class FairQueue:
     def vouch(self, source: str) -> None:
         """Give a source that signed validly a bucket of its own."""
         if source not in self._vouched and len(self._vouched) < VOUCHED_MAX:
-            bucket: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY)
+            bucket = _Bucket()
             self._turns = (*self._turns, bucket)
             self._vouched[source] = bucket
 
@@ -136,16 +169,14 @@ class FairQueue:
         return source in self._vouched
 
     def put(self, event: str, source: str, payload: bytes, *, urgent: bool = True) -> None:
-        """Add an event; one that is not urgent is served last or dropped."""
+        """Add an event; of those that are not urgent, a full bucket drops the new."""
         received = StopEvent(event, source, payload, time.monotonic())
         bucket = self._vouched.get(source)
         if bucket is None:
-            bucket = self._buckets[hash((self._salt, source)) % BUCKETS]
-        # Appending to a deque and setting an event are atomic; no lock is shared with the listener's thread.
-        if urgent:
-            bucket.append(received)
-        elif len(bucket) < BUCKET_CAPACITY // 2:
-            bucket.appendleft(received)
+            # Within one text: the hash of a pair keeps the same names together whatever the salt.
+            bucket = self._buckets[hash(self._salt + source) % len(self._buckets)]
+        # Adding to a bucket and setting an event are atomic; no lock is shared with the listener's thread.
+        bucket.put(received, urgent)
         # While it is set, the listener's next look is still to come: most messages of a flood need not wake it.
         if not self._waiting.is_set():
             self._waiting.set()
@@ -165,20 +196,20 @@ class FairQueue:
             # What was put between the look and the clearing is found by the next look; what comes later sets it.
 
     def _of_crowd(self) -> StopEvent | None:
-        for _ in range(BUCKETS):
-            self._turn = (self._turn + 1) % BUCKETS
-            bucket = self._buckets[self._turn]
-            if bucket:
-                return bucket.pop()
+        for _ in self._buckets:
+            self._turn = (self._turn + 1) % len(self._buckets)
+            event = self._buckets[self._turn].take()
+            if event is not None:
+                return event
         return None
 
     def _of_vouched(self) -> StopEvent | None:
         turns = self._turns
         for _ in turns:
             self._vouched_turn = (self._vouched_turn + 1) % len(turns)
-            bucket = turns[self._vouched_turn]
-            if bucket:
-                return bucket.pop()
+            event = turns[self._vouched_turn].take()
+            if event is not None:
+                return event
         return None
 
     def close(self) -> None:

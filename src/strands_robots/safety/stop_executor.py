@@ -469,12 +469,18 @@ class StopExecutor:
     def _watch(self) -> None:
         """Answer for halts that miss their deadline, and refill the reserve."""
         due: list[tuple[float, int, _Stop]] = []
+        without_threads = False
         while True:
             try:
                 self._take_new(due)
                 self._refill()
+                if without_threads:
+                    logger.warning("The threads that stand ready for stops are complete again.")
+                without_threads = False
             except RuntimeError as exc:
-                logger.critical("No thread can be started for stops of robots that block their halts: %s.", exc)
+                if not without_threads:
+                    logger.critical("No thread can be started for stops of robots that block their halts: %s.", exc)
+                without_threads = True
             except Exception:
                 logger.critical("The deadlines of stops could not be read.", exc_info=True)
             late = []
