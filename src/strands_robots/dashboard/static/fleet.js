@@ -66,6 +66,7 @@ export function verdictText(stop) {
   if (stop.settling) text += S.settling;
   if (stop.ms !== null && stop.ms !== undefined && ["stopped", "claimed"].includes(stop.state)) text += S.inMs(stop.ms);
   if (stop.state === "stopped") text += ` (${stop.signed ? S.signed : S.unsigned})`;
+  if (stop.state === "claimed") text += S.unproven;
   if (stop.why) text += `: ${stop.why}`;
   if (stop.alarm) text += `. ALARM: ${stop.alarm}`;
   if (stop.freed) text += S.freed;

@@ -48,7 +48,7 @@ export class Plot {
       pen.lineWidth = 1.5;
       pen.setLineDash(index < 6 ? [] : [4, 3]);
       pen.beginPath();
-      let begun = false;
+      let begun = false, points = 0;
       for (const [at, joints] of this.samples) {
         const value = joints[part] && joints[part][name];
         if (typeof value !== "number") { begun = false; continue; }
@@ -56,6 +56,9 @@ export class Plot {
         const y = height - 2 - (height - 4) * Math.min(1, Math.max(0, (value - low) / (high - low)));
         if (begun) pen.lineTo(x, y); else pen.moveTo(x, y);
         begun = true;
+        points += 1;
+        // One sample makes no line: a robot that is idle was read once.
+        if (points === 1) { pen.fillStyle = pen.strokeStyle; pen.fillRect(Math.min(x, width - 5), y - 2, 5, 4); }
       }
       pen.stroke();
     });
