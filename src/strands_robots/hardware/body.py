@@ -11,7 +11,7 @@ from typing import Any
 
 from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
-from strands_robots.hardware.calibration import write_to_servos
+from strands_robots.hardware.calibration import answer_lost, write_to_servos
 from strands_robots.hardware.device_facts import require_port
 from strands_robots.hardware.speed import default_speeds
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
@@ -133,7 +133,7 @@ class DeviceBody:
                     device.connect()
             except BaseException as exc:
                 drop(device)
-                if left and isinstance(exc, ConnectionError | RuntimeError) and not isinstance(exc.__cause__, OSError):
+                if left and answer_lost(exc):
                     continue
                 raise
             return

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from strands_robots.hardware._compat import forget_input, lerobot_module
+from strands_robots.hardware._compat import drop, forget_input, lerobot_module
 from strands_robots.utils import ValidationError, mapping, shown, whole
 
 logger = logging.getLogger(__name__)
@@ -105,6 +105,14 @@ def write_to_servos(device: Any) -> None:
         bus.disconnect(disable_torque=False)
 
 
+def answer_lost(problem: BaseException) -> bool:
+    """Return True where a device did not answer while it was connected, False for its port."""
+    # LeRobot raises the same for both, caused by the system's error or by the lost answer, which is a ConnectionError.
+    cause = problem.__cause__
+    of_port = isinstance(cause, OSError) and not isinstance(cause, ConnectionError)
+    return isinstance(problem, ConnectionError | RuntimeError) and not of_port
+
+
 def _content(given: object) -> object:
     if not isinstance(given, str | Path):
         return given
@@ -133,7 +141,7 @@ class JointReach:
 
 
 LOOK_TRIES = 5
-"""Joint reads that fail before the calibration is given up; LeRobot waits 50 ms for each answer."""
+"""Connections, or joint reads, that fail before the calibration is given up; LeRobot waits 50 ms for each answer."""
 
 
 class Calibrator:
@@ -155,11 +163,19 @@ class Calibrator:
         self._reaches: dict[str, JointReach] = {}
 
     def begin(self) -> None:
-        """Connect and let go of the joints. Raises what the bus raises."""
-        self._bus.connect()
-        self._bus.disable_torque()
-        for motor in self._bus.motors:
-            self._bus.write("Operating_Mode", motor, _POSITION_MODE)
+        """Connect and let go of the joints, again after a lost answer. Raises what the bus raises."""
+        for left in reversed(range(LOOK_TRIES)):
+            try:
+                self._bus.connect()
+                self._bus.disable_torque()
+                for motor in self._bus.motors:
+                    self._bus.write("Operating_Mode", motor, _POSITION_MODE)
+            except (ConnectionError, RuntimeError) as exc:
+                drop(self._device)
+                if not left or not answer_lost(exc):
+                    raise
+            else:
+                return
 
     def centre(self) -> None:
         """Take the present position of every joint as the middle of its motion."""

@@ -9,12 +9,11 @@ from typing import Any
 
 import pytest
 from fixtures.feetech_bus import FeetechBus, arm_servos, write_calibration
+from fixtures.feetech_bus.patience import patient
 
 from strands_robots.hardware._compat import lerobot_module
 
 Arm = Callable[..., Any]
-
-ANSWER_MS = 150.0
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -35,15 +34,9 @@ def lerobot_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """LeRobot waits 50 ms for a servo; a busy machine may hold the emulated ones up for longer."""
-    if importlib.util.find_spec("lerobot") is None:
-        return
-    feetech = lerobot_module("lerobot.motors.feetech.feetech")
-
-    def patient(handler: Any, length: int) -> None:
-        handler.setPacketTimeoutMillis(ANSWER_MS)
-
-    monkeypatch.setattr(feetech, "patch_setPacketTimeout", patient)
+    """A busy machine may hold the emulated servos up for longer than LeRobot waits."""
+    if importlib.util.find_spec("lerobot") is not None:
+        monkeypatch.setattr(lerobot_module("lerobot.motors.feetech.feetech"), "patch_setPacketTimeout", patient)
 
 
 @pytest.fixture
