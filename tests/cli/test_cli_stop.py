@@ -127,6 +127,7 @@ def test_stop_of_one_robot_of_a_world_names_it(run: Run, fleet: FakeFleet) -> No
     result = run("stop", "world-1", "--robot", "left")
     assert result.exit_code == 0
     assert "Stopped left." in result.stdout
+    assert "world-1/left" in result.stdout, "the other robots of the world may move on"
 
 
 @pytest.mark.parametrize("arguments", [("stop",), ("stop", "a", "--all"), ("stop", "--all", "--robot", "left")])
@@ -177,7 +178,8 @@ def test_printed_resume_names_the_operators_key_that_is_found(state: Path, capsy
     (state / "operator.pem").touch()
     network = Network(connect=["tcp/10.0.0.1:7447"], tenant="lab 1", insecure=True)
     assert printed_commands(capsys, network.flags) == [
-        f"strands-robots resume --key {state}/operator.pem --connect tcp/10.0.0.1:7447 --tenant 'lab 1' --insecure"
+        f"strands-robots resume --key {state}/operator.pem --connect tcp/10.0.0.1:7447 --tenant 'lab 1' --insecure",
+        "strands-robots resume --local",
     ]
 
 
@@ -190,5 +192,6 @@ def test_without_an_operators_key_the_line_that_makes_it_is_printed(
     passphrase.write_text("Correct-Horse-7-Battery\n")
     passphrase.chmod(0o600)
     assert run(*shlex.split(making)[1:], "--passphrase-file", str(passphrase)).exit_code == 0
-    [then] = printed_commands(capsys, "")
+    then, at_the_robot = printed_commands(capsys, "")
+    assert at_the_robot == here, "robots may not know that key yet"
     assert then == f"strands-robots resume --key {state}/operator.pem"

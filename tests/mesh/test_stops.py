@@ -162,7 +162,7 @@ def test_a_stop_of_an_unknown_robot_is_answered_at_once_and_halts_nothing(peers:
             flood.put(f"strands/{name}/cmd", {"sender_id": "flood", "turn_id": f"t{turn}", "command": command})
     assert len(said) == 500, "an unknown name is answered while a halt is carried out"
     assert said[0]["result"]["ok"] is False
-    assert "there are left, right" in said[0]["result"]["error"]
+    assert "the robots here are left, right" in said[0]["result"]["error"]
     assert peers.meshes[0].stops_waiting == 1
     world.let_go.set()
     asking.join(20)

@@ -57,7 +57,11 @@ def resume(
     timeout: Timeout = 5.0,
     on_mesh: OnMesh = False,
 ) -> None:
-    """Free locked robots: by the operator's key over the network, or here by --local. It starts no motion."""
+    """Free locked robots: by the operator's key over the network, or here by --local. It starts no motion.
+
+    Each emergency stop leaves a lockout with its id as epoch. A resume names the epochs of the robot, so that it never
+    frees one from a later stop.
+    """
     if local == (key is not None):
         raise CliError("resume takes --key FILE, or --local at the robot's own machine.", Exit.USAGE)
     names = [part for each in (*(devices or []), *(targets or [])) for part in each.split(",") if part]
@@ -87,7 +91,10 @@ def lockout(
     timeout: Timeout = 2.0,
     on_mesh: OnMesh = False,
 ) -> None:
-    """List locked robots, since when and by whom: live ones, and those in this machine's lockout file."""
+    """List locked robots, since when and by whom: live ones, and those in this machine's lockout file.
+
+    The epoch of a lockout is the id of the emergency stop that left it; a resume names it.
+    """
     seconds = number("--timeout", timeout, above=0, high=60)
     stored, live, note, stale = _stored_lockouts(), list[LockoutReport](), "", ""
     if not local:

@@ -36,6 +36,7 @@ LATE_MS = 1000.0
 LOCKED = "They are locked until they are resumed:"
 LOCKED_THERE = "They are locked until they are resumed, at the machine of each robot:"
 BY_KEY = "Or from here, once the robots know the key that this makes (docs/safety.md):"
+UNKNOWN_KEY = "A robot that does not know that key is resumed at its own machine:"
 RESUME_HERE = "strands-robots resume --local"
 CLAIMED = "Claimed is not proven: no enrolled robot signed it. Enroll robots with strands-robots enroll."
 LINK_WAIT_S = 2.0
@@ -74,7 +75,8 @@ def stop(
         near = near_devices(fleet, device) if unknown and device is not None else ""
     if not answers:
         raise CliError(f"No robot that can be stopped answered. {describe(fleet.link)}", Exit.SILENT, devices={})
-    outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
+    # One robot of a world is named with it: the others may move on.
+    outcomes = {f"{each}/{name}" if name else each: stop_outcome(answer) for each, answer in answers.items()}
     _show_outcomes(screen, outcomes)
     devices = {name: {"stopped": stopped, "said": said} for name, (stopped, said) in outcomes.items()}
     moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
@@ -110,7 +112,11 @@ def estop(
     passphrase_file: PassphraseFile = None,
     on_mesh: OnMesh = False,
 ) -> None:
-    """Stop every robot of the tenant and lock it. Exits with 1 when one did not stop, with 3 when one is silent."""
+    """Stop every robot of the tenant and lock it. Exits with 1 when one did not stop, with 3 when one is silent.
+
+    The tenant is the fleet that --tenant names, default without it. The id of the stop is the epoch of the lockout that
+    it leaves; a resume names it.
+    """
     if devices and everything:
         raise CliError("estop takes DEVICE... or --all.", Exit.USAGE)
     if on_mesh:
@@ -176,6 +182,8 @@ def show_resume(screen: Screen, key: Path | None, flags: str) -> None:
     if held is not None:
         screen.say(LOCKED)
         screen.copyable(f"  strands-robots resume --key {shlex.quote(str(held.resolve()))}{flags}")
+        screen.say(UNKNOWN_KEY)
+        screen.copyable(f"  {RESUME_HERE}")
         return
     screen.say(LOCKED_THERE)
     screen.copyable(f"  {RESUME_HERE}")

@@ -94,7 +94,7 @@ class OneRobot:
             ValidationError: ``name`` is another robot's.
         """
         if name not in ("", self.tool_name_str):
-            raise ValidationError(f"there is no robot of this name; there are {self.tool_name_str}")
+            raise ValidationError(f"there is no robot of this name; the robots here are {self.tool_name_str}")
         return RobotStop(self._world, self.tool_name_str) if self.list_robots() else None
 
     def facts(self) -> dict[str, Any]:

@@ -169,9 +169,9 @@ def _object(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as exc:
-        raise ValidationError(f"{path.name} cannot be read: {exc}") from None
+        raise ValidationError(f"it cannot be read: {exc}") from None
     if not isinstance(content, dict):
-        raise ValidationError(f"{path.name} must be an object, not {shown(content)}")
+        raise ValidationError(f"it must be an object, not {shown(content)}")
     return content
 
 

@@ -81,7 +81,7 @@ class Lease:
 
     def left(self, now: float) -> float | None:
         """Return the seconds left, None for the lease of one motion."""
-        return None if self.until is None or self.one_motion else max(self.until - now, 0.0)
+        return None if self.until is None or self.one_motion else round(max(self.until - now, 0.0), 3)
 
 
 @dataclass(frozen=True, slots=True)

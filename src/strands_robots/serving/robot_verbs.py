@@ -144,7 +144,7 @@ def robot_stop(world: WorldRobot, name: str) -> RobotStop:
     """
     robots = world.list_robots()
     if name not in robots:
-        raise ValidationError(f"there is no robot of this name; there are {', '.join(robots) or 'none'}")
+        raise ValidationError(f"there is no robot of this name; the robots here are {', '.join(robots) or 'none'}")
     return RobotStop(world, name)
 
 

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import device_connect_agent_tools as agent_tools
@@ -203,9 +204,16 @@ def test_mcp_bridge_lists_calls_and_receives_events(lab: Lab) -> None:
     from fastmcp import Client  # noqa: PLC0415 - heavy
     from fastmcp.client.transports import StdioTransport  # noqa: PLC0415
 
+    page = Path(__file__).parents[3].joinpath("docs", "agents.md").read_text("utf-8")
+    blocks = [json.loads(each.partition("```")[0]) for each in page.split("```json\n")[1:]]
+    block = next(each["mcpServers"]["device-connect"] for each in blocks if "device-connect" in each["mcpServers"])
+    assert block["env"].keys() <= {"ZENOH_CONNECT", "DEVICE_CONNECT_DISCOVERY_MODE"}
+
     async def drive() -> None:
-        environment = {**os.environ, **lab.environment}
-        bridge = StdioTransport(sys.executable, ["-m", "device_connect_agent_tools.mcp"], env=environment)
+        # The block of docs/agents.md, on the lab's network.
+        of_the_page = block["env"] if block["env"].keys() <= lab.environment.keys() else {}
+        environment = {**os.environ, **of_the_page, **lab.environment}
+        bridge = StdioTransport(sys.executable, block["args"], env=environment)
         async with Client(bridge) as client:
             assert {tool.name for tool in await client.list_tools()} >= {"describe_fleet", "invoke_device"}
 
@@ -221,6 +229,9 @@ def test_mcp_bridge_lists_calls_and_receives_events(lab: Lab) -> None:
                 "arguments": '{"instruction": "wave", "duration": 1.0}',
             }
             assert "success" in str((await client.call_tool("invoke_device", call)).content)
+            an_object = {**call, "arguments": {"instruction": "wave"}}
+            refused = await client.call_tool("invoke_device", an_object, raise_on_error=False)
+            assert refused.is_error, "as the page says"
             end = {"device_id": "arm-1", "event_name": "policyComplete", "timeout_seconds": 30}
             assert "wave" in str((await client.call_tool("wait_for_event", end)).content)
             call["arguments"] = '{"instruction": "wave again"}'
