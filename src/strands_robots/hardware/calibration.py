@@ -106,7 +106,7 @@ def write_to_servos(device: Any) -> None:
 
 
 def answer_lost(problem: BaseException) -> bool:
-    """Return True where a device did not answer while it was connected, False for its port."""
+    """Return True for a lost answer of a device, False for its port."""
     # LeRobot raises the same for both, caused by the system's error or by the lost answer, which is a ConnectionError.
     cause = problem.__cause__
     of_port = isinstance(cause, OSError) and not isinstance(cause, ConnectionError)
@@ -163,7 +163,7 @@ class Calibrator:
         self._reaches: dict[str, JointReach] = {}
 
     def begin(self) -> None:
-        """Connect and let go of the joints, again after a lost answer. Raises what the bus raises."""
+        """Connect and let go of the joints, again after a lost answer."""
         for left in reversed(range(LOOK_TRIES)):
             try:
                 self._bus.connect()
