@@ -30,7 +30,7 @@ def test_every_setting_is_declared_once_with_a_usable_default() -> None:
             assert each.default in ("true", "false", "auto", "0", "1"), each.name
 
 
-@hypothesis_settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@hypothesis_settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(spelling=TEXTS, safe=st.booleans())
 def test_unknown_spelling_of_a_boolean_gives_the_safe_value(
     monkeypatch: pytest.MonkeyPatch, spelling: str, safe: bool
@@ -46,7 +46,7 @@ def test_unknown_spelling_of_a_boolean_gives_the_safe_value(
         assert value is safe
 
 
-@hypothesis_settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@hypothesis_settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(spelling=st.one_of(TEXTS, st.floats().map(str), st.integers().map(str)))
 def test_number_is_always_in_its_domain(monkeypatch: pytest.MonkeyPatch, spelling: str) -> None:
     monkeypatch.setenv(RATE, spelling)

@@ -102,6 +102,9 @@ async def test_an_argument_out_of_its_domain_is_refused_by_name(robot: ToyRobot,
         assert robot.rollouts == {}
 
 
+SLOW_OR_SHARED = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+
+
 @given(
     st.dictionaries(
         st.sampled_from(["instruction", "policy_provider", "duration", "policy_port", "self", "function_name", "x"]),
@@ -112,7 +115,7 @@ async def test_an_argument_out_of_its_domain_is_refused_by_name(robot: ToyRobot,
         ),
     )
 )
-@hypothesis_settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@hypothesis_settings(max_examples=100, deadline=None, suppress_health_check=SLOW_OR_SHARED)
 def test_whatever_is_sent_the_answer_is_an_envelope(params: dict[str, Any]) -> None:
     toy = ToyRobot()
 

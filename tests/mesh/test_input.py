@@ -19,7 +19,7 @@ from tests.mesh.peers import Fleet, signed
 from strands_robots.envelope import success
 from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh import input as input_module
-from strands_robots.mesh import safety
+from strands_robots.mesh import input_receiver, safety
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputPublisher, InputReceiver, MeshInputSink
 from strands_robots.mesh.security import ValidationError
@@ -68,6 +68,13 @@ def stream(peers: Fleet) -> Iterator[Stream]:
     assert made.receiver.start_refusal is None
     yield made
     made.receiver.stop()
+
+
+@pytest.fixture(autouse=True)
+def patient_follower(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A leader that a busy machine keeps from its beat is not silent: half a second halts a follower without a body."""
+    monkeypatch.setattr(input_receiver, "HOLD_S", 600.0)
+    monkeypatch.setattr(input_receiver, "LOST_S", 600.0)
 
 
 def first_frame(peers: Fleet, teleoperator: Any) -> dict[str, Any]:
