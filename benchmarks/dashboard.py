@@ -268,7 +268,7 @@ def hundred(seconds: float, robots_: int = 100) -> list[Row]:
 
 def run(*, quick: bool = False) -> list[Row]:
     """Return the rows of the table."""
-    presses, jogs, kills, silences = (8, 6, 2, 2) if quick else (50, 25, 5, 5)
+    presses, jogs, kills, silences = (8, 6, 2, 2) if quick else (60, 25, 5, 5)
     with ExitStack() as stack:
         bench = Bench(stack, FOUR, 500.0 / len(FOUR), STRANDS_DC_STREAM_HZ="10", STRANDS_DC_STATE_BUSY_HZ="5")
         rows = [
