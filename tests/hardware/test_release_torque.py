@@ -159,5 +159,5 @@ def test_a_robot_whose_torque_cannot_be_switched_says_so() -> None:
 
 def test_it_is_in_the_audit(robot: HardwareRobot) -> None:
     robot.release_torque("grip")
-    assert flush_audit()
+    assert flush_audit(60.0)
     assert [record for record in read_audit_log() if "torque_released" in record.values()]

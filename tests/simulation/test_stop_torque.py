@@ -222,7 +222,7 @@ def test_something_in_its_way_ends_the_settling_with_torque_and_an_event(
     assert all(abs(each - joints(settler)[key]) < NEAR for key, each in settler.targets("arm").items())
     eventually(lambda: any(event.kind == "finished" and event.policy == "settle" for event in events), PATIENCE_S)
     assert "in its way" in events[-1].error
-    assert flush_audit()
+    assert flush_audit(60.0)
     assert [record for record in read_audit_log() if "settle_failed" in record.values()]
     assert [record for record in caplog.records if record.levelname == "CRITICAL" and "settle" in record.message]
 
