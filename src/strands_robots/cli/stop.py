@@ -6,6 +6,7 @@ import shlex
 import threading
 from collections.abc import Mapping
 from concurrent.futures import Future, wait
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -194,8 +195,8 @@ def show_resume(screen: Screen, key: Path | None, flags: str) -> None:
 class RunningStop:
     """An emergency stop on a thread of its own, which never waits for drawing.
 
-    Without ``expected``, every robot that can be found and stopped must answer; they are looked up once the stop has
-    left.
+    Without ``expected``, every robot that can be found and stopped must answer. The connection on which they are looked
+    up is made beside the stop's; they are looked up once the stop has begun.
     """
 
     def __init__(
@@ -206,9 +207,11 @@ class RunningStop:
         self._deadline_s, self._link = deadline_s, link
         self._id = new_epoch()
         controller.press(self._id)
-        self._lookup: threading.Thread | None = None
+        self._begun = threading.Event()
         self.report: Future[StopReport] = Future()
         threading.Thread(target=self._run, name="estop", daemon=True).start()
+        if not expected:
+            threading.Thread(target=self._expect_all, name="estop lookup", daemon=True).start()
 
     def _run(self) -> None:
         try:
@@ -228,21 +231,26 @@ class RunningStop:
 
     def _progress(self, progress: Progress) -> None:
         self.latest = progress
-        if not self._expected and self._lookup is None:
-            self._lookup = threading.Thread(target=self._expect_all, name="estop lookup", daemon=True)
-            self._lookup.start()
+        self._begun.set()
 
     def _expect_all(self) -> None:
         from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - the network is loaded when it is used
 
-        from strands_robots.device_connect import FleetClient  # noqa: PLC0415
-
-        try:
-            with FleetClient(self._link) as fleet:
-                found = [peer.id for peer in fleet.peers(min(2.0, self._deadline_s), thorough=True) if peer.stop_verb]
-        except (MessagingError, TimeoutError):
-            # The report still names every robot that answers before the deadline.
+        # A network that is not there yet is asked again once the stop has begun.
+        with suppress(MessagingError, TimeoutError):
+            self._look_up()
             return
+        self._begun.wait()
+        # Without it the report still names every robot that answers before the deadline.
+        with suppress(MessagingError, TimeoutError):
+            self._look_up()
+
+    def _look_up(self) -> None:
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
+
+        with FleetClient(self._link) as fleet:
+            self._begun.wait()
+            found = [peer.id for peer in fleet.peers(min(2.0, self._deadline_s), thorough=True) if peer.stop_verb]
         answered = self.latest.answered if self.latest else {}
         self._controller.expect(self._id, {*found, *answered})
 
