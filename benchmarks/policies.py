@@ -36,6 +36,8 @@ from strands_robots.policies.rollout import Rollout
 from strands_robots.safety.gate import MotionGate, Permit
 
 HZ, STEPS, CHUNK_S = 30.0, 20, 0.1
+SHORT = 3
+"""Steps of a chunk after which the next inference hangs."""
 P99_MS, SEAM_MS, STOP_MS, OVERHEAD = 36.0, 40.0, 20.0, 1.5
 PICTURES = ("observation/image", "observation/wrist_image")
 
@@ -229,7 +231,7 @@ class HungPolicy(Computing):
         if chunk:
             self.hangs.set()
             self.let_go.wait(60)
-        return [{"a": float(chunk)}] * STEPS
+        return [{"a": float(chunk)}] * SHORT
 
 
 def stop_in_process(stops: int) -> Row:
@@ -256,7 +258,7 @@ def stop_openpi(stops: int) -> Row:
     """Halt a robot whose policy server does not answer."""
     took = []
     with (
-        OpenPiServer(lambda observation: {"actions": numpy.zeros((STEPS, 3), numpy.float32)}) as own,
+        OpenPiServer(lambda observation: {"actions": numpy.zeros((SHORT, 3), numpy.float32)}) as own,
         policies(own.url),
     ):
         answer, hangs, let_go = own.answer, threading.Event(), threading.Event()
