@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import threading
+import time
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
@@ -184,3 +185,28 @@ def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.Mon
     assert set(fleet.expected()) == {"arm-1", "arm-2"}
     fleet.forget()
     assert fleet.expected() == ()
+
+
+def test_robots_that_beat_are_asked_in_turn_and_all_others_at_each_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(safety_controller, "ASKED_MOST", 3)
+    fake: Any = FakeController()
+    fleet, now = FleetScreen(fake, loopback_config(), None), time.monotonic()
+    names = [f"arm-{number}" for number in range(10)]
+    assert fleet.due(names) == names
+    fleet.update([LockoutReport(name, at=now - 100.0 + number) for number, name in enumerate(names)])
+    assert fleet.due(names) == names
+    fleet.take_beats(dict.fromkeys(names[:8], now + 1000.0))
+    assert fleet.due([*names, "new"]) == ["arm-0", "arm-1", "arm-2", "arm-8", "arm-9", "new"]
+    assert set(fleet.expected()) == set(names)
+    assert fleet.due(names) == names, "after a stop each is asked"
+
+
+def test_a_robot_that_beats_is_not_gone_though_its_status_is_old() -> None:
+    fake: Any = FakeController()
+    fleet, button = FleetScreen(fake, loopback_config(), None), StopButton(fake, lambda: (), "")
+    fleet.update([LockoutReport("arm-1", at=time.monotonic() - 100.0)])
+    assert "GONE" in drawn(fleet, button)
+    fleet.take_beats({"arm-1": time.monotonic() + 1000.0})
+    assert "GONE" not in drawn(fleet, button)
+    fleet.forget()
+    assert fleet.expected() == ("arm-1",)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import getpass
 import os
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,10 +13,10 @@ import typer
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.lockout_report import LockoutReport
-from strands_robots.cli.network import Network, call_device, describe, mesh_peer, temporary_mesh_id
+from strands_robots.cli.network import Network, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.cli.resume_mesh import ask_peers, lockable_peers, resume_peers
-from strands_robots.envelope import text_of
+from strands_robots.envelope import Envelope, text_of
 from strands_robots.safety.approval import GRANT_S, Grants, state_dir
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.identity import KeyFileError
@@ -32,7 +31,6 @@ from strands_robots.utils import device_id, number
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
 
-PARALLEL_CALLS = 8
 THEN = "They move again when they get a new command."
 
 
@@ -283,35 +281,39 @@ def resume_robots(
         for assertion in sign(signer, epoch, names):
             for name in assertion["targets"]:
                 assertions.setdefault(name, []).append(assertion)
-    with ThreadPoolExecutor(PARALLEL_CALLS) as pool:
-        outcomes = pool.map(
-            lambda robot: _resume(fleet, robot, assertions.get(robot.name, []), seconds, keys.get(robot.name)), found
-        )
-        return {robot.name: outcome for robot, outcome in zip(found, outcomes, strict=True)}
+    outcomes = {robot.name: _before_resume(robot) for robot in found}
+    # All robots at once, and the lockouts of each one after the other, until it refuses.
+    left = {each.name: assertions.get(each.name, []) for each in found if each.lockouts and not each.problem}
+    while sent := {name: waiting[0] for name, waiting in left.items() if waiting}:
+        calls = {name: {"assertion": assertion} for name, assertion in sent.items()}
+        for name, (answer, _) in fleet.call_each(calls, "resume", seconds).items():
+            goes_on, outcomes[name] = _resumed(name, answer, sent[name], keys.get(name))
+            left[name] = left[name][1:] if goes_on else []
+    return outcomes
 
 
-def _resume(
-    fleet: FleetClient, robot: LockoutReport, assertions: list[dict[str, Any]], seconds: float, key: bytes | None
-) -> tuple[bool, str]:
+def _before_resume(robot: LockoutReport) -> tuple[bool, str]:
     if robot.problem:
         return False, robot.problem
     if not robot.lockouts:
         return True, "was not locked"
-    locked, said = True, "more stops than it can keep apart; resume --local at its own machine"
-    for assertion in assertions:
-        try:
-            answer = call_device(fleet, robot.name, "resume", {"assertion": assertion}, seconds)
-        except CliError as failure:
-            return False, failure.reason
-        stated = {"status": answer.get("status"), "nonce": assertion["nonce"]}
-        stated |= {"locked": answer["locked"]} if "locked" in answer else {}
-        problem = distrust(Purpose.RESUME_ANSWER, robot.name, answer.get("statement"), key, stated)
-        if problem:
-            return False, problem
-        if answer.get("status") != "success":
-            return False, f"{text_of(answer)}: its own audit says why"
-        locked, said = answer.get("locked") is not False, text_of(answer)
-    return not locked, said
+    return False, "more stops than it can keep apart; resume --local at its own machine"
+
+
+def _resumed(
+    name: str, answer: Envelope | Exception, assertion: Mapping[str, Any], key: bytes | None
+) -> tuple[bool, tuple[bool, str]]:
+    """Return True where its next lockout may be resumed, and the outcome."""
+    if isinstance(answer, Exception):
+        return False, (False, plain(str(answer.args[0] if answer.args else answer), 2000))
+    stated = {"status": answer.get("status"), "nonce": assertion["nonce"]}
+    stated |= {"locked": answer["locked"]} if "locked" in answer else {}
+    problem = distrust(Purpose.RESUME_ANSWER, name, answer.get("statement"), key, stated)
+    if problem:
+        return False, (False, problem)
+    if answer.get("status") != "success":
+        return False, (False, f"{text_of(answer)}: its own audit says why")
+    return True, (answer.get("locked") is False, text_of(answer))
 
 
 def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], then: str) -> None:

@@ -39,6 +39,12 @@ if TYPE_CHECKING:
 DRAW_S = 0.1
 LOOK_S = 1.0
 ASK_S = 1.0
+ASKED_MOST = 32
+"""Robots that are asked for their status at a look, if their beats say that they live: those asked longest ago."""
+
+BEAT_FRESH_S = 3.0
+"""Age of a beat up to which its robot is not asked out of turn."""
+
 GONE_S = 5.0
 """A robot that was silent for this long is shown as gone; it must still answer a stop."""
 
@@ -239,17 +245,21 @@ class FleetScreen:
     ) -> None:
         self._controller, self._link, self._check_in_s = controller, link, check_in_s
         self._robots: dict[str, LockoutReport] = {}
+        self._beats: dict[str, float] = {}
+        self._pressed_at = float("-inf")
         self._problem = "Looking for robots..."
         self._closed = threading.Event()
 
     def expected(self) -> Collection[str]:
         """Return the robots that must answer a stop: seen and not forgotten."""
+        # A stop asks for them: what each reports of itself is read anew.
+        self._pressed_at = time.monotonic()
         return tuple(self._robots)
 
     def forget(self) -> None:
         """Expect no answer any more from robots that are gone."""
         now = time.monotonic()
-        self._robots = {name: last for name, last in self._robots.items() if now - last.at < GONE_S}
+        self._robots = {name: last for name, last in self._robots.items() if now - self._seen_at(last) < GONE_S}
 
     @contextmanager
     def polling(self) -> Iterator[None]:
@@ -276,10 +286,34 @@ class FleetScreen:
                 with FleetClient(self._link, self._controller.controller_id) as fleet:
                     while not self._closed.wait(LOOK_S):
                         names = {*lockable_robots(fleet, ASK_S), *self._robots}
-                        self.update(ask_robots(fleet, sorted(names), ASK_S))
+                        self.take_beats({name: fleet.last_heartbeat(name) for name in names})
+                        self.update(ask_robots(fleet, self.due(names), ASK_S))
             except (MessagingError, TimeoutError) as exc:
                 self._problem = f"The robots cannot be polled: {exc}. The space bar has a connection of its own."
                 self._closed.wait(LOOK_S)
+
+    def take_beats(self, beats: Mapping[str, float | None]) -> None:
+        """Take the monotonic times of the robots' last beats or heartbeats."""
+        self._beats = {name: at for name, at in beats.items() if at is not None}
+
+    def due(self, names: Collection[str]) -> list[str]:
+        """Return the robots to ask now.
+
+        All that are new, that have no fresh beat, or that were not asked since the last stop; of the others in turn.
+        """
+        now, reports = time.monotonic(), self._robots
+        calm = [
+            name
+            for name in names
+            if name in reports
+            and reports[name].at > self._pressed_at + GONE_S
+            and now - self._beats.get(name, float("-inf")) < BEAT_FRESH_S
+        ]
+        in_turn = sorted(calm, key=lambda name: reports[name].at)[:ASKED_MOST]
+        return sorted({*names} - {*calm} | {*in_turn})
+
+    def _seen_at(self, last: LockoutReport) -> float:
+        return max(last.at, self._beats.get(last.name, last.at))
 
     def update(self, reports: Sequence[LockoutReport]) -> None:
         """Take the robots' reports; a robot that did not answer keeps its last one."""
@@ -298,7 +332,8 @@ class FleetScreen:
             head += f"; checks in every {self._check_in_s:g} s"
         answers = button.progress.answered if button.progress is not None else {}
         columns = ("robot", "lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
-        rows = (_row(name, last, answers.get(name)) for name, last in sorted(self._robots.items()))
+        robots = sorted(self._robots.items())
+        rows = (_row(name, last, self._seen_at(last), answers.get(name)) for name, last in robots)
         return Group(
             label(head, "bold green" if up else "bold white on red"),
             label("SPACE stops everything    f forgets robots that are gone    q quits", "bold"),
@@ -309,8 +344,8 @@ class FleetScreen:
         )
 
 
-def _row(name: str, last: LockoutReport, answer: Answer | None) -> tuple[Any, ...]:
-    age, lockouts, trip_ms = time.monotonic() - last.at, last.lockouts, last.round_trip_ms
+def _row(name: str, last: LockoutReport, seen_at: float, answer: Answer | None) -> tuple[Any, ...]:
+    age, lockouts, trip_ms = time.monotonic() - seen_at, last.lockouts, last.round_trip_ms
     locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
     return (
         name,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,6 +15,7 @@ from device_connect_edge.discovery import PresenceCollector
 from device_connect_edge.drivers import DeviceDriver, rpc
 from fixtures.nats_server import NatsServer
 from fixtures.waiting import eventually, free_port
+from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots.device_connect import (
     DuplicateDeviceError,
@@ -50,10 +52,14 @@ class Idle:
         return success("none")
 
 
-@pytest.fixture(params=["zenoh", "nats"])
+@pytest.fixture(params=["zenoh", "router", "nats"])
 def link(request: pytest.FixtureRequest) -> Iterator[LinkConfig]:
     if request.param == "zenoh":
         yield loopback_config(free_port())
+        return
+    if request.param == "router":
+        with ZenohRouter() as router:
+            yield LinkConfig(transport="zenoh", connect=(router.endpoint,))
         return
     with NatsServer() as server:
         yield LinkConfig(transport="nats", connect=(server.url,))
@@ -213,6 +219,30 @@ def test_device_that_fails_to_join_leaves_the_others_alone(link: LinkConfig, ser
     with FleetClient(link, "tester") as fleet:
         eventually(lambda: [each.id for each in fleet.peers()] == ["arm-1"])
         assert fleet.call("arm-1", "getStatus")["status"] == "success"
+
+
+def test_device_that_leaves_disturbs_no_call_of_the_others(link: LinkConfig, serve: Any) -> None:
+    # The first device holds the beat and the stops of the process.
+    first = init_device_connect_sync(Idle("arm-1"), peer_id="arm-1", link=link, allow_insecure=True)
+    slow = Idle("arm-2")
+    serve(slow, "arm-2")
+    serve(Idle("arm-3"), "arm-3")
+    slow.held = threading.Event()
+    try:
+        with FleetClient(link, "tester") as fleet, ThreadPoolExecutor() as callers:
+            eventually(lambda: len(fleet.peers()) == 3)
+            slow.asked.clear()
+            waiting = callers.submit(fleet.call, "arm-2", "getStatus", timeout=60.0)
+            assert slow.asked.wait(20.0)
+            stop_device_connect(first)
+            left_at = time.monotonic()
+            assert fleet.call("arm-3", "getStatus", timeout=20.0)["status"] == "success"
+            assert not waiting.done()
+            slow.held.set()
+            assert waiting.result(60.0)["status"] == "success"
+            eventually(lambda: (fleet.last_heartbeat("arm-3") or 0.0) > left_at)
+    finally:
+        slow.held.set()
 
 
 def test_rounds_of_joins_and_leaves_leave_nothing(link: LinkConfig) -> None:
