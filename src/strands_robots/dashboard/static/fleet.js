@@ -3,7 +3,7 @@ import { el, setAttr, setText } from "./dom.js";
 import { S } from "./strings.js";
 
 // Made once: a comparison that makes its own collator costs a hundred times as much.
-const byName = new Intl.Collator("en", { numeric: true });
+export const byName = new Intl.Collator("en", { numeric: true });
 const STALE_S = 3;
 const BAD = ["not_stopped", "alarm", "unknown", "refused", "silent"];
 

@@ -1,6 +1,6 @@
 // STOP. It means one thing, always: stop every robot. Nothing on this page changes what it does.
 import { el, setText } from "./dom.js";
-import { verdictText, verdictTone } from "./fleet.js";
+import { byName, verdictText, verdictTone } from "./fleet.js";
 import { S } from "./strings.js";
 
 const ORDER = ["not_stopped", "alarm", "refused", "unknown", "silent", "claimed", "waiting", "stopped"];
@@ -65,7 +65,7 @@ export class Stop {
   }
 
   draw() {
-    const answers = [...this.fleet.rows.values()].filter((row) => row.stop);
+    const answers = [...this.fleet.rows.values()].filter((row) => row.stop).sort((a, b) => byName.compare(a.id, b.id));
     const latest = this.link ? this.link.pressed_at : this.pressedAt;
     this.pressedAt = latest;
     const signature = JSON.stringify([latest, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
