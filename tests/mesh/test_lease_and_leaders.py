@@ -10,6 +10,7 @@ import pytest
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
+from strands_robots.mesh import input_receiver
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputPublisher
 from strands_robots.mesh.input_receiver import HOLD_S, LOST_S
@@ -86,16 +87,53 @@ def test_agent_is_refused_while_a_teleoperator_leads_and_free_after_it_fell_sile
     assert cell.robot.lockout_epoch is None
 
 
-def test_follower_of_a_silent_leader_holds_after_half_a_second_and_is_let_go_after_two(cell: Cell) -> None:
+class Watch:
+    """The time module of the receiver, which a test stops, and counts the looks at."""
+
+    def __init__(self) -> None:
+        self.at: float | None = None
+        self.looks = 0
+
+    def monotonic(self) -> float:
+        self.looks += 1
+        return time.monotonic() if self.at is None else self.at
+
+    def stop(self) -> float:
+        self.at = time.monotonic()
+        return self.at
+
+    def go_to(self, at: float) -> None:
+        """Set the time, and return once the receiver has looked at it often."""
+        self.at, before = at, self.looks
+        eventually(lambda: self.looks > before + 10, what="looks at the time")
+
+
+def test_follower_of_a_silent_leader_holds_after_half_a_second_and_is_let_go_after_two(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = Watch()
+    monkeypatch.setattr(input_receiver, "time", watch)
+    monkeypatch.setenv("STRANDS_MESH_INPUT_MAX_HZ", "0")
     cell.begin()
-    cell.publisher.stop()
-    silent = time.monotonic()
+    last, before = watch.stop(), cell.stream()["frames_received"]
+    eventually(lambda: cell.stream()["frames_received"] > before + 1, what="frames at the time that stands still")
+    sent = cell.publisher.stop()["frames"]
+
+    def taken() -> int:
+        row = cell.stream()
+        return int(row["frames_received"] + row["rate_dropped"])
+
+    eventually(lambda: taken() >= sent, what="the last frame")
+    watch.go_to(last + HOLD_S - 0.01)
+    assert not cell.stream()["holding"]
+    watch.go_to(last + HOLD_S + 0.01)
     eventually(lambda: cell.stream()["holding"], what="the hold")
-    held = time.monotonic() - silent
-    assert HOLD_S - 0.1 <= held < LOST_S - 0.5
+    watch.go_to(last + LOST_S - 0.01)
+    assert cell.stream()["running"]
     targets = cell.world.body("arm").targets
     where = cell.world.body("arm").get_joints()
     assert targets["shoulder_pan"] == pytest.approx(where["shoulder_pan"], abs=0.05)
+    watch.at = last + LOST_S + 0.01
     eventually(lambda: not cell.stream()["running"], what="the end of the stream")
     assert cell.world.gate.refusal("motion") is None
 

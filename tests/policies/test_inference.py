@@ -6,7 +6,6 @@ import logging
 import os
 import sys
 import threading
-import time
 from typing import Any
 
 import pytest
@@ -88,9 +87,8 @@ def test_closing_returns_at_once_names_the_hung_inference_and_drops_its_answer(
     caplog.set_level(logging.INFO)
     worker.ask("late")
     assert model.begun.wait(20)
-    began = time.monotonic()
+    # The inference goes on until it is let go: a close that waited for it would not return.
     worker.close()
-    assert time.monotonic() - began < 1.0
     assert "The policy pick has been computing" in caplog.text
     assert not model.finished.is_set(), "the model is freed only when nothing computes with it any more"
     model.let_go.set()

@@ -113,7 +113,7 @@ def test_base_whose_server_hangs_is_not_said_to_have_stopped_and_is_halted_when_
         began = time.monotonic()
         verdict = rover.halt("test")
         assert verdict.stopped is not True, verdict
-        assert time.monotonic() - began < 10.0
+        assert time.monotonic() - began < 30.0, "before the drive's own time was over"
         assert server.published[-1][1]["linear"]["x"] == 0.5, "nothing came through"
         relay.thaw()
         eventually(lambda: not server.published[-1][1]["linear"]["x"], what="a zero at the base")

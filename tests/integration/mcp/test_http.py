@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 
 import pytest
@@ -126,13 +125,12 @@ async def test_a_client_with_a_standing_stream_loses_its_lease_when_it_is_killed
     site: McpSite, url: str, tokens: dict[str, str]
 ) -> None:
     with site.child(
-        url, tokens["gone"], "legacy", "acquire_control", {"robot": "arm-1", "robot_name": "left"}
+        url, tokens["gone"], "legacy", "acquire_control", {"robot": "arm-1", "robot_name": "left", "ttl_s": 600}
     ) as child:
         await asyncio.to_thread(eventually, lambda: holder(site) == "gone")
         child.kill()
-        killed = time.monotonic()
+        # Released: it would last ten minutes more.
         await asyncio.to_thread(eventually, lambda: holder(site) is None)
-        assert time.monotonic() - killed < 10, "the lease ran out instead of being released"
 
 
 @BOTH
