@@ -62,13 +62,17 @@ def test_a_recorded_verdict_of_the_robot_does_not_answer_another_stop(cell: Cell
 
 
 def test_a_robot_that_stays_frozen_is_claimed_and_never_stopped(cell: Cell) -> None:
+    def is_claimed() -> bool:
+        """Stop once; on a busy machine the stranger may be too late for one stop."""
+        report = cell.controller.stop(["arm-1"], deadline_s=0.3)
+        assert not report.ok
+        assert is_error(envelope(report))
+        return set(report.claimed) == {"arm-1"}
+
     cell.robot.signal(signal.SIGSTOP)
     try:
         for _ in range(TIMES):
-            report = cell.controller.stop(["arm-1"], deadline_s=0.3)
-            assert set(report.claimed) == {"arm-1"}
-            assert not report.ok
-            assert is_error(envelope(report))
+            eventually(is_claimed, 60)
     finally:
         cell.robot.signal(signal.SIGCONT)
 
