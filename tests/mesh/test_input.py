@@ -129,6 +129,29 @@ def test_a_stream_needs_a_leader_that_was_seen(peers: Fleet) -> None:
     assert peers.events("input_stream_refused")
 
 
+def test_a_stream_whose_leader_is_lost_is_closed_while_the_followers_bus_hangs(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    holding, free = threading.Event(), threading.Event()
+
+    class Hanging:
+        def hold(self, permit: object) -> None:
+            holding.set()
+            free.wait(60)
+
+    monkeypatch.setattr(stream.arm, "body", Hanging, raising=False)
+    monkeypatch.setattr(input_receiver, "HOLD_S", 0.05)
+    stream.send()
+    try:
+        assert holding.wait(20)
+        monkeypatch.setattr(input_receiver, "LOST_S", 0.1)
+        eventually(lambda: not stream.receiver.running)
+        assert not free.is_set()
+    finally:
+        free.set()
+    assert stream.peers.events("input_stream_lost")
+
+
 def test_a_locked_follower_opens_no_stream_and_an_open_one_ends(
     stream: Stream, monkeypatch: pytest.MonkeyPatch
 ) -> None:

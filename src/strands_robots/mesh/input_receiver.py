@@ -240,7 +240,8 @@ class InputReceiver:
                 return
             if not self._holds:
                 self._holds = True
-                self._hold()
+                # It waits for the bus, which a write may block; the stream of a lost leader is closed all the same.
+                threading.Thread(target=self._hold, name=f"mesh-hold-{self._device}", daemon=True).start()
 
     def _hold(self) -> None:
         body = getattr(self._robot, "body", None)
