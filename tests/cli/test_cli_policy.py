@@ -78,3 +78,20 @@ def test_bench_prints_the_figures_of_a_server_against_the_budget(
     assert found["loop"]["inferences"] >= 2
     assert {row["what"].split(",")[0] for row in found["rows"]} >= {"latency", "underruns", "control period"}
     assert result.exit_code == (0 if found["kept"] else 1)
+
+
+@pytest.mark.parametrize("good", [0, 2])
+def test_bench_says_why_a_policy_failed(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, good: int) -> None:
+    monkeypatch.setenv("STRANDS_POLICIES", "")  # which the command sets
+    answers = iter([{"actions": numpy.zeros((4, 6), numpy.float32)}] * good)
+    with OpenPiServer(lambda observation: next(answers, "RuntimeError: out of memory")) as server:
+        keys = json.dumps(JOINTS)
+        entries = f'url = "{server.url}"\nstate = {keys}\naction = {keys}\nunits = "radians"\nrate = 30\n'
+        file = tmp_path / "bench.toml"
+        file.write_text(f'[pi]\nprovider = "openpi"\n{entries}')
+        result = run("policy", "bench", "pi", "--policies", str(file), "--for", "20")
+    assert result.exit_code == 1
+    said = " ".join((result.output + result.stderr).split())
+    assert "pi failed:" in said
+    assert "out of memory" in said
+    assert "Traceback" not in said

@@ -11,6 +11,7 @@ import typer
 from strands_robots import settings
 from strands_robots.cli.command import assignments, command
 from strands_robots.cli.output import CliError, Screen, label, table
+from strands_robots.policies.base import PolicyError
 from strands_robots.policies.check import PolicyCheck, check_policy, statements_of
 from strands_robots.policies.profiles import Profile, load_profiles
 from strands_robots.utils import ValidationError, number, shown
@@ -73,7 +74,10 @@ def bench(
         settings.put("STRANDS_POLICIES", str(policies))
     from strands_robots.policies.bench import measure  # noqa: PLC0415 - needed by this command alone
 
-    figures = measure(profile, rate, span)
+    try:
+        figures = measure(profile, rate, span)
+    except PolicyError as failure:
+        raise CliError(f"{name} failed: {failure}.") from failure
     screen.data({"kept": figures.kept, **asdict(figures)})
     rows: list[tuple[Any, ...]] = [
         (row.what, row.measured, row.budget, label("yes" if row.kept else "no", "green" if row.kept else "bold red"))
