@@ -277,7 +277,7 @@ def _stops(network: Network, link: LinkConfig, children: list[Child], size: Size
             halts.append((max(times, default=math.nan) - pressed) * 1e3)
     finally:
         controller.close()
-    stored = len(list(state.glob("lockouts/*")))
+    stored = len(list(state.glob("lockouts/*.json")))
     yield network.row(
         f"emergency stop to {count} devices, last halt, worst of {stops}",
         f"{max(halts):.0f} ms (p50 {statistics.median(halts):.0f})",
