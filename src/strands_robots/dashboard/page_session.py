@@ -30,6 +30,7 @@ TICK_S, SLOW_TICKS = 0.05, 10
 """Seconds between two looks for changes, and looks between two updates of ages and steps."""
 
 JOINTS_TICKS = 2
+ALIVE_TICKS = 20
 CALL_S = 10.0
 WAITING_MAX = 500
 CALLS_MAX = 16
@@ -86,29 +87,31 @@ class PageSession:
 
     async def run(self) -> None:
         """Serve the page until it goes, then halt and give back what it holds."""
-        server = self._server
-        await self._send(
-            {
-                "type": "hello",
-                "ticket": self.ticket,
-                "role": self._role,
-                "local": self._local,
-                "operator_key": server.operator_key.present,
-                "signed": server.signed,
-                "source": server.source,
-                "networks": [feed.network for feed in server.feeds.values()],
-            }
-        )
-        sending = asyncio.create_task(self._send_changes())
+        sending: asyncio.Task[None] | None = None
         try:
+            await self._send(self._hello())
+            sending = asyncio.create_task(self._send_changes())
             while True:
                 self._take(await self._socket.receive_text())
         except (WebSocketDisconnect, KeyError, RuntimeError) as gone:
             logger.debug("A page is gone, or sent bytes: %s", type(gone).__name__)
         finally:
-            for task in (sending, *self._thumbnails.values()):
+            for task in (*([sending] if sending else []), *self._thumbnails.values()):
                 task.cancel()
             await asyncio.shield(asyncio.ensure_future(self._control.leave()))
+
+    def _hello(self) -> dict[str, Any]:
+        server = self._server
+        return {
+            "type": "hello",
+            "ticket": self.ticket,
+            "role": self._role,
+            "local": self._local,
+            "operator_key": server.operator_key.present,
+            "signed": server.signed,
+            "source": server.source,
+            "networks": [feed.network for feed in server.feeds.values()],
+        }
 
     async def _send(self, message: Mapping[str, Any]) -> None:
         await self._send_text(json.dumps(message, allow_nan=False, default=str))
@@ -138,6 +141,9 @@ class PageSession:
             ticks_since = since if slow else ticks_since
             if message:
                 await self._send_text(message)
+            elif tick % ALIVE_TICKS == 0:
+                # A page makes its connection anew when it hears nothing, and would lose what it holds.
+                await self._send_text('{"type": "alive"}')
             while not self._waiting.empty():
                 await self._send(self._waiting.get_nowait())
             if self._watched and tick % JOINTS_TICKS == 0:

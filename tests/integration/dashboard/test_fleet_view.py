@@ -20,7 +20,6 @@ def test_five_hundred_robots_are_searched_and_filtered(page: Any, served: Served
     served.model.task("dc", "arm-7", state="running", instruction="stack the blue cups")
     served.model.update("dc", "arm-499", locked=True, lockouts=[{"epoch": "e" * 32, "source": "desk-1"}])
     shows(page, f"document.querySelectorAll('.card').length === {FIVE_HUNDRED}", 60.0)
-    assert page.locator(".card .name").first.text_content() == "arm-499", "what needs attention comes first"
     for text, wanted in (
         ("arm-123", ["arm-123"]),
         ("BLUE cups", ["arm-7"]),
