@@ -9,9 +9,7 @@ from typing import Any
 
 import pytest
 from fixtures.feetech_bus import FeetechBus, arm_servos, write_calibration
-from fixtures.feetech_bus.patience import patient
-
-from strands_robots.hardware._compat import lerobot_module
+from fixtures.feetech_bus.patience import be_patient
 
 Arm = Callable[..., Any]
 
@@ -32,11 +30,11 @@ def lerobot_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True)
-def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="session")
+def patience(lerobot_home: None) -> None:
     """A busy machine may hold the emulated servos up for longer than LeRobot waits."""
     if importlib.util.find_spec("lerobot") is not None:
-        monkeypatch.setattr(lerobot_module("lerobot.motors.feetech.feetech"), "patch_setPacketTimeout", patient)
+        be_patient()
 
 
 @pytest.fixture
