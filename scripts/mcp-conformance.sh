@@ -14,5 +14,7 @@ want=$(sha256sum <"$0")
 echo "Installing the conformance tests of MCP into $dir (once)..."
 rm -rf "$dir"
 mkdir "$dir"
-(cd "$dir" && npm install --no-audit --no-fund --loglevel=error node@22.23.3 @modelcontextprotocol/conformance@0.1.16)
+# The newest protocol revision, 2026-07-28, has its scenarios in an alpha only.
+(cd "$dir" && npm install --no-audit --no-fund --loglevel=error node@22.23.3 @modelcontextprotocol/conformance@0.1.16 \
+  conformance-next@npm:@modelcontextprotocol/conformance@0.2.0-alpha.12)
 echo "$want" >"$stamp"

@@ -16,13 +16,21 @@ pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_ty
 pytestmark = pytest.mark.system
 
 FOLDER = Path(__file__).resolve().parents[3] / ".mcp-conformance"
-PROGRAM = [str(FOLDER / "node_modules/node/bin/node"), str(FOLDER / "node_modules/.bin/conformance"), "server"]
+NODE = str(FOLDER / "node_modules/node/bin/node")
+PROGRAM = [NODE, str(FOLDER / "node_modules/@modelcontextprotocol/conformance/dist/index.js"), "server"]
+NEXT = FOLDER / "node_modules/conformance-next/dist/index.js"
 
 APPLY = (
     *("server-initialize", "ping", "tools-list", "resources-list", "prompts-list", "server-sse-multiple-streams"),
     *("dns-rebinding-protection", "resources-subscribe", "resources-unsubscribe"),
 )
 """Scenarios that call nothing but what every server has."""
+
+APPLY_NEXT = (
+    *("tools-list", "resources-list", "prompts-list", "server-sse-multiple-streams", "dns-rebinding-protection"),
+    *("caching", "http-header-validation", "sep-2164-resource-not-found"),
+)
+"""Such scenarios of revision 2026-07-28."""
 
 FIXED = 32
 """Scenarios up to revision 2025-11-25."""
@@ -34,13 +42,22 @@ def installed() -> None:
         pytest.skip("needs scripts/mcp-conformance.sh")
 
 
-def conformance(*flags: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*PROGRAM, *flags], capture_output=True, text=True, timeout=110, check=False)
+def conformance(*flags: str, program: list[str] = PROGRAM) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*program, *flags], capture_output=True, text=True, timeout=110, check=False)
 
 
 @pytest.mark.parametrize("scenario", APPLY)
 def test_the_server_passes_what_applies_to_it(site: McpSite, served: str, scenario: str) -> None:
     ran = conformance("--url", served, "--scenario", scenario)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize("scenario", APPLY_NEXT)
+def test_the_server_passes_what_applies_to_it_in_the_newest_revision(site: McpSite, served: str, scenario: str) -> None:
+    if not NEXT.exists():
+        pytest.skip("needs scripts/mcp-conformance.sh")
+    flags = ("--url", served, "--scenario", scenario, "--spec-version", "2026-07-28")
+    ran = conformance(*flags, program=[NODE, str(NEXT), "server"])
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
