@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+from typing import Any
 
 import pytest
 from fixtures.mcp_site import WAVE, McpSite
+from fixtures.waiting import eventually_async
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 
@@ -26,9 +28,15 @@ async def test_a_client_lists_robots_by_a_small_set_of_tools_that_name_none(site
 
 async def test_a_simulated_arm_says_what_it_reached_and_refuses_what_it_cannot(site: McpSite) -> None:
     async with site.client() as client:
-        answer = await client.call_tool("move", {"robot": "arm-2", "to": {"x": 0.25, "y": 0.0, "z": 0.1}})
-        assert not answer.is_error, answer
-        assert answer.structured_content["data"]["error_mm"] < 15
+        answers: list[Any] = []
+
+        async def moved() -> bool:
+            # A motion has its own few seconds; on a busy machine the next one goes on where it ended.
+            answers.append(await client.call_tool("move", {"robot": "arm-2", "to": {"x": 0.25, "y": 0.0, "z": 0.1}}))
+            return not answers[-1].is_error
+
+        await eventually_async(moved, within=60, what=f"its arrival, and not {answers}")
+        assert answers[-1].structured_content["data"]["error_mm"] < 15
         for malformed in (
             {"to": {"x": 9.0, "y": 0.0, "z": 0.1}},
             {"to": {"x": True}},
