@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
 from fixtures.recording_robot import RecordingRobot
 from fixtures.waiting import eventually
 
-from strands_robots.safety import reporting
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.estop_listener import VERDICT, notification
 from strands_robots.safety.orders import ANSWERED, ANSWERED_MAX_BYTES, StopOrder, StopRules, answered_field, new_epoch
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.reporting import Reporter, StopRun
+from strands_robots.safety.stopping import StopVerdict
 
 Add = Callable[..., RecordingRobot]
 
@@ -105,23 +108,73 @@ def test_the_names_of_those_that_answered_are_bounded() -> None:
     assert answered_field([]) == {}
 
 
-def test_no_robot_of_a_large_process_answers_before_the_last_has_halted(
-    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+@dataclass
+class PacedRun:
+    """A stop of four robots whose *stopped* is not due until the test says so."""
+
+    reporter: Reporter
+    run: StopRun
+    events: list[str]
+
+    def answer(self, robot_id: str, **verdict: Any) -> None:
+        self.reporter.answer(self.run, robot_id, StopVerdict(**verdict))
+
+
+@pytest.fixture
+def paced() -> Iterator[PacedRun]:
+    names, events, reporter = ("arm-0", "arm-1", "arm-2", "arm-3"), list[str](), Reporter()
+    run = StopRun(
+        order(),
+        names,
+        frozenset(names),
+        20.0,
+        lambda name: (),
+        lambda report: events.append(report.robot_id),
+        lambda done: events.append("done"),
+        lambda: events.append("file"),
+    )
+    run.answer_at = math.inf
+    reporter.begin(run)
+    yield PacedRun(reporter, run, events)
+    reporter.close()
+
+
+def test_a_large_process_writes_its_lockouts_before_its_answers_are_due(paced: PacedRun) -> None:
+    for name in paced.run.robot_ids:
+        paced.answer(name, halted=("task",))
+    eventually(lambda: paced.run.kept is True)
+    assert paced.events == ["file"]
+    paced.run.answer_at = 0.0
+    eventually(lambda: "done" in paced.events)
+    assert paced.events == ["file", *paced.run.robot_ids, "done"]
+
+
+def test_a_large_process_writes_its_lockouts_though_a_halt_has_not_answered(paced: PacedRun) -> None:
+    paced.answer("arm-0", halted=("task",))
+    eventually(lambda: paced.run.kept is True)
+    assert paced.events == ["file"]
+
+
+@pytest.mark.parametrize("verdict", [{"not_stopped": {"bus": "no answer in 1 s"}}, {"unknown": {"arm-2": "unknown"}}])
+def test_a_robot_of_a_large_process_that_did_not_stop_says_so_at_once(
+    paced: PacedRun, verdict: dict[str, dict[str, str]]
 ) -> None:
-    monkeypatch.setattr(reporting, "UNPACED", 3)
-    monkeypatch.setattr(reporting, "PACE_S", 2.0)
-    events, last = [], threading.Event()
+    for name in ("arm-0", "arm-1", "arm-3"):
+        paced.answer(name, halted=("task",))
+    paced.answer("arm-2", **verdict)
+    eventually(lambda: "arm-2" in paced.events)
+    assert paced.events == ["file", "arm-2"]
+    paced.run.answer_at = 0.0
+    eventually(lambda: "done" in paced.events)
+    assert paced.events == ["file", "arm-2", "arm-0", "arm-1", "arm-3", "done"]
 
-    def halt() -> None:
-        events.append("halt")
 
-    for number in range(3):
-        add(f"arm-{number}", before_halt=halt)
-    add("arm-3", before_halt=lambda: (last.wait(60), halt()))
-    run = plane.begin(order(), lambda report: events.append("answer"))
-    assert run is not None
-    eventually(lambda: len(events) == 3)
-    run.wait(10 * reporting.GRACE_S)  # the time in which robots of a small process answer
-    last.set()
-    assert run.wait(60)
-    assert events == ["halt"] * 4 + ["answer"] * 4
+@pytest.mark.parametrize(("count", "shortest", "longest"), [(32, 0.0, 0.0), (33, 0.033, 0.066), (5000, 0.1, 0.2)])
+def test_answers_are_held_back_for_a_fifth_of_a_second_at_most(count: int, shortest: float, longest: float) -> None:
+    def nothing(*given: object) -> None:
+        pass
+
+    names = tuple(f"arm-{number}" for number in range(count))
+    for _ in range(100):
+        run = StopRun(order(), names, frozenset(), 1.0, lambda name: (), nothing, nothing, nothing)
+        assert shortest - 1e-6 <= run.answer_at - run.started <= longest + 1e-6

@@ -27,9 +27,12 @@ UNPACED = 32
 """Robots of a process that answer as soon as they have halted."""
 
 PACE_S = 0.001
-"""Seconds for each robot of a larger process until they answer, and as much again by chance.
+"""Seconds for each robot of a larger process until they answer *stopped*, and as much again by chance.
 
-Other processes of the machine still halt theirs in this time: nothing of an answer is done meanwhile."""
+Other processes of the machine still halt theirs in this time. Lockouts are written and bad news is sent meanwhile."""
+
+PACE_MAX_S = 0.1
+"""The longest of these times; with the chance, an answer is held back for twice as long at most."""
 
 GATHER_S = 0.005
 """Seconds between two looks at the answers that come in before any of them goes out."""
@@ -65,7 +68,8 @@ class StopRun:
 
     def __post_init__(self) -> None:
         count = len(self.robot_ids)
-        self.answer_at = self.started + (PACE_S * count * random.uniform(1.0, 2.0) if count > UNPACED else 0.0)
+        pace_s = min(PACE_S * count, PACE_MAX_S) if count > UNPACED else 0.0
+        self.answer_at = self.started + pace_s * random.uniform(1.0, 2.0)
 
     def wait(self, timeout: float) -> bool:
         """True when every robot has been reported."""
@@ -185,8 +189,6 @@ class Reporter:
 
     def _advance(self, run: StopRun, now: float) -> None:
         waiting = [each for each in run.robot_ids if each not in run.answers]
-        if now < run.answer_at:
-            return
         if run.keeping_since is None and (not waiting or now - run.started >= GRACE_S):
             run.keeping_since = now
             self._files.put(run)
@@ -194,10 +196,14 @@ class Reporter:
             run.kept = False
         if run.kept is not None:
             for robot_id in run.robot_ids:
-                if robot_id in run.answers and robot_id not in run.reports:
+                if robot_id in run.answers and robot_id not in run.reports and self._due(run, robot_id, now):
                     self._report(run, robot_id)
         if len(run.reports) == len(run.robot_ids):
             self._finish(run)
+
+    def _due(self, run: StopRun, robot_id: str, now: float) -> bool:
+        """Return False for good news before its moment."""
+        return now >= run.answer_at or run.answers[robot_id][0].stopped is not True
 
     def _time_out(self, run: StopRun) -> None:
         """Report the rest as unanswered: the reporter ends before the executor answers."""
