@@ -10,12 +10,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.recording_robot import RecordingRobot
 from fixtures.waiting import eventually
 
+from strands_robots.safety import controller as controller_module
+from strands_robots.safety import estop_listener
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import VERDICT, notification
-from strands_robots.safety.orders import ANSWERED, ANSWERED_MAX_BYTES, StopOrder, StopRules, answered_field, new_epoch
+from strands_robots.safety.estop_listener import VERDICT, EstopListener, notification
+from strands_robots.safety.orders import (
+    ANSWERED,
+    ANSWERED_MAX_BYTES,
+    RobotReport,
+    StopOrder,
+    StopRules,
+    answered_field,
+    new_epoch,
+)
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.reporting import Reporter, StopRun
 from strands_robots.safety.stopping import StopVerdict
@@ -24,20 +35,23 @@ Add = Callable[..., RecordingRobot]
 
 
 class RepeatingLink:
-    """Robots that answer one after the other: one more at each sending."""
+    """Robots that answer one after the other: one more at each sending, and ``before`` the first all of these."""
 
-    def __init__(self, names: list[str], **fields: Any) -> None:
+    def __init__(self, names: list[str], before: list[str] | None = None, **fields: Any) -> None:
         self.up = True
         self.sent: list[dict[str, Any]] = []
-        self._names, self._fields = names, fields
+        self.payloads: list[bytes] = []
+        self._names, self._before, self._fields = names, before or [], fields
         self._hear: Callable[[str, str, bytes], None] = lambda event, source, payload: None
 
     def open(self, events: object, hear: Callable[[str, str, bytes], None], on_state: object) -> None:
         self._hear = hear
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
+        self.payloads.append(payload)
         self.sent.append(json.loads(payload)["params"])
-        for name in self._names[len(self.sent) - 1 : len(self.sent)]:
+        before, self._before = self._before, []
+        for name in [*before, *self._names[len(self.sent) - 1 : len(self.sent)]]:
             answer = {"device_id": name, "estop_id": self.sent[0]["estop_id"], "stopped": True, **self._fields}
             self._hear(VERDICT, name, notification(VERDICT, answer))
         return True
@@ -86,6 +100,20 @@ def test_a_robot_that_did_not_stop_says_so_at_each_repetition(
     release.set()
 
 
+def test_a_robot_whose_lockout_is_not_kept_says_so_at_each_repetition(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(kept: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(plane.store, "save", full)
+    add("arm-1", key="k")
+    first, repeated = order(), list[RobotReport]()
+    assert plane.emergency_stop(first)["arm-1"].persisted is False
+    plane.begin(order(("arm-1",), first.epoch), repeated.append)
+    assert [(each.robot_id, each.stopped, each.persisted) for each in repeated] == [("arm-1", True, False)]
+
+
 def test_a_robot_that_is_named_as_answered_is_halted_by_a_stop_that_it_has_not_seen(
     plane: SafetyPlane, add: Add
 ) -> None:
@@ -101,11 +129,60 @@ def test_a_stop_counts_whatever_it_names_as_answered(stated: object) -> None:
     assert decided.answered == frozenset()
 
 
-def test_the_names_of_those_that_answered_are_bounded() -> None:
-    names = [f"arm-{number:05}" for number in range(20_000)]
+@pytest.mark.parametrize("letter", ["a", "\N{LATIN SMALL LETTER E WITH ACUTE}", "\N{ROBOT FACE}", '"', "\ud83e"])
+def test_the_names_of_those_that_answered_are_bounded_as_encoded(letter: str) -> None:
+    names = [f"{letter * 20}-{number:05}" for number in range(20_000)]
     named = answered_field(names)[ANSWERED]
-    assert 0 < len(json.dumps(named)) <= ANSWERED_MAX_BYTES
+    assert ANSWERED_MAX_BYTES * 0.9 < len(json.dumps(named)) <= ANSWERED_MAX_BYTES
     assert answered_field([]) == {}
+
+
+def test_one_name_that_is_too_long_displaces_no_other() -> None:
+    assert answered_field(["arm-1", "a" * ANSWERED_MAX_BYTES, "arm-2"]) == {ANSWERED: ["arm-1", "arm-2"]}
+
+
+@pytest.mark.parametrize("letter", ["a", "\N{ROBOT FACE}"])
+def test_answers_in_600_invented_names_keep_no_repetition_from_being_read(letter: str) -> None:
+    invented, rules = [f"{letter * 60}-{number}" for number in range(600)], StopRules(allow=(), keys=())
+    link = RepeatingLink(["arm-1", "arm-2", "arm-3"], before=invented)
+    controller = SafetyController("safety-1", lambda: link)
+    assert controller.stop(["arm-1", "arm-2", "arm-3"], "\N{ROBOT FACE}" * 200, deadline_s=20).ok
+    assert len(link.sent) >= 3
+    for number, payload in enumerate(link.payloads):
+        read = rules.order_of("safety-1", payload)
+        assert isinstance(read, StopOrder)
+        assert read.epoch == link.sent[0]["estop_id"]
+        assert read.answered >= {"arm-1", "arm-2"} or number < 2
+
+
+@pytest.mark.parametrize(("key", "unused"), [(None, "SIGNED_MAX_S"), (Ed25519PrivateKey.generate(), "MAX_S")])
+def test_many_expected_robots_that_do_not_exist_delay_no_repetition_for_long(
+    key: Ed25519PrivateKey | None, unused: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert controller_module.REPEAT_EACH_MAX_S <= 0.05
+    assert controller_module.REPEAT_EACH_SIGNED_MAX_S <= 0.02
+    monkeypatch.setattr(controller_module, "REPEAT_EACH_S", 1000.0)
+    monkeypatch.setattr(controller_module, f"REPEAT_EACH_{unused}", 1000.0)
+    names = ["arm-1", "arm-2", "arm-3"]
+    link = RepeatingLink(names)
+    assert SafetyController("safety-1", lambda: link, signing_key=key).stop(names, deadline_s=20).ok
+
+
+def test_a_robot_of_a_large_process_answers_a_repetition_after_a_quarter_of_a_second(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estop_listener, "ANSWER_AGAIN_EACH_S", 3600.0)
+    add("arm-1")
+    listener, link, stop = EstopListener(plane, lambda: StopRules(allow=(), keys=())), RepeatingLink([]), order()
+    registration = listener.register("arm-1", "net", lambda: link)
+    try:
+        listener.stop_here(stop)
+        eventually(lambda: len(link.sent) == 1)
+        eventually(lambda: listener.stop_here(stop) or len(link.sent) == 2)
+        assert [each["repeated"] for each in link.sent] == [False, True]
+        assert estop_listener.ANSWER_AGAIN_MAX_S <= 0.25
+    finally:
+        listener.unregister(registration)
 
 
 @dataclass

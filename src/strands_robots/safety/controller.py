@@ -48,6 +48,10 @@ many forged stops in the controller's name and the true ones only a share is ser
 REPEAT_EACH_S = 0.00005
 """Pause for each robot that has to answer, where that is longer: hundreds of halts are under way meanwhile."""
 
+REPEAT_EACH_MAX_S = 0.05
+REPEAT_EACH_SIGNED_MAX_S = 0.02
+"""The longest pause by number, unsigned and signed, however many robots are said to exist."""
+
 UNCONFIRMED_S = 0.1
 RENEW_S = 6.0
 """A stop, or one after another, that someone expected left unanswered for so long makes the connection anew."""
@@ -281,13 +285,15 @@ class SafetyController:
     def _send(self, run: _Running) -> None:
         """Send the stop, issued now and pressed at its press."""
         fields: dict[str, Any] = {"estop_id": run.estop_id, "reason": run.reason, "pressed_at": run.press.wall}
-        fields |= answered_field(run.graded.final())
+        # Expected ones first: a flood of answers in invented names crowds none of them out.
+        fields |= answered_field(sorted(run.graded.final(), key=lambda name: name not in run.expected))
         payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
         if self._link.publish(self.controller_id, ESTOP, payload) and run.left is None:
             run.left = now
 
     def _repeat(self, run: _Running, deadline_s: float, on_progress: OnProgress) -> None:
         pauses, reported = iter(REPEAT_S if self._key is None else REPEAT_SIGNED_S), -1
+        longest_s = REPEAT_EACH_MAX_S if self._key is None else REPEAT_EACH_SIGNED_MAX_S
         pause, next_send, again = 0.0, run.started, 0
         renew_at = run.started + max(SETTLE_S, RENEW_S - self._unanswered_s)
         while True:
@@ -314,7 +320,7 @@ class SafetyController:
                     self._send(run)
                 again += 1
                 pause = next(pauses, pause)
-                next_send = now + max(pause, REPEAT_EACH_S * len(run.expected))
+                next_send = now + max(pause, min(REPEAT_EACH_S * len(run.expected), longest_s))
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
             with self._changed:
                 seen = (self._link.up, len(run.expected))

@@ -40,6 +40,8 @@ ANSWER_AGAIN_S = 0.01
 ANSWER_AGAIN_EACH_S = 0.002
 """The same, for each robot of the process, where that is longer: a stop repeated to hundreds is no flood of answers."""
 
+ANSWER_AGAIN_MAX_S = 0.25
+
 REFUSAL_INTERVAL_S = 10.0
 SOURCES_MAX = 256
 """Sources remembered; past it the oldest is forgotten or all new ones share an entry, so that names take no memory."""
@@ -508,7 +510,8 @@ class EstopListener:
         key, now = (report.robot_id, report.epoch), time.monotonic()
         if not report.names_its_epoch and not self._latch_answers.allows(report.robot_id, report.epoch, now):
             return
-        again_s = max(ANSWER_AGAIN_S, ANSWER_AGAIN_EACH_S * len(self._registrations))
+        # Robots, not registrations: one on two networks has two.
+        again_s = min(max(ANSWER_AGAIN_S, ANSWER_AGAIN_EACH_S * len(self._plane.robots)), ANSWER_AGAIN_MAX_S)
         if report.repeated and now - self._answered.get(key, 0.0) < again_s:
             return
         if report.repeated and report.names_its_epoch and key not in self._redundant:

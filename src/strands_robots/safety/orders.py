@@ -39,8 +39,8 @@ REASON_MAX = 200
 ANSWERED = "answered"
 """Field of a repeated stop: the devices that its issuer asks for no further answer."""
 
-ANSWERED_MAX_BYTES = PARSED_MAX_BYTES // 2
-"""Length of all names in :data:`ANSWERED`; what exceeds it is left out, and answers again."""
+ANSWERED_MAX_BYTES = 8 * 2**10
+"""Encoded length of :data:`ANSWERED`; a name that exceeds it is left out, and answers again."""
 
 REQUIRE_SIGNED = "STRANDS_ESTOP_REQUIRE_SIGNED"
 ALLOW = "DEVICE_CONNECT_ESTOP_ALLOW"
@@ -326,13 +326,18 @@ def params_of(payload: bytes) -> dict[str, Any]:
 
 
 def answered_field(names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the field that names who has answered; empty where there is nobody."""
-    named, length = [], 0
+    """Return the field that names who has answered; empty where there is nobody.
+
+    Args:
+        names: the ones that matter most come first.
+    """
+    named, length = [], len("[]")
     for name in names:
-        length += len(name) + 4
-        if length > ANSWERED_MAX_BYTES:
-            break
-        named.append(name)
+        # Encoded: a letter outside ASCII takes six bytes or twelve.
+        more = len(json.dumps(name)) + len(", ")
+        if length + more <= ANSWERED_MAX_BYTES:
+            length += more
+            named.append(name)
     return {ANSWERED: named} if named else {}
 
 

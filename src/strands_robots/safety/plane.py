@@ -431,9 +431,10 @@ class SafetyPlane:
     def _repeat(self, order: StopOrder, robots: Collection[Registered], on_report: OnReport) -> None:
         for entry in robots:
             report = entry.report_again(order)
-            # Only a robot that stopped: whoever claims to have its answer silences nothing else.
-            if report is not None and not (report.stopped and entry.wire_id in order.answered):
-                on_report(report)
+            # Only a robot that stopped and stays locked: whoever claims to have its answer silences nothing else.
+            if report is None or (report.stopped and report.persisted is not False and entry.wire_id in order.answered):
+                continue
+            on_report(report)
         if any(entry.crowded and order.epoch not in entry.epochs for entry in robots):
             self._counted.add(order.source)
 
