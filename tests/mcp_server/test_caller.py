@@ -24,10 +24,16 @@ class FakeFleet:
         self.answers = answers
         self.stop_answers = [success("Stopped.", stopped=True)]
         self.stops = 0
+        self.calls: list[tuple[str, dict[str, Any]]] = []
+
+    def sent(self, verb: str) -> dict[str, Any]:
+        """Return the parameters of the last call of a verb."""
+        return next(params for name, params in reversed(self.calls) if name == verb)
 
     async def call_async(self, robot: str, verb: str, params: Mapping[str, Any], within: float) -> Envelope:
         """Answer a call."""
-        answer = self.answers[verb]
+        self.calls.append((verb, dict(params)))
+        answer = description() if verb == "requestRegistration" and verb not in self.answers else self.answers[verb]
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -36,6 +42,13 @@ class FakeFleet:
         """Count the stop; the last answer is given again and again."""
         self.stops += 1
         return self.stop_answers.pop(0) if len(self.stop_answers) > 1 else self.stop_answers[0]
+
+
+def description(*parameters: str) -> Envelope:
+    """Return the description of a robot whose verbs have these parameters."""
+    schema = {"type": "object", "properties": {name: {"type": "string"} for name in parameters}}
+    functions = [{"name": verb, "parameters": schema} for verb in ("moveTo", "execute")]
+    return {"device_id": "arm-1", "status": {}, "capabilities": {"functions": functions}}
 
 
 def client_of(fleet: FakeFleet) -> Caller:
@@ -93,3 +106,80 @@ async def test_motion_that_ended_by_itself_is_not_stopped() -> None:
     assert not is_error(await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True))
     await asyncio.sleep(0)
     assert fleet.stops == 0
+
+
+@pytest.mark.parametrize(
+    "published, bound",
+    [
+        (description("x", "lease_id", "lease_ttl_s"), True),
+        (description("x", "lease_id"), False),
+        (description("x"), False),
+        ({"device_id": "arm-1"}, False),
+        (DeviceTimeoutError("arm-1 did not answer."), True),
+    ],
+)
+async def test_motion_carries_a_lease_only_to_a_robot_that_publishes_it(
+    published: Envelope | Exception, bound: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SILENCE_S", 0.0)
+    fleet = FakeFleet(
+        requestRegistration=published,
+        moveTo=RUNNING,
+        execute=RUNNING,
+        getStatus=success("idle"),
+        renewControl=success(""),
+    )
+    fleet.answers["wait"] = success("there", task_status="completed")
+    client = client_of(fleet)
+    assert not is_error(await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True))
+    assert not is_error(await client.run_policy("arm-1", {"instruction": "wave"}, wait=True))
+    for verb in ("moveTo", "execute"):
+        assert [name in fleet.sent(verb) for name in ("lease_id", "lease_ttl_s")] == [bound, bound]
+    assert bound == any(verb == "renewControl" for verb, _ in fleet.calls)
+    assert sum(verb == "requestRegistration" for verb, _ in fleet.calls) == 2
+
+
+async def test_robot_is_asked_once_whether_it_takes_the_lease_of_a_motion() -> None:
+    fleet = FakeFleet(requestRegistration=description("lease_ttl_s"), moveTo=success("", task_status="completed"))
+    client = client_of(fleet)
+    for _ in range(3):
+        await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    assert sum(verb == "requestRegistration" for verb, _ in fleet.calls) == 1
+
+
+async def test_held_lease_goes_to_any_robot_that_gave_it() -> None:
+    fleet = FakeFleet(
+        acquireControl=success("", lease_id="a" * 32), getStatus=success("idle"), renewControl=success("")
+    )
+    fleet.answers |= {"moveTo": success("", task_status="completed"), "requestRegistration": description("x")}
+    client = client_of(fleet)
+    assert not is_error(await client.acquire("arm-1", 60.0, ""))
+    assert "lease_id" not in fleet.sent("acquireControl")
+    await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    assert fleet.sent("moveTo")["lease_id"] == "a" * 32
+    assert "lease_ttl_s" not in fleet.sent("moveTo")
+    client._forget(("arm-1", ""))
+
+
+async def test_client_that_moves_a_robot_acquires_it_by_the_secret_of_its_motion() -> None:
+    fleet = FakeFleet(moveTo=RUNNING, getStatus=success("idle"), acquireControl=error("held"))
+    asked = asyncio.Event()
+    go_on = asyncio.Event()
+    answer = fleet.call_async
+
+    async def waits(robot: str, verb: str, params: Mapping[str, Any], within: float) -> Envelope:
+        if verb == "wait":
+            asked.set()
+            await go_on.wait()
+            return success("there", task_status="completed")
+        return await answer(robot, verb, params, within)
+
+    fleet.call_async = waits  # type: ignore[method-assign]
+    fleet.answers["requestRegistration"] = description("lease_id", "lease_ttl_s")
+    client = client_of(fleet)
+    motion = asyncio.ensure_future(client.move("arm-1", "moveTo", {"x": 0.1}, wait=True))
+    await asyncio.wait_for(asked.wait(), 20.0)
+    await client.acquire("arm-1", 60.0, "")
+    assert fleet.sent("acquireControl")["lease_id"] == fleet.sent("moveTo")["lease_id"]
+    go_on.set()
+    assert not is_error(await motion)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -170,3 +171,58 @@ def test_agent_gets_no_lease_of_a_robot_that_is_led_at_its_own_machine(cell: Cel
     assert cell.world.stop_teleoperate()["stopped"] is True
     assert cell.ask(cell.agent, "acquireControl", ttl_s=0.5)["status"] == "success"
     assert leases_of(cell.world, hardware=False).of().facts()["holder"] == "agent"
+
+
+def without_threads(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """Let the system have no thread whose name begins with ``kind``."""
+    start = threading.Thread.start
+
+    def scarce(thread: threading.Thread) -> None:
+        if thread.name.startswith(kind):
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", scarce)
+
+
+def test_follower_of_a_silent_leader_holds_and_is_let_go_without_a_thread_for_the_hold(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[str] = []
+    monkeypatch.setattr(input_receiver.InputReceiver, "_hold", lambda self: held.append(self.topic))
+    without_threads(monkeypatch, "mesh-hold")
+    cell.begin()
+    cell.publisher.stop()
+    eventually(lambda: not cell.stream()["running"], within=20.0, what="the end of the stream")
+    eventually(lambda: len(held) == 1, within=20.0, what="the hold on the watching thread")
+
+
+def test_stream_that_nothing_would_watch_is_refused(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    without_threads(monkeypatch, "mesh-watch")
+    answer = cell.follow()
+    assert answer["status"] == "error" and "can't start new thread" in str(answer), answer
+
+
+def test_no_second_hold_begins_while_one_waits_for_the_bus(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(input_receiver, "LOST_S", 600.0)
+    bus, holds = threading.Event(), []
+    receivers: set[input_receiver.InputReceiver] = set()
+
+    def hold(receiver: input_receiver.InputReceiver) -> None:
+        receivers.add(receiver)
+        holds.append(receiver.topic)
+        assert bus.wait(60.0)
+
+    monkeypatch.setattr(input_receiver.InputReceiver, "_hold", hold)
+    cell.begin()
+    cell.publisher.stop()
+    eventually(lambda: len(holds) == 1, within=20.0, what="the first hold")
+    [receiver] = receivers
+    watch = Watch()
+    monkeypatch.setattr(input_receiver, "time", watch)
+    watch.stop()
+    receiver._holds = False  # as a frame that came meanwhile leaves it
+    watch.go_to(receiver._moved + 2 * HOLD_S)
+    assert len(holds) == 1
+    bus.set()
+    eventually(lambda: len(holds) == 2, within=20.0, what="the hold after it")

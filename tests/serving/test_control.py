@@ -193,14 +193,6 @@ def test_motion_with_a_time_keeps_others_out_until_it_has_ended(bench: Bench) ->
     bench.acquire("agent-b")
 
 
-def test_motion_of_a_holder_ends_with_the_lease_that_is_held(bench: Bench) -> None:
-    held = bench.acquire(ttl_s=60.0)
-    bench.lease.admit("moveTo", "agent-a", held, 0.5).close()
-    bench.clock.now += 59.0
-    bench.lease.expire()
-    assert bench.lease.facts()["held"] is True
-
-
 def test_motion_that_was_refused_leaves_the_robot_free(bench: Bench) -> None:
     bench.lease.admit("moveTo", "agent-a", "").close()
     bench.acquire("agent-b")
@@ -385,3 +377,106 @@ def test_motion_of_a_caller_that_went_away_is_halted_in_its_time(robot: ToyRobot
     assert begun.result["status"] == "success"
     eventually(lambda: not robot.rollouts["toy"].running, within=20.0, what="the halt")
     assert robot.rollouts["toy"].state == "stopped"
+
+
+class Unreadable(Bench):
+    """A robot whose state cannot be read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.state: bool | Exception | None = True
+        self.lease._moving = self.read
+
+    def read(self) -> bool | None:
+        """Answer, or raise, as the test has set it."""
+        if isinstance(self.state, Exception):
+            raise self.state
+        return self.state
+
+
+@pytest.mark.parametrize("state", [OSError("the bus is gone"), None, True])
+def test_motion_whose_state_is_not_known_to_be_at_rest_is_halted_at_its_time(state: bool | Exception | None) -> None:
+    bench = Unreadable()
+    bench.lease.admit("execute", "agent-a", SECRET, 5.0).close()
+    bench.state = state
+    bench.clock.now += 5.0
+    bench.lease.expire()
+    assert len(bench.body.halts) == 1
+    assert bench.lease.due is None, "the watch would come again and again"
+    assert [each.event for each in bench.changes] == ["expired"]
+
+
+def test_robot_at_rest_is_not_halted_at_the_end_of_a_motions_time() -> None:
+    bench = Unreadable()
+    bench.lease.admit("execute", "agent-a", SECRET, 5.0).close()
+    bench.state = False
+    bench.clock.now += 5.0
+    bench.lease.expire()
+    assert bench.body.halts == [] and bench.lease.due is None
+
+
+def test_lease_ends_and_is_told_though_the_halt_failed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(reason: str) -> None:
+        raise OSError("the bus is gone")
+
+    monkeypatch.setattr(bench.lease, "_halt", fails)
+    bench.acquire(ttl_s=5.0)
+    bench.clock.now += 5.0
+    with pytest.raises(OSError):
+        bench.lease.expire()
+    assert bench.lease.due is None
+    assert bench.changes[-1].event == "expired"
+
+
+def test_robot_whose_state_cannot_be_read_stays_its_movers() -> None:
+    bench = Unreadable()
+    bench.lease.admit("moveTo", "agent-a", "").close()
+    bench.state = OSError("the bus is gone")
+    assert refused(bench, "agent-b")["code"] == "not_holder"
+    bench.state = None
+    bench.lease.admit("moveTo", "agent-b", "").close()
+
+
+@pytest.mark.parametrize("state", ["running", "idle", "wandering", None])
+def test_state_outside_the_contract_is_unknown(robot: ToyRobot, state: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    leases = leases_of(robot, hardware=False)
+    monkeypatch.setattr(type(robot), "get_task_status", lambda self: {"task_status": state})
+    assert leases._moves("") is {"running": True, "idle": False}.get(str(state))
+
+
+@pytest.mark.parametrize("asked, lasts", [(2.0, 2.0), (600.0, 60.0), (0.0, 60.0)])
+def test_time_of_a_motion_bounds_the_lease_that_its_caller_holds(bench: Bench, asked: float, lasts: float) -> None:
+    held = bench.acquire(ttl_s=60.0)
+    watched: list[float | None] = []
+    bench.lease._watched = lambda lease: watched.append(lease.due)
+    bench.lease.admit("execute", "agent-a", held, asked).close()
+    assert watched == ([bench.clock.now + lasts] if asked else [])
+    bench.clock.now += lasts / 2
+    bench.lease.renew(held)
+    bench.clock.now += lasts - 0.1
+    bench.lease.expire()
+    assert bench.body.halts == []
+    bench.clock.now += 0.1
+    bench.lease.expire()
+    assert len(bench.body.halts) == 1
+
+
+def test_second_motion_bounds_the_time_of_the_first(bench: Bench) -> None:
+    bench.lease.admit("execute", "agent-a", SECRET, 60.0).close()
+    bench.body.moves = True
+    bench.lease.admit("execute", "agent-a", SECRET, 2.0).close()
+    bench.clock.now += 2.0
+    bench.lease.expire()
+    assert len(bench.body.halts) == 1
+
+
+def test_name_of_a_caller_with_a_secret_does_not_stand_for_it(bench: Bench) -> None:
+    bench.lease.admit("execute", "agent-a", SECRET, 5.0).close()
+    bench.body.moves = True
+    assert refused(bench, "agent-a")["code"] == "not_holder"
+    with pytest.raises(NotHolderError):
+        bench.lease.refuse_others("reset", "agent-a", "")
+    with pytest.raises(NotHolderError):
+        bench.lease.acquire("agent-a", "agent", 60.0)
+    bench.lease.refuse_others("reset", "agent-a", SECRET)
+    assert bench.lease.acquire("agent-a", "agent", 60.0, SECRET)["status"] == "success"

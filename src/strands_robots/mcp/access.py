@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,8 +41,10 @@ class PictureFiles:
 
     def show(self, jpeg: bytes) -> str:
         """Write a picture; return its address."""
-        path = Path(tempfile.mkstemp(suffix=".jpg", dir=self._folder.name)[1])
-        path.write_bytes(jpeg)
+        descriptor, name = tempfile.mkstemp(suffix=".jpg", dir=self._folder.name)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(jpeg)
+        path = Path(name)
         self._files.append(path)
         while len(self._files) > self.KEPT:
             self._files.pop(0).unlink(missing_ok=True)

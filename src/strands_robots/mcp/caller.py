@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -17,6 +18,7 @@ from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import RUNNING
 from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
@@ -75,6 +77,7 @@ class Caller:
         self._first: dict[str, str] = {}
         self._moving: set[_Halting] = set()
         self._secrets: dict[str, str] = {}
+        self._binding: set[tuple[str, str]] = set()
         self._used_at = time.monotonic()
         # An emergency stop is never behind another call.
         self._urgent = ThreadPoolExecutor(1, "mcp-estop")
@@ -98,7 +101,8 @@ class Caller:
         target = await self._target(robot, params)
         if not wait and not self._holds(target):
             return _needs_lease()
-        arguments = {**params, "wait": wait, **self._for_motion(target)}
+        lease = await self._for_motion(target, verb)
+        arguments = {**params, "wait": wait, **lease}
 
         async def to_the_end(motion: _Halting) -> Envelope:
             answer = await motion.begin(verb, arguments, ANSWER_S + WAIT_S)
@@ -107,16 +111,17 @@ class Caller:
                 answer = await self._followed(robot, "wait", task, ANSWER_S + WAIT_S)
             return answer
 
-        return await self._halting(target, to_the_end)
+        return await self._halting(target, lease, to_the_end)
 
     async def run_policy(self, robot: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
         """Run a policy, to its end with ``wait``; halted and refused as :meth:`move`."""
         target = await self._target(robot, params)
         if not wait and not self._holds(target):
             return _needs_lease()
+        lease = await self._for_motion(target, "execute")
 
         async def to_the_end(motion: _Halting) -> Envelope:
-            answer = await motion.begin("execute", {**params, **self._for_motion(target)}, ANSWER_S)
+            answer = await motion.begin("execute", {**params, **lease}, ANSWER_S)
             one = str(answer.get("robot_name") or params.get("robot_name") or "")
             while wait and not is_error(answer):
                 await asyncio.sleep(POLL_S)
@@ -125,7 +130,7 @@ class Caller:
                     break
             return answer
 
-        return await self._halting(target, to_the_end)
+        return await self._halting(target, lease, to_the_end)
 
     async def acquire(self, robot: str, ttl_s: float, robot_name: str) -> Envelope:
         """Acquire the control lease; motions of this client carry it from then on.
@@ -140,7 +145,10 @@ class Caller:
         target = await self._target(robot, {"robot_name": robot_name}, leased=True)
         at_robot = min(lasts, SILENCE_S)
         params = {"kind": "agent", "ttl_s": at_robot, **({"robot_name": robot_name} if robot_name else {})}
-        answer = await self.read(robot, "acquireControl", {**params, **self._lease(target)})
+        # While a motion of its own runs, the secret of that motion says that the robot is this client's.
+        moves = any(each.target[0] == robot for each in self._moving)
+        own = self._lease(target) or ({LEASE_ID: self._secret(robot)} if moves else {})
+        answer = await self.read(robot, "acquireControl", {**params, **own})
         lease_id = answer.get(LEASE_ID)
         # The secret stays here: a model has no use for it.
         told = {name: value for name, value in answer.items() if name != LEASE_ID}
@@ -196,9 +204,11 @@ class Caller:
         """Keep a motion among those that :meth:`leave` halts."""
         (self._moving.discard if ended else self._moving.add)(motion)
 
-    async def _halting(self, target: Target, work: Callable[[_Halting], Awaitable[Envelope]]) -> Envelope:
+    async def _halting(
+        self, target: Target, lease: Mapping[str, Any], work: Callable[[_Halting], Awaitable[Envelope]]
+    ) -> Envelope:
         halting = _Halting(self, target)
-        renewing = None if target in self._leases else asyncio.ensure_future(self._renew_motion(target))
+        renewing = asyncio.ensure_future(self._renew_motion(target)) if LEASE_TTL_S in lease else None
         try:
             async with halting as motion:
                 return await work(motion)
@@ -269,9 +279,29 @@ class Caller:
         held = self._leases.get(target)
         return {} if held is None else {LEASE_ID: held.lease_id}
 
-    def _for_motion(self, target: Target) -> dict[str, Any]:
-        """Return the held lease, else one for this motion alone."""
-        return self._lease(target) or {LEASE_ID: self._secret(target[0]), LEASE_TTL_S: SILENCE_S}
+    async def _for_motion(self, target: Target, verb: str) -> dict[str, Any]:
+        """Return the held lease, or one for this motion where the robot knows such."""
+        held = self._lease(target)
+        if held or not await self._binds(target[0], verb):
+            return held
+        return {LEASE_ID: self._secret(target[0]), LEASE_TTL_S: SILENCE_S}
+
+    async def _binds(self, robot: str, verb: str) -> bool:
+        """Return whether a robot's verb is published to take a motion's lease.
+
+        True where the robot does not answer.
+        """
+        if (robot, verb) in self._binding:
+            return True
+        description = await self.read(robot, "requestRegistration")
+        if is_error(description):
+            return True
+        functions = Peer.of(description).functions
+        published = next((each.get("parameters") for each in functions if each.get("name") == verb), None)
+        if LEASE_TTL_S not in json.dumps(published):
+            return False
+        self._binding.add((robot, verb))
+        return True
 
     def _secret(self, robot: str) -> str:
         return self._secrets.setdefault(robot, secrets.token_hex(16))

@@ -106,6 +106,7 @@ class InputReceiver:
         self._session: str | None = None
         self._opened = self._ended = self._moved = 0.0
         self._holds = False
+        self._holding: threading.Thread | None = None
         self._closed = threading.Event()
         self._sequence = -1
         self._last: dict[str, tuple[float, float]] = {}
@@ -224,7 +225,11 @@ class InputReceiver:
             return "the mesh is not running"
         self._moved, self._holds, self._closed = 0.0, False, threading.Event()
         watch = partial(self._watch, self._closed)
-        threading.Thread(target=watch, name=f"mesh-watch-{self._device}", daemon=True).start()
+        try:
+            threading.Thread(target=watch, name=f"mesh-watch-{self._device}", daemon=True).start()
+        except RuntimeError as exc:
+            self.close()
+            return f"nothing would watch for the leader's silence: {exc}"
         return None
 
     def _watch(self, closed: threading.Event) -> None:
@@ -234,14 +239,24 @@ class InputReceiver:
             if not self._moved or silent < HOLD_S:
                 continue
             if silent >= LOST_S:
-                logger.warning("%s: the leader is silent; the stream is closed.", self.topic)
-                self._mesh.record("input_stream_lost", self._source, device=self._device, silent_s=round(silent, 2))
-                self.close()
+                self._lose(silent)
                 return
-            if not self._holds:
+            if not self._holds and (self._holding is None or not self._holding.is_alive()):
                 self._holds = True
                 # It waits for the bus, which a write may block; the stream of a lost leader is closed all the same.
-                threading.Thread(target=self._hold, name=f"mesh-hold-{self._device}", daemon=True).start()
+                self._holding = threading.Thread(target=self._hold, name=f"mesh-hold-{self._device}", daemon=True)
+                try:
+                    self._holding.start()
+                except RuntimeError:
+                    logger.critical("%s: the system has no thread for the hold.", self.topic, exc_info=True)
+                    self._lose(silent)
+                    self._hold()
+                    return
+
+    def _lose(self, silent: float) -> None:
+        logger.warning("%s: the leader is silent; the stream is closed.", self.topic)
+        self._mesh.record("input_stream_lost", self._source, device=self._device, silent_s=round(silent, 2))
+        self.close()
 
     def _hold(self) -> None:
         body = getattr(self._robot, "body", None)

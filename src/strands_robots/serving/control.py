@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
-from strands_robots.contract import RUNNING, Robot, WorldRobot, body_of
+from strands_robots.contract import AT_REST, RUNNING, Robot, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
@@ -215,7 +215,8 @@ class ControlLease:
     Args:
         robot: its name in messages.
         halt: stops what the robot does, without a lockout.
-        moving: whether it moves now; asked only while the lease of one motion is in the way, and under no lock.
+        moving: whether it moves now, None where its state is unknown; asked only while the lease of one motion is in
+            the way, and under no lock.
         led_by: the leader at the robot's own machine that drives it, empty without one.
         hardware: False for a simulation, which a human may take without a key where none is configured.
         clock: monotonic seconds.
@@ -227,7 +228,7 @@ class ControlLease:
         self,
         robot: str,
         halt: Callable[[str], object],
-        moving: Callable[[], bool],
+        moving: Callable[[], bool | None],
         *,
         led_by: Callable[[], str] = lambda: "",
         hardware: bool = True,
@@ -292,8 +293,7 @@ class ControlLease:
             raise NotHolderError(text, "not_holder", holder=leader, kind=HUMAN)
         with self._changing:
             lease = self._lease
-            own = lease is not None and (_is(lease, lease_id) or (lease.one_motion and lease.holder == holder))
-            if lease is not None and not own:
+            if lease is not None and not _owns(lease, holder, lease_id):
                 raise self._not_holder("acquireControl", lease)
             return self._give(holder, kind, ttl_s, "acquired")
 
@@ -349,7 +349,7 @@ class ControlLease:
 
         Args:
             ttl_s: on a free robot ``lease_id`` is a secret of the caller's own, and the motion is halted so long after
-                the last renewal; 0 for a motion that needs none.
+                the last renewal; 0 for a motion that needs none. A held lease lasts no longer than that from then on.
 
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
@@ -360,9 +360,9 @@ class ControlLease:
             if lease is None and (ttl_s or not lease_id):
                 self._hold_for_motion(holder, HUMAN if verb == FOLLOW else AGENT, lease_id, ttl_s)
             elif lease_id:
-                if not self._used(verb, lease_id).one_motion:
+                if not self._used(verb, lease_id, ttl_s).one_motion:
                     return Admission()
-            elif lease is not None and not (lease.one_motion and lease.holder == holder):
+            elif lease is not None and not _owns(lease, holder):
                 raise self._not_holder(verb, lease)
             return Admission(self._starting)
 
@@ -383,8 +383,7 @@ class ControlLease:
         self._settle()
         with self._changing:
             lease = self._lease
-            own = lease is None or _is(lease, lease_id) or (lease.one_motion and lease.holder == _name(caller))
-            if lease is not None and not own:
+            if lease is not None and not _owns(lease, _name(caller), lease_id):
                 raise self._not_holder(verb, lease)
 
     def expire(self) -> None:
@@ -392,7 +391,8 @@ class ControlLease:
         lease = self._lease
         if lease is None or lease.until is None or self._clock() < lease.until:
             return
-        moves = not lease.one_motion or bool(self._starting) or self._moving()
+        # An unknown state is no rest: what cannot be read is halted.
+        moves = not lease.one_motion or bool(self._starting) or self._activity() is not False
         with self._changing:
             if self._lease is not lease:  # renewed or given to another meanwhile
                 return
@@ -400,14 +400,24 @@ class ControlLease:
         if not moves:
             return
         logger.warning("%s: the control lease of %s is over; what it moved is halted.", self._robot, lease.holder)
-        self._halt(f"the control lease of {lease.holder} is over")
-        self._tell("expired", lease)
+        try:
+            self._halt(f"the control lease of {lease.holder} is over")
+        finally:
+            self._tell("expired", lease)
+
+    def _activity(self) -> bool | None:
+        """Return whether it moves, None if unknown; an error counts as motion."""
+        try:
+            return self._moving()
+        except Exception:
+            logger.exception("%s: its state could not be read, so it counts as moving.", self._robot)
+            return True
 
     def _settle(self) -> None:
         """End a lease that is over, by its time or with its motion."""
         self.expire()
         lease = self._lease
-        if lease is None or not lease.one_motion or self._starting or self._moving():
+        if lease is None or not lease.one_motion or self._starting or self._activity():
             return
         with self._changing:
             if self._lease is lease and not self._starting:
@@ -426,11 +436,14 @@ class ControlLease:
             expires_in_s=ttl_s,
         )
 
-    def _used(self, verb: str, lease_id: str) -> Lease:
+    def _used(self, verb: str, lease_id: str, at_most_s: float = 0.0) -> Lease:
         lease = self._lease
         if lease is not None and _is(lease, lease_id):
             if lease.ttl_s is not None:
-                lease = self._lease = replace(lease, until=self._clock() + lease.ttl_s)
+                ttl_s = min(lease.ttl_s, at_most_s or lease.ttl_s)
+                lease = self._lease = replace(lease, ttl_s=ttl_s, until=self._clock() + ttl_s)
+                if at_most_s:
+                    self._watched(self)  # which may wait for a later moment
             return lease
         taker = self._displaced.get(lease_id)
         if taker is not None:
@@ -586,7 +599,7 @@ class ControlLeases:
         led = getattr(body_of(robot), "teleoperated_by", None)
         return str(led(name or getattr(robot, "tool_name_str", ""))) if callable(led) else ""
 
-    def _moves(self, name: str) -> bool:
+    def _moves(self, name: str) -> bool | None:
         if any(each.leading() for each in self._streams_of(name)):
             return True
         robot = self._robot()
@@ -594,7 +607,10 @@ class ControlLeases:
             return any(row.get("robot") == name for row in robot.list_policies_running())
         # A robot whose motions are gestures has no task; its motion ends the lease with the call that began it.
         status = getattr(robot, "get_task_status", None)
-        return callable(status) and str(status().get("task_status", "")).lower() in RUNNING
+        if not callable(status):
+            return False
+        state = str(status().get("task_status", "")).lower()
+        return state in RUNNING if state in RUNNING | AT_REST else None
 
     def _halt(self, name: str, reason: str) -> None:
         for each in self._streams_of(name):
@@ -655,6 +671,11 @@ class _Strong(ControlLeases):
 
 def _name(caller: object) -> str:
     return caller_name(caller) or ANONYMOUS
+
+
+def _owns(lease: Lease, holder: str, lease_id: str = "") -> bool:
+    """Return whether it is the caller's: a name is enough where it has no secret."""
+    return _is(lease, lease_id) or (lease.one_motion and lease.ttl_s is None and lease.holder == holder)
 
 
 def _is(lease: Lease, lease_id: str) -> bool:

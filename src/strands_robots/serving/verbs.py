@@ -87,7 +87,7 @@ _LEASE_TTL = Parameter(
     LEASE_TTL_S,
     float,
     f"Seconds without renewControl after which this motion is halted, {TTL_MIN_S:g} to {TTL_MAX_S:g}, 0 for never; "
-    "lease_id is then a secret of your own",
+    "lease_id is then a secret of your own; a lease that you hold lasts no longer than that from then on",
     _motion_ttl,
     default=0.0,
 )
