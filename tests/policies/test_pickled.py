@@ -142,6 +142,8 @@ STRANGE = {
     "items of a list that is in itself": b"\x80\x02]q\x00h\x00a.",
     "a list of lists that grows twice at each step": b"\x80\x02" + b"]q\x00" + b"(h\x00h\x00l" * 40 + b".",
     "a key that is a tuple": b"\x80\x02}))s.",
+    "a name of tuples": b"\x80\x04" + (b")" + b"q\x00h\x00\x86" * 60) + b"\x8c\x01x\x93.",
+    "a class of tuples": b"\x80\x04\x8c\x01x" + (b")" + b"q\x00h\x00\x86" * 60) + b"\x93.",
     "the deepest list": b"\x80\x02" + b"]" * 200_000 + b"a" * 199_999 + b".",
     "a pickle without an end": pickle.dumps(list(range(100)))[:-1],
 }
@@ -154,7 +156,7 @@ def test_a_strange_pickle_is_refused(what: str) -> None:
 
 
 def test_an_answer_of_endless_operations_is_given_up() -> None:
-    with pytest.raises(UnreadablePickleError, match="more than 500000 operations"):
+    with pytest.raises(UnreadablePickleError, match="more than 500000 operations and numbers"):
         read_actions(b"\x80\x02" + b"N" * 600_000 + b".")
 
 
@@ -196,6 +198,65 @@ def test_bytes_that_stand_for_many_tensors_are_counted_each_time() -> None:
 def test_what_is_no_flat_tensor_of_floats_is_refused_by_name(data: bytes, words: str) -> None:
     with pytest.raises(UnreadablePickleError, match=words):
         read_actions(data)
+
+
+TUPLES = b")" + b"q\x00h\x00\x86" * 60
+"""A tuple of twice the tuple before, sixty deep: to compare two of them, or to write one, takes 2**60 steps."""
+ITSELF = b"]q\x00h\x00a"
+"""A list that is in itself."""
+
+
+def pieces() -> list[bytes]:
+    """The five pickles of a tensor's file, and its numbers."""
+    system = {"protocol_version": 1001, "little_endian": True}
+    storage = Storage([1.0, 2.0, 3.0])
+    made = [wired(each, 2) for each in (0x1950A86A20F9469CFC6C, 1001, system, storage, ["94"])]
+    return [*made, struct.pack("<q3f", 3, 1.0, 2.0, 3.0)]
+
+
+def in_file(made: list[bytes]) -> bytes:
+    return action(Tensor(StorageBytes(b"".join(made)), 0, (3,)))
+
+
+@pytest.mark.parametrize("inner", [TUPLES, ITSELF], ids=["tuples", "a list in itself"])
+def test_parts_of_a_tensors_file_that_never_end_to_compare_are_refused_uncompared(inner: bytes) -> None:
+    assert read_actions(in_file(pieces()))
+    whole = b"\x80\x02" + inner + b"."
+    keys = b"\x80\x02]" + inner + b"a."
+    with_key = pieces()[3].replace(b"X\x02\x00\x00\x0094", inner)
+    with_word = pieces()[3].replace(b"X\x07\x00\x00\x00storage", inner)
+    assert inner in with_key
+    assert inner in with_word
+    for changed in (
+        {0: whole},
+        {1: whole},
+        {3: with_word},
+        {3: with_key},
+        {4: whole},
+        {4: keys},
+        {3: with_key, 4: keys},
+    ):
+        made = [changed.get(index, each) for index, each in enumerate(pieces())]
+        with pytest.raises(UnreadablePickleError, match=r"another format|one storage|float32"):
+            read_actions(in_file(made))
+
+
+def test_one_action_that_stands_in_the_list_many_times_is_counted_each_time() -> None:
+    numbers = [0.0] * module.SIZE_MAX
+    one = TimedAction(0.0, 0, tensor(numbers, size=(module.SIZE_MAX,)))
+    many = wired([one] * 1000)
+    assert len(many) < 25_000
+    with pytest.raises(UnreadablePickleError, match="more than 500000 operations and numbers"):
+        read_actions(many)
+    assert len(read_actions(wired([one] * 100))) == 100
+
+
+def test_a_tensors_file_holds_no_bytes_before_its_numbers() -> None:
+    more = pickle.dumps(b"x" * module.HEADER_MAX, 3)
+    made = pieces()
+    for changed in ({2: more}, {3: made[3].replace(b"Nt", more[2:-1] + b"t")}):
+        with pytest.raises(UnreadablePickleError, match=r"malformed|cut off"):
+            read_actions(in_file([changed.get(index, each) for index, each in enumerate(made)]))
 
 
 def test_a_file_that_says_more_than_it_has_is_refused() -> None:

@@ -9,6 +9,7 @@ reading. ``pickle.loads`` is never used. Format: ``pickletools`` of the standard
 from __future__ import annotations
 
 import io
+import itertools
 import pickle
 import pickletools
 import struct
@@ -25,7 +26,10 @@ SIZE_MAX = 4096
 """Most numbers of one action."""
 
 OPERATIONS_MAX = 500_000
-"""Most operations of one answer; a chunk of a hundred actions has about ten thousand."""
+"""Most operations and numbers of one answer; a chunk of a hundred actions has about ten thousand operations."""
+
+HEADER_MAX = 4096
+"""Longest part of a tensor's file before its numbers, in bytes; torch writes about 400."""
 
 _TENSOR, _STORAGE, _ORDERED = (
     "torch._utils._rebuild_tensor_v2",
@@ -112,7 +116,7 @@ def _read(stream: BinaryIO, operations: Iterator[int]) -> Any:
     except UnreadablePickleError:
         raise
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, RecursionError) as exc:
-        raise UnreadablePickleError(f"it is malformed: {type(exc).__name__}: {exc}") from None
+        raise UnreadablePickleError(f"it is malformed: {type(exc).__name__}: {exc!s:.200}") from None
     raise UnreadablePickleError("it is cut off")
 
 
@@ -127,7 +131,7 @@ class _Reader:
 
     def take(self, name: str, argument: Any) -> None:
         if next(self._operations, None) is None:
-            raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX} operations")
+            raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX} operations and numbers")
         if name in _IGNORED:
             return
         if name in _VALUES:
@@ -150,6 +154,9 @@ class _Reader:
 
     def name_of_stack(self) -> None:
         name, module = self._stack.pop(), self._stack.pop()
+        # The text of a tuple of tuples could take for ever to write.
+        if not (_is_text(name) and _is_text(module)):
+            raise UnreadablePickleError("a name must be text")
         self.push_name(f"{module}.{name}")
 
     def remember(self, index: int | None = None) -> None:
@@ -263,6 +270,9 @@ def _tensor(found: Any, operations: Iterator[int]) -> tuple[float, ...]:
     first, last = offset * width, (offset + size[0]) * width
     if last > len(numbers):
         raise UnreadablePickleError("a tensor has more numbers than its bytes")
+    # One action may stand in the list many times, and each time its numbers are copied.
+    if sum(1 for _ in itertools.islice(operations, size[0])) < size[0]:
+        raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX} operations and numbers")
     return struct.unpack(f"<{size[0]}{code}", numbers[first:last])
 
 
@@ -270,15 +280,19 @@ def _storage(data: Any, operations: Iterator[int]) -> tuple[tuple[str, int], mem
     """Return the kind and the bytes of the numbers in a file of torch's older format."""
     if not isinstance(data, bytes):
         raise UnreadablePickleError("a tensor must have its numbers as bytes")
-    stream = io.BytesIO(data)
+    stream = io.BytesIO(memoryview(data)[:HEADER_MAX])
     magic, version, _ = (_read(stream, operations) for _ in range(3))
-    if magic != _MAGIC or version != _VERSION:
+    if type(magic) is not int or type(version) is not int or (magic, version) != (_MAGIC, _VERSION):
         raise UnreadablePickleError("a tensor's file is of another format")
     stored, keys = _read(stream, operations), _read(stream, operations)
     parts = stored.args if isinstance(stored, PickledObject) and stored.name == "stored" else ()
     kind = parts[1].name if len(parts) >= 5 and isinstance(parts[1], PickledName) else ""
-    if kind not in _KINDS or parts[0] != "storage" or keys != [parts[2]] or not _is_count(parts[4]):
+    if kind not in _KINDS or not _is_text(parts[0]) or parts[0] != "storage" or not _is_count(parts[4]):
         raise UnreadablePickleError(f"a tensor must have float32 or float64 numbers, not {_shown(kind or parts)}")
+    # Two tuples of tuples could take for ever to compare.
+    key = parts[2]
+    if not (_is_text(key) and isinstance(keys, list) and len(keys) == 1 and _is_text(keys[0]) and keys[0] == key):
+        raise UnreadablePickleError("a tensor's file must have one storage, under its key")
     numbers = memoryview(data)[stream.tell() + 8 :]
     (count,) = struct.unpack("<q", data[stream.tell() : stream.tell() + 8].ljust(8, b"\xff"))
     if count != parts[4] or count * _KINDS[kind][1] != len(numbers):
@@ -294,6 +308,10 @@ def _tuple(value: Any) -> tuple[Any, ...]:
 
 def _flat(value: Any) -> bool:
     return isinstance(value, tuple) and len(value) == 1 and _is_count(value[0])
+
+
+def _is_text(value: Any) -> bool:
+    return type(value) is str
 
 
 def _is_count(value: Any) -> bool:
