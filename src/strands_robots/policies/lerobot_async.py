@@ -101,7 +101,9 @@ class LeRobotAsyncConnection:
             actions = read_actions(answer)
         except UnreadablePickleError as exc:
             raise PolicyServerError(f"{where} sent an unreadable answer: {exc}") from exc
-        if [each.timestep for each in actions] != list(range(step, step + len(actions))):
+        # Every client counts from 0; the server gives the first action the time of its observation.
+        steps = [each.timestep for each in actions]
+        if steps != list(range(step, step + len(steps))) or any(each.timestamp != now for each in actions[:1]):
             raise PolicyServerError(f"{where} answered another observation; it serves another client besides")
         return [each.values for each in actions]
 

@@ -26,7 +26,8 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.hardware import HardwareRobot
 from strands_robots.policies import create_policy
-from strands_robots.policies.lerobot_async import LeRobotAsyncConnection, LeRobotAsyncPolicy
+from strands_robots.policies.lerobot_async import LeRobotAsyncConnection, LeRobotAsyncPolicy, _pieces
+from strands_robots.policies.pickled import pickled
 from strands_robots.policies.policy_server import PolicyServerError
 from strands_robots.policies.profiles import CameraMap, Profile, load_profiles
 from strands_robots.utils import ValidationError
@@ -303,14 +304,15 @@ def hostile(tmp_path: Path) -> dict[str, Any]:
         "a bomb in the list": (pickle.dumps([bomb]), "which is not read"),
         "a bomb in a tensor": (wired([TimedAction(0.0, 1, inside)]), "which is not read"),
         "numbers of the wrong kind": (answered([[1, 2, 3]], 0.0, 1, LongStorage), "torch.LongStorage"),
-        "no numbers": (answered([[float("nan")] * 3], 0.0, 1), "no finite numbers"),
-        "infinite numbers": (answered([[float("inf")] * 3], 0.0, 1), "no finite numbers"),
-        "too few": (answered([[1.0, 2.0]], 0.0, 1), "shape"),
-        "different lengths": (answered([[1.0, 2.0, 3.0], [1.0, 2.0]], 0.0, 1), "different lengths"),
+        "no numbers": ([[float("nan")] * 3], "no finite numbers"),
+        "infinite numbers": ([[float("inf")] * 3], "no finite numbers"),
+        "too few": ([[1.0, 2.0]], "shape"),
+        "different lengths": ([[1.0, 2.0, 3.0], [1.0, 2.0]], "different lengths"),
         "nothing": (None, "answered no actions"),
         "an empty list": (wired([]), "different lengths, or none"),
         "garbage": (b"\x00" * 100, "unreadable answer"),
         "an answer to another": (answered(rows(), 0.0, 99), "answered another observation"),
+        "an answer to another of the same step": (answered(rows(), 10.0, 1), "answered another observation"),
         "steps out of order": (
             wired([TimedAction(0.0, step, Tensor(StorageBytes(b""), 0, (3,))) for step in (2, 1)]),
             "unreadable answer",
@@ -331,6 +333,24 @@ def test_a_hostile_answer_is_refused_by_name_and_does_nothing(
     policy.close()
     assert policy.warm() == "", "the server is asked anew before the next task"
     eventually(lambda: policy.warm() != "", what="the end of that attempt")
+
+
+def test_the_answer_to_another_clients_observation_of_the_same_step_moves_nothing(
+    stand_in: Any, made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = made(stand_in.url)
+    call = policy._connection._call
+    other = {"timestamp": 10.0, "timestep": 1, "observation": {**SEEN, "pan.pos": -90.0}, "must_go": True}
+
+    def overtaken(method: str, message: Any, *rest: Any) -> Any:
+        if method == "GetActions":
+            call("SendObservations", _pieces(pickled("TimedObservation", other)), *rest)
+        return call(method, message, *rest)
+
+    monkeypatch.setattr(policy._connection, "_call", overtaken)
+    with pytest.raises(PolicyServerError, match="answered another observation"):
+        policy.act(SEEN)
+    assert stand_in.seen[-1] == other["observation"]
 
 
 def test_an_answer_of_another_message_is_refused(stand_in: Any, made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
