@@ -14,6 +14,7 @@ from fixtures.waiting import eventually
 
 from strands_robots import audit, settings
 from strands_robots.audit import flush_audit
+from strands_robots.policies import settling
 
 # What is set in the shell that starts the tests would change what they say; how pictures are made stays as it is.
 for setting in settings.declared():
@@ -62,6 +63,19 @@ def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
 def patient_halts(monkeypatch: pytest.MonkeyPatch) -> None:
     """A halt that comes late on a busy machine is a halt; a test of the deadline sets its own."""
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
+
+
+@pytest.fixture
+def patient_settling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm that settles slowly on a busy machine settles."""
+    monkeypatch.setattr(settling, "SETTLE_S", 600.0)
+    monkeypatch.setattr(settling, "STALLED_S", 600.0)
+
+
+@pytest.fixture
+def unending_settling(patient_settling: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm settles until the test stops it again, however late that is."""
+    monkeypatch.setattr(settling, "RANGES_PER_S", 0.001)
 
 
 OURS = ("rollout-", "simulation", "device-connect", "fleet-client", "rosbridge", "rtps-bridge", "dds-", "mesh-")

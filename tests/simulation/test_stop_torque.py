@@ -21,7 +21,7 @@ from strands_robots.simulation import Simulation
 from strands_robots.simulation.body import RobotBody
 from strands_robots.utils import ValidationError
 
-pytestmark = pytest.mark.usefixtures("patient_halts")
+pytestmark = pytest.mark.usefixtures("patient_halts", "patient_settling")
 
 REST = {
     "shoulder_pan": 0.0,
@@ -46,7 +46,23 @@ def settler() -> Iterator[Simulation]:
     made = Simulation("settler", stop_level="settle", rest_pose=REST)
     assert made.add_robot("arm", "so100")["status"] == "success"
     yield made
+    made.halt("the test is over")
     made.cleanup()
+
+
+@pytest.fixture
+def written(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, float]]:
+    """What is written to a robot from now on, its settling's way as well."""
+    actions: list[dict[str, float]] = []
+    send = RobotBody.send_action
+
+    def recorded(body: RobotBody, action: Mapping[str, float], permit: Any = None) -> dict[str, float]:
+        sent = send(body, action, permit)
+        actions.append(sent)
+        return sent
+
+    monkeypatch.setattr(RobotBody, "send_action", recorded)
+    return actions
 
 
 def moved(world: Simulation, robot: str = "arm") -> Simulation:
@@ -122,19 +138,11 @@ def test_a_stop_of_one_robot_leaves_the_torque_of_the_other() -> None:
 
 
 def test_a_stop_freezes_then_goes_to_the_rest_pose_at_bounded_speed_and_goes_limp(
-    settler: Simulation, monkeypatch: pytest.MonkeyPatch
+    settler: Simulation, written: list[dict[str, float]]
 ) -> None:
-    written: list[dict[str, float]] = []
-    send = RobotBody.send_action
-
-    def recorded(body: RobotBody, action: Mapping[str, float], permit: Any = None) -> dict[str, float]:
-        sent = send(body, action, permit)
-        written.append(sent)
-        return sent
-
     moved(settler)
     frozen = joints(settler)
-    monkeypatch.setattr(RobotBody, "send_action", recorded)
+    written.clear()
     verdict = settler.halt("test")
     assert (verdict.stopped, verdict.settling) == (True, True)
     assert "is at its rest pose, and limp" in settler.wait_settled()
@@ -144,23 +152,27 @@ def test_a_stop_freezes_then_goes_to_the_rest_pose_at_bounded_speed_and_goes_lim
     assert all(abs(written[0][key] - frozen[key]) < steps[key] + NEAR for key in REST), "from where it was frozen"
     for before, after in itertools.pairwise(written):
         assert all(abs(after[key] - before[key]) <= steps[key] + 1e-9 for key in REST)
-
-
-def test_every_motion_and_every_change_of_the_world_is_refused_while_it_settles(settler: Simulation) -> None:
-    moved(settler).halt("test")
-    answers = [settler.start_policy("arm", "wave"), settler.send_action({"gripper": 1.0}), settler.reset()]
-    added = settler.add_robot("other", "so100")
-    settler.wait_settled()
-    assert all("arm settles to its rest pose" in answer["reason"] for answer in answers)
-    assert "arm, which settles" in added["reason"]
     assert settler.send_action({"gripper": 1.0})["status"] == "success", "a resumed robot takes its place back"
     assert not limp(settler)
 
 
-def test_a_second_stop_freezes_it_for_good(settler: Simulation) -> None:
+@pytest.mark.usefixtures("unending_settling")
+def test_every_motion_and_every_change_of_the_world_is_refused_while_it_settles(settler: Simulation) -> None:
     moved(settler).halt("test")
-    start = joints(settler)
-    eventually(lambda: off(settler, start) > NEAR, PATIENCE_S, "it is on its way")
+    answers = [settler.start_policy("arm", "wave"), settler.send_action({"gripper": 1.0}), settler.reset()]
+    added = settler.add_robot("other", "so100")
+    settler.halt("again")
+    settler.wait_settled()
+    assert all("arm settles to its rest pose" in answer["reason"] for answer in answers)
+    assert "arm, which settles" in added["reason"]
+
+
+@pytest.mark.usefixtures("unending_settling")
+def test_a_second_stop_freezes_it_for_good(settler: Simulation, written: list[dict[str, float]]) -> None:
+    moved(settler)
+    written.clear()
+    settler.halt("test")
+    eventually(lambda: len(written) > 10, PATIENCE_S, "it is on its way")
     again = settler.halt("again")
     assert (again.stopped, again.settling, again.halted) == (True, False, ("settling arm",))
     assert "stopped again" in settler.wait_settled()
@@ -169,6 +181,7 @@ def test_a_second_stop_freezes_it_for_good(settler: Simulation) -> None:
     assert off(settler, REST) > NEAR
 
 
+@pytest.mark.usefixtures("unending_settling")
 def test_a_stop_of_the_one_robot_freezes_it_as_well(settler: Simulation) -> None:
     moved(settler).halt("test")
     assert settler.stop_policy("arm")["stopped"] is True
@@ -176,6 +189,80 @@ def test_a_stop_of_the_one_robot_freezes_it_as_well(settler: Simulation) -> None
     assert not limp(settler)
 
 
+def test_an_arm_that_was_stopped_by_its_name_does_not_settle_at_the_next_stop_of_all(settler: Simulation) -> None:
+    assert moved(settler).stop_policy("arm")["stopped"] is True
+    assert settler.halt("test").settling is False
+    moved(settler)
+    assert settler.halt("test").settling is True, "it has moved since"
+
+
+@pytest.mark.usefixtures("unending_settling")
+def test_of_two_stops_at_once_the_later_one_alone_lets_the_arm_settle(
+    settler: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    revoke = settler.gate.revoke
+
+    def overtaken() -> int:
+        """Another stop is ordered before this one goes on."""
+        mine = revoke()
+        revoke()
+        return mine
+
+    moved(settler)
+    with monkeypatch.context() as patched:
+        patched.setattr(settler.gate, "revoke", overtaken)
+        first = settler.halt("first")
+    assert (first.stopped, first.settling) == (True, False)
+    assert settler.wait_settled() == "", "nothing has settled"
+    assert settler.halt("second").settling is True
+    assert settler.halt("third").settling is False
+    assert "stopped again" in settler.wait_settled()
+
+
+@pytest.mark.usefixtures("unending_settling")
+def test_a_stop_that_another_one_overtook_whole_says_that_the_arm_settles(
+    settler: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    revoke, later = settler.gate.revoke, list[bool]()
+
+    def overtaken() -> int:
+        mine = revoke()
+        patched.undo()
+        later.append(settler.halt("later").settling)
+        return mine
+
+    moved(settler)
+    with monkeypatch.context() as patched:
+        patched.setattr(settler.gate, "revoke", overtaken)
+        first = settler.halt("first")
+    assert (later, first.settling) == ([True], True)
+    assert settler.halt("third").settling is False
+
+
+def test_a_robot_that_joins_changes_nothing_that_a_stop_is_reading(settler: Simulation) -> None:
+    present = settler._torque._settlings
+    names = iter(present)
+    assert next(names) == "arm"
+    assert settler.add_robot("other", "so100")["status"] == "success"
+    assert list(names) == [], "a map that had changed would raise"
+    assert (list(present), list(settler._torque._settlings)) == (["arm"], ["arm", "other"])
+
+
+def test_a_stop_that_cannot_note_what_moves_voids_every_permit(
+    settler: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails() -> None:
+        raise RuntimeError("a loop cannot say what it does")
+
+    permit = settler.gate.permit("test")
+    with monkeypatch.context() as patched:
+        patched.setattr(settler, "halt_ordered", fails)
+        with pytest.raises(RuntimeError, match="cannot say"):
+            settler.halt("test")
+    assert not permit.valid
+
+
+@pytest.mark.usefixtures("unending_settling")
 def test_an_emergency_stop_settles_a_locked_robot_and_a_second_one_freezes_it(settler: Simulation) -> None:
     with own_plane(20.0) as plane:
         plane.register("settler", moved(settler))

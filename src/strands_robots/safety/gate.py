@@ -237,9 +237,10 @@ class MotionGate:
             begins()
         return permit
 
-    def revoke(self) -> None:
-        """Void every permit given so far."""
-        self._generation = next(self._numbers)
+    def revoke(self) -> int:
+        """Void every permit given so far; return the generation of this halt."""
+        mine = self._generation = next(self._numbers)
+        return mine
 
     def settling(self, generation: int) -> Permit:
         """Return leave for the motion that is a part of the halt of ``generation``.

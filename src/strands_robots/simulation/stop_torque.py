@@ -42,13 +42,15 @@ class StopTorque:
 
     def fit(self, bodies: Mapping[str, RobotBody]) -> None:
         """Make the settling of each robot that joined, and forget that of others."""
-        self._settlings = {name: each for name, each in self._settlings.items() if name in bodies}
+        # A halt may be reading the present map, so that a new one takes its place as a whole.
+        settlings = {name: each for name, each in self._settlings.items() if name in bodies}
         for name, body in bodies.items():
             pose = self._pose_of(body.parts)
-            if self._level == "settle" and pose and name not in self._settlings:
+            if self._level == "settle" and pose and name not in settlings:
                 ranges = {key: body.bounds[key] for key in pose}
                 settling = Settling(body, self._gate, pose, ranges, self._observers, clock=body.clock)
-                self._settlings[name], body.on_motion = settling, settling.note_motion
+                settlings[name], body.on_motion = settling, settling.note_motion
+        self._settlings = settlings
 
     def freeze(self, physics: Physics, clock: WorldClock) -> None:
         """Freeze every robot of a world, and let it go where the level says so."""
@@ -58,15 +60,26 @@ class StopTorque:
             clock.commanded()
 
     def freeze_one(self, body: RobotBody) -> None:
-        """Freeze one robot, also one that settles, or let it go."""
-        if body.name in self._settlings:
-            self._settlings[body.name].give_up()
+        """Freeze one robot for good, also one that settles, or let it go."""
+        settling = self._settlings.get(body.name)
+        if settling is not None:
+            settling.give_up()
+            # It has stopped: the next halt finds it at rest.
+            settling.take()
         body.hold()
         if self._level == "limp":
             body.let_go()
 
     def after(self, verdict: StopVerdict, generation: int) -> StopVerdict:
-        """Let the arms settle that moved since the last stop, if everything stopped."""
+        """Let the arms settle that moved since the last stop, if everything stopped.
+
+        Args:
+            verdict: of the halt, which has frozen every robot.
+            generation: of that halt.
+        """
+        if generation != self._gate.generation:
+            # Another stop came meanwhile: the two are one, and the later one lets the arms settle.
+            return replace(verdict, settling=bool(self.settling))
         due = [each for each in self._settlings.values() if each.take()]
         if not due or not verdict.stopped:
             return verdict

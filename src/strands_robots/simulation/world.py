@@ -466,9 +466,10 @@ class Simulation(ArmMixin, TeleopMixin):
         The gate is revoked first and the setpoints are frozen second; both take microseconds, and after them no
         action is written, whatever a policy is doing. Last it waits for the loops to end, to report whether they did.
         """
-        self.halt_ordered()
-        self.gate.revoke()
-        generation = self.gate.generation
+        try:
+            self.halt_ordered()
+        finally:
+            generation = self.gate.revoke()
         return self._torque.after(self._freeze(reason), generation)
 
     def halt_ordered(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 from fixtures.feetech_bus import MOTORS, FeetechBus
 from fixtures.waiting import eventually
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.usefixtures("patient_settling")]
 
 Arm = Callable[..., Any]
 
@@ -36,6 +36,7 @@ def test_it_goes_to_its_rest_pose_and_then_its_torque_is_off(arm: Arm, bus: Feet
     assert bus.written_after(at) == []
 
 
+@pytest.mark.usefixtures("unending_settling")
 def test_a_second_stop_freezes_it_with_torque(arm: Arm, bus: FeetechBus) -> None:
     robot = settling(arm)
     assert robot.halt("again").stopped is True
@@ -45,6 +46,7 @@ def test_a_second_stop_freezes_it_with_torque(arm: Arm, bus: FeetechBus) -> None
     assert bus.written_after(at) == []
 
 
+@pytest.mark.usefixtures("unending_settling")
 def test_a_servo_that_dies_on_the_way_leaves_the_others_held_with_torque(arm: Arm, bus: FeetechBus) -> None:
     robot = settling(arm)
     bus.servos[3].dead = True
