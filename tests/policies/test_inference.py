@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
-import sys
 import threading
 from typing import Any
 
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.policies.inference import NICENESS, InferenceResult, InferenceWorker, InlineInference
+from strands_robots.policies.inference import InferenceResult, InferenceWorker, InlineInference
 
 
 class Model:
@@ -40,19 +38,6 @@ def model() -> Model:
 @pytest.fixture
 def worker(model: Model) -> InferenceWorker:
     return InferenceWorker("pick", model.infer, model.finished.set)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a thread has a priority of its own on Linux alone")
-def test_an_inference_yields_the_processor_to_the_threads_of_control() -> None:
-    def priority(request: Any) -> int:
-        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-
-    worker = InferenceWorker("pick", priority, lambda: None)
-    worker.ask("one")
-    mine = priority("here")
-    assert answered(worker).value == min(19, mine + NICENESS)
-    assert priority("here") == mine
-    worker.close()
 
 
 def answered(worker: InferenceWorker) -> InferenceResult:

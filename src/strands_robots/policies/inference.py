@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import queue
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -14,9 +11,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 logger = logging.getLogger(__name__)
-
-NICENESS = 5
-"""Steps by which an inference yields the processor to control loops and stops; it never takes more than its own."""
 
 Infer = Callable[[Any], Any]
 """Computes the answer to one request; may take long, and may raise."""
@@ -106,7 +100,6 @@ class InferenceWorker:
         self._requests.put(None)
 
     def _run(self) -> None:
-        _yield_processor()
         try:
             while (request := self._requests.get()) is not None and not self._closed:
                 began = self._asked_at if self._asked_at is not None else self._now()
@@ -118,17 +111,6 @@ class InferenceWorker:
                 self._answers.put(InferenceResult(value, failure, self._now() - began))
         finally:
             self._finish()
-
-
-def _yield_processor() -> None:
-    """Lower the priority of this thread, and of those that it starts to compute."""
-    # Elsewhere a priority is that of the whole process.
-    if sys.platform == "linux":
-        thread = threading.get_native_id()
-        niceness = min(19, os.getpriority(os.PRIO_PROCESS, thread) + NICENESS)
-        # A sandbox may forbid it; the inference then competes with the loop as any other thread.
-        with contextlib.suppress(PermissionError):
-            os.setpriority(os.PRIO_PROCESS, thread, niceness)
 
 
 class InlineInference:
