@@ -40,6 +40,9 @@ MESSAGES_MAX = 8
 LEFT_S = 1.0
 """Seconds without a request after a client closed its standing stream; then it has gone away."""
 
+KEEPALIVE = {"TCP_KEEPIDLE": 2, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3, "TCP_USER_TIMEOUT": 5000}
+"""Options of a connection: its client's machine is gone after 5 s without a sign."""
+
 SHUTDOWN_S = 1
 CONNECTING_MAX = 4
 
@@ -301,7 +304,6 @@ async def serve_http(
         timeout_graceful_shutdown=SHUTDOWN_S,
         timeout_keep_alive=60,
     )
-    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
     loop = asyncio.get_running_loop()
     leaving: list[asyncio.Future[None]] = []
     server = _Server(config)
@@ -309,10 +311,24 @@ async def serve_http(
     for each in (signal.SIGTERM, signal.SIGINT):
         # uvicorn raises a signal again at its end; the robots are halted first, and then the process ends by itself.
         signal.signal(each, lambda *_: None)
-    with socket.create_server((address.host, address.port), family=family) as listening:
+    with listener(address.host, address.port) as listening:
         async with app.running():
             ready(address.url)
             await server.serve(sockets=[listening])
+
+
+def listener(host: str, port: int) -> socket.socket:
+    """Return a listening socket that notices when a client's machine is gone.
+
+    Its client counts as present until then, so its leases are renewed.
+    """
+    listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in KEEPALIVE.items():
+        option = getattr(socket, name, None)  # the names differ among systems
+        if option is not None:
+            listening.setsockopt(socket.IPPROTO_TCP, option, value)
+    return listening
 
 
 def _access_of(context: Any) -> ClientAccess:
