@@ -201,6 +201,82 @@ def test_robots_that_beat_are_asked_in_turn_and_all_others_at_each_look(monkeypa
     assert fleet.due(names) == names, "after a stop each is asked"
 
 
+class Turning:
+    """A monotonic clock that the test turns."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        """Return its seconds."""
+        return self.now
+
+
+def calm_fleet(monkeypatch: pytest.MonkeyPatch, robots: int) -> tuple[FleetScreen, Turning, list[str]]:
+    """Return a screen of robots that have answered, beat, and are asked three at a look."""
+    clock, fake = Turning(), FakeController()
+    monkeypatch.setattr(safety_controller, "time", clock)
+    monkeypatch.setattr(safety_controller, "ASKED_MOST", 3)
+    names = [f"arm-{number}" for number in range(robots)]
+    fleet = FleetScreen(fake, loopback_config(), None)  # type: ignore[arg-type]
+    fleet.take_beats(dict.fromkeys(names, 1e9))
+    assert fleet.due(names) == names
+    fleet.update([LockoutReport(name, at=clock.now) for name in names])
+    return fleet, clock, names
+
+
+def test_robots_that_beat_and_do_not_answer_take_no_turn_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet, clock, names = calm_fleet(monkeypatch, 9)
+    asked: list[str] = []
+    for _look in range(6):
+        clock.now += 1.0
+        due = fleet.due(names)
+        asked += due
+        answers = [LockoutReport(name, at=clock.now) for name in due if name not in names[:3]]
+        fleet.update(answers + [LockoutReport(name, problem="no answer") for name in due if name in names[:3]])
+    assert sorted(asked) == sorted(names * 2), "each is asked once in three looks"
+
+
+def test_robots_that_do_not_answer_a_stop_take_their_turn_again_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet, clock, names = calm_fleet(monkeypatch, 9)
+    fleet.expected()
+    clock.now += safety_controller.GONE_S + 1.0
+    assert fleet.due(names) == names
+    clock.now += 1.0
+    assert len(fleet.due(names)) == 3
+
+
+@pytest.mark.parametrize("lockouts", [(Lockout("e" * 32, "desk-1", "a hand", 0.0),), ()])
+def test_all_robots_are_asked_after_one_was_stopped_or_resumed_by_another(
+    lockouts: tuple[Lockout, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet, clock, names = calm_fleet(monkeypatch, 9)
+    before = () if lockouts else (Lockout("e" * 32, "desk-1", "a hand", 0.0),)
+    fleet.update([LockoutReport("arm-4", before, at=clock.now)])
+    clock.now += 60.0
+    fleet.due(names)
+    clock.now += 1.0
+    assert len(fleet.due(names)) == 3
+    fleet.update([LockoutReport("arm-4", lockouts, at=clock.now)])
+    clock.now += 1.0
+    assert fleet.due(names) == names
+
+
+def test_age_of_a_lockouts_report_is_shown_beside_a_fresh_beat(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet, clock, _ = calm_fleet(monkeypatch, 1)
+    fake: Any = FakeController()
+    button = StopButton(fake, lambda: (), "")
+    assert "s ago" not in drawn(fleet, button).replace("0 s ago", "")
+    clock.now += 7.0
+    fleet.take_beats({"arm-0": clock.now})
+    assert "free, 7 s ago" in drawn(fleet, button)
+    assert "NO ANSWER" not in drawn(fleet, button)
+    fleet.update([LockoutReport("arm-0", problem="no answer")])
+    assert "beats, NO ANSWER for 7 s" in drawn(fleet, button)
+    fleet.update([LockoutReport("arm-0", at=clock.now)])
+    assert "NO ANSWER" not in drawn(fleet, button)
+
+
 def test_a_robot_that_beats_is_not_gone_though_its_status_is_old() -> None:
     fake: Any = FakeController()
     fleet, button = FleetScreen(fake, loopback_config(), None), StopButton(fake, lambda: (), "")

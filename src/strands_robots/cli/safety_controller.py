@@ -246,14 +246,16 @@ class FleetScreen:
         self._controller, self._link, self._check_in_s = controller, link, check_in_s
         self._robots: dict[str, LockoutReport] = {}
         self._beats: dict[str, float] = {}
-        self._pressed_at = float("-inf")
+        self._asked: dict[str, float] = {}
+        self._unanswered: set[str] = set()
+        self._all_since = float("-inf")
         self._problem = "Looking for robots..."
         self._closed = threading.Event()
 
     def expected(self) -> Collection[str]:
         """Return the robots that must answer a stop: seen and not forgotten."""
         # A stop asks for them: what each reports of itself is read anew.
-        self._pressed_at = time.monotonic()
+        self._all_since = time.monotonic()
         return tuple(self._robots)
 
     def forget(self) -> None:
@@ -299,18 +301,23 @@ class FleetScreen:
     def due(self, names: Collection[str]) -> list[str]:
         """Return the robots to ask now.
 
-        All that are new, that have no fresh beat, or that were not asked since the last stop; of the others in turn.
+        All that are new, that have no fresh beat, or that were not asked since the last stop or the last change of a
+        lockout; of the others those asked longest ago.
         """
         now, reports = time.monotonic(), self._robots
+        asked = {name: self._asked.get(name, reports[name].at) for name in names if name in reports}
         calm = [
             name
             for name in names
             if name in reports
-            and reports[name].at > self._pressed_at + GONE_S
+            and asked[name] > self._all_since + GONE_S
             and now - self._beats.get(name, float("-inf")) < BEAT_FRESH_S
         ]
-        in_turn = sorted(calm, key=lambda name: reports[name].at)[:ASKED_MOST]
-        return sorted({*names} - {*calm} | {*in_turn})
+        # By the question and not by the answer: those that no longer answer would take the turns of all others.
+        in_turn = sorted(calm, key=lambda name: asked[name])[:ASKED_MOST]
+        chosen = sorted({*names} - {*calm} | {*in_turn})
+        self._asked = asked | dict.fromkeys(chosen, now)
+        return chosen
 
     def _seen_at(self, last: LockoutReport) -> float:
         return max(last.at, self._beats.get(last.name, last.at))
@@ -318,7 +325,16 @@ class FleetScreen:
     def update(self, reports: Sequence[LockoutReport]) -> None:
         """Take the robots' reports; a robot that did not answer keeps its last one."""
         robots = dict(self._robots)
-        robots |= {each.name: each for each in reports if not each.problem}
+        for each in reports:
+            if each.problem:
+                self._unanswered = {*self._unanswered, each.name}
+                continue
+            last = robots.get(each.name)
+            if last is not None and _epochs(last) != _epochs(each):
+                # Another controller stops or resumes robots: what the others reported may be old as well.
+                self._all_since = time.monotonic()
+            robots[each.name] = each
+            self._unanswered = self._unanswered - {each.name}
         # The screen and the space bar may be reading the old dictionary, so it is replaced and not changed.
         self._robots = robots
         alarms = [f"{each.name}: {each.problem}." for each in reports if "ALARM" in each.problem]
@@ -333,7 +349,8 @@ class FleetScreen:
         answers = button.progress.answered if button.progress is not None else {}
         columns = ("robot", "lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
         robots = sorted(self._robots.items())
-        rows = (_row(name, last, self._seen_at(last), answers.get(name)) for name, last in robots)
+        silent = self._unanswered
+        rows = (_row(name, last, self._seen_at(last), name in silent, answers.get(name)) for name, last in robots)
         return Group(
             label(head, "bold green" if up else "bold white on red"),
             label("SPACE stops everything    f forgets robots that are gone    q quits", "bold"),
@@ -344,16 +361,25 @@ class FleetScreen:
         )
 
 
-def _row(name: str, last: LockoutReport, seen_at: float, answer: Answer | None) -> tuple[Any, ...]:
-    age, lockouts, trip_ms = time.monotonic() - seen_at, last.lockouts, last.round_trip_ms
+def _epochs(report: LockoutReport) -> set[str]:
+    return {each.epoch for each in report.lockouts}
+
+
+def _row(name: str, last: LockoutReport, seen_at: float, unanswered: bool, answer: Answer | None) -> tuple[Any, ...]:
+    now, lockouts, trip_ms = time.monotonic(), last.lockouts, last.round_trip_ms
+    age, report_age = now - seen_at, now - last.at
     locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
+    old = f", {report_age:.0f} s ago" if report_age > BEAT_FRESH_S else ""
+    seen = f"GONE, {age:.0f} s"
+    if age < GONE_S:
+        seen = f"beats, NO ANSWER for {report_age:.0f} s" if unanswered and old else f"{age:.0f} s ago"
     return (
         name,
-        label(locked, "bold red") if lockouts else label("free"),
+        label(locked + old, "bold red") if lockouts else label("free" + old),
         f"{utc(lockouts[0].at)} {lockouts[0].source} {lockouts[0].reason}" if lockouts else "",
         _stop_cell(answer),
         label(f"{trip_ms:.1f} ms", "red" if trip_ms > SLOW_MS else ""),
-        label(f"{age:.0f} s ago" if age < GONE_S else f"GONE, {age:.0f} s", "" if age < GONE_S else "bold red"),
+        label(seen, "" if seen.endswith("ago") else "bold red"),
         _check_in_cell(last.facts.get("check_in")),
     )
 
