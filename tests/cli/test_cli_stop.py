@@ -2,19 +2,24 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Collection
+import threading
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
+from click.testing import Result
+from device_connect_edge.messaging import MessagingError
 from tests.cli.conftest import FakeFleet, Run
 
+from strands_robots import device_connect
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Screen
-from strands_robots.cli.stop import exit_code, progress_rows, report_rows, show_resume, summary
+from strands_robots.cli.stop import RunningStop, exit_code, progress_rows, report_rows, show_resume, summary
 from strands_robots.device_connect import safety_controller
-from strands_robots.device_connect.discovery import Peer
+from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.discovery import Peer, RegistryError
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
@@ -195,3 +200,110 @@ def test_without_an_operators_key_the_line_that_makes_it_is_printed(
     then, at_the_robot = printed_commands(capsys, "")
     assert at_the_robot == here, "robots may not know that key yet"
     assert then == f"strands-robots resume --key {state}/operator.pem"
+
+
+class Lookup:
+    """A fleet whose tries to look robots up end as ``tries`` say: with robots, or with an error."""
+
+    def __init__(self, *tries: list[str] | Exception, stale: str = "") -> None:
+        self.tries, self.stale = list(tries), stale
+        self.failed, self.left = threading.Event(), threading.Event()
+
+    def __call__(self, link: object) -> Lookup:
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.left.set()
+
+    def peers(self, timeout: float, *, thorough: bool) -> list[Peer]:
+        outcome = self.tries.pop(0)
+        if isinstance(outcome, Exception):
+            if not self.tries:
+                self.failed.set()
+            raise outcome
+        return [Peer(name, functions=({"name": "stop"},)) for name in outcome]
+
+
+class LookingController(FakeController):
+    """A stop that ends once its robots were named, or with the event ``until``."""
+
+    def __init__(self, stop_report: StopReport, until: threading.Event | None = None, *, over: bool = False) -> None:
+        super().__init__(stop_report)
+        self.named: list[set[str]] = []
+        self._over, self._until = over, until or threading.Event()
+
+    def stop(self, expected: Collection[str], reason: str, **more: Any) -> StopReport:
+        more["on_progress"](Progress(more["estop_id"], self.report.answered, (), True, 1.0))
+        assert self._over or self._until.wait(20)
+        return super().stop(expected, reason)
+
+    def expect(self, estop_id: str, names: Collection[str]) -> bool:
+        self.named.append(set(names))
+        self._until.set()
+        return not self._over
+
+
+@pytest.fixture
+def estop(run: Run, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    def one(lookup: Lookup, controller: FakeController, *arguments: str) -> Result:
+        monkeypatch.setattr(device_connect, "FleetClient", lookup)
+        monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: controller)
+        return run("estop", *arguments)
+
+    return one
+
+
+@pytest.mark.parametrize("kind", [RegistryError, MessagingError, TimeoutError, OSError, ValueError])
+@pytest.mark.parametrize("moving", [False, True])
+def test_estop_whose_robots_could_not_be_looked_up_is_no_success(
+    estop: Callable[..., Result], kind: type[Exception], moving: bool
+) -> None:
+    lookup = Lookup(kind("the broker is gone."), kind("the broker is gone."))
+    controller = LookingController(report(answer("a"), answer("b", not moving)), lookup.failed)
+    result = estop(lookup, controller)
+    assert result.exit_code == (1 if moving else 3)
+    said = "The robots that must answer could not be looked up: the broker is gone."
+    assert said in " ".join(result.stdout.split())
+    assert said in " ".join(result.stderr.split())
+    assert controller.named == []
+
+
+def test_robots_that_are_found_at_the_second_try_must_answer(estop: Callable[..., Result]) -> None:
+    controller = LookingController(report(answer("a"), answer("b")))
+    result = estop(Lookup(RegistryError("the database is gone"), ["b", "c"]), controller)
+    assert result.exit_code == 0
+    assert controller.named == [{"a", "b", "c"}]
+    assert "looked up" not in result.stdout + result.stderr
+
+
+def test_estop_says_so_when_the_registry_gave_no_list(estop: Callable[..., Result]) -> None:
+    stale = "The registry gives no list (no answer in time): devices may be missing."
+    result = estop(Lookup(["a"], stale=stale), LookingController(report(answer("a"))), "--json")
+    assert result.exit_code == 3
+    assert stale in json.loads(result.stdout)["reason"]
+
+
+def test_estop_that_ended_before_its_robots_were_found_is_no_success(estop: Callable[..., Result]) -> None:
+    result = estop(Lookup(["a"]), LookingController(report(answer("a")), over=True))
+    assert result.exit_code == 3
+    assert "could not be looked up: no list of them in time." in " ".join(result.stderr.split())
+
+
+def test_robots_that_are_named_are_not_looked_up(estop: Callable[..., Result]) -> None:
+    assert estop(Lookup(), FakeController(report(answer("a"))), "a").exit_code == 0
+
+
+def test_stop_that_raises_at_once_leaves_no_lookup_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken(FakeController):
+        def stop(self, expected: Collection[str], reason: str, **more: Any) -> StopReport:
+            raise OSError(24, "Too many open files")
+
+    lookup = Lookup()
+    monkeypatch.setattr(device_connect, "FleetClient", lookup)
+    running = RunningStop(Broken(report()), [], "", 3.0, loopback_config())  # type: ignore[arg-type]
+    with pytest.raises(OSError, match="Too many open files"):
+        running.report.result(20)
+    assert lookup.left.wait(20)

@@ -6,7 +6,6 @@ import shlex
 import threading
 from collections.abc import Mapping
 from concurrent.futures import Future, wait
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,6 +40,9 @@ UNKNOWN_KEY = "A robot that does not know that key is resumed at its own machine
 RESUME_HERE = "strands-robots resume --local"
 CLAIMED = "Claimed is not proven: no enrolled robot signed it. Enroll robots with strands-robots enroll."
 LINK_WAIT_S = 2.0
+
+LOOKUP_SHARE = 2 / 3
+"""Part of the deadline in which robots are looked up; the rest is for their answers."""
 
 
 def register(app: typer.Typer) -> None:
@@ -150,7 +152,8 @@ def estop(
         controller.close()
     answer = envelope(report)
     facts = _facts(answer)
-    screen.say(summary(report), style_of(report))
+    missed = running.missed()
+    screen.say(f"{summary(report)}{missed}", "bold red" if missed else style_of(report))
     for name, why in report.alarms.items():
         screen.say(
             f"ALARM: {name}: {why}. Its own answer {'is missing' if name in report.alarmed else 'came, too'}.",
@@ -159,9 +162,10 @@ def estop(
     if report.claimed:
         screen.say(CLAIMED, "yellow")
     code = exit_code(report)
-    if code is not Exit.OK:
+    if code is not Exit.OK or missed:
         where = "" if report.link else f" {describe(link)}"
-        raise CliError(plain(f"{answer['reason']}{where}", 2000), code, **facts)
+        said = text_of(answer) if code is Exit.OK else answer["reason"]
+        raise CliError(plain(f"{said}{missed}{where}", 2000), Exit.SILENT if code is Exit.OK else code, **facts)
     screen.data({"status": "success", **facts})
     if link.loopback_only:
         user = meeting_user(link)
@@ -208,6 +212,8 @@ class RunningStop:
         self._id = new_epoch()
         controller.press(self._id)
         self._begun = threading.Event()
+        self._looking = threading.Lock()
+        self._missed = "" if expected else "no list of them in time"
         self.report: Future[StopReport] = Future()
         threading.Thread(target=self._run, name="estop", daemon=True).start()
         if not expected:
@@ -228,31 +234,51 @@ class RunningStop:
             self.report.set_exception(exc)
         else:
             self.report.set_result(report)
+        finally:
+            # A stop that ends before its first progress leaves no lookup waiting.
+            self._begun.set()
+
+    def missed(self) -> str:
+        """Return the sentence that robots could not be looked up, or nothing."""
+        with self._looking:
+            return f" The robots that must answer could not be looked up: {self._missed}." if self._missed else ""
 
     def _progress(self, progress: Progress) -> None:
         self.latest = progress
         self._begun.set()
 
     def _expect_all(self) -> None:
-        from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - the network is loaded when it is used
+        if not self._found():
+            # A network that is not there yet is asked again once the stop has begun.
+            self._begun.wait()
+            if not self.report.done():
+                self._found()
 
-        # A network that is not there yet is asked again once the stop has begun.
-        with suppress(MessagingError, TimeoutError):
+    def _found(self) -> bool:
+        """Look up those that must answer; False when it failed, with the reason kept."""
+        try:
             self._look_up()
-            return
-        self._begun.wait()
-        # Without it the report still names every robot that answers before the deadline.
-        with suppress(MessagingError, TimeoutError):
-            self._look_up()
+        except Exception as exc:  # noqa: BLE001 - said with the report, which names those that answered
+            with self._looking:
+                self._missed = plain(str(exc).rstrip(".") or type(exc).__name__, 300)
+            return False
+        return True
 
     def _look_up(self) -> None:
-        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - the network is loaded when it is used
 
         with FleetClient(self._link) as fleet:
             self._begun.wait()
-            found = [peer.id for peer in fleet.peers(min(2.0, self._deadline_s), thorough=True) if peer.stop_verb]
+            if self.report.done():
+                return
+            within = min(2.0, self._deadline_s * LOOKUP_SHARE)
+            found = [peer.id for peer in fleet.peers(within, thorough=True) if peer.stop_verb]
+            stale = fleet.stale
         answered = self.latest.answered if self.latest else {}
-        self._controller.expect(self._id, {*found, *answered})
+        # The report of a stop that this completes is read after what this says.
+        with self._looking:
+            if self._controller.expect(self._id, {*found, *answered}):
+                self._missed = stale.rstrip(".")
 
 
 def exit_code(report: StopReport) -> Exit:

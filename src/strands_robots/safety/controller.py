@@ -252,13 +252,14 @@ class SafetyController:
                 del self._presses[next(iter(self._presses))]
         return press
 
-    def expect(self, estop_id: str, names: Collection[str]) -> None:
-        """Name further robots that must answer the running stop ``estop_id``."""
+    def expect(self, estop_id: str, names: Collection[str]) -> bool:
+        """Name further robots that must answer ``estop_id``; False when it is over."""
         with self._changed:
             run = self._stops.get(estop_id)
             if run is not None:
                 run.expected |= frozenset(names)
                 self._changed.notify_all()
+        return run is not None
 
     def check_in_every(self, interval_s: float) -> None:
         """Check in with the robots that need a live controller, from now until ``close``."""
