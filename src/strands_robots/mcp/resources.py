@@ -60,8 +60,9 @@ class RobotResources:
     def add_to(self, server: MCPServer[Any], access: AccessOf) -> None:
         """Register the resources and their methods."""
 
+        # Where the annotation has parameters, pydantic copies the context without its request.
         @server.resource(SCHEME + "{robot}", mime_type="application/json")
-        async def robot(robot: str, context: Context[Any, Any]) -> str:
+        async def robot(robot: str, context: Context) -> str:
             """State of one robot: task, lockout, who holds it."""
             return quoted({"robot": robot, **facts(await access(context).caller.read(robot, "getStatus"))})
 

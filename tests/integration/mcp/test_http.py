@@ -69,6 +69,13 @@ def test_another_address_needs_tls_and_a_token(site: McpSite, tmp_path: object) 
 
 
 @BOTH
+async def test_a_robot_is_a_resource_over_http_too(site: McpSite, url: str, tokens: dict[str, str], mode: str) -> None:
+    async with site.http_client(url, tokens["desk"], mode=mode) as client:
+        read = await client.read_resource("robot://arm-1")
+        assert "running_policies" in read.contents[0].text
+
+
+@BOTH
 async def test_the_name_of_the_token_is_the_callers(site: McpSite, url: str, tokens: dict[str, str], mode: str) -> None:
     async with site.http_client(url, tokens["desk"], mode=mode) as client:
         held = await client.call_tool("acquire_control", {"robot": "arm-1"})
