@@ -63,7 +63,7 @@ def test_a_revoked_token_is_refused_at_once(site: McpSite, url: str) -> None:
 
 def test_another_address_needs_tls_and_a_token(site: McpSite, tmp_path: object) -> None:
     command = [sys.executable, *site.command("--http", f"0.0.0.0:{free_port()}")]
-    refused = subprocess.run(command, env=site.environment, capture_output=True, text=True, timeout=30, check=False)
+    refused = subprocess.run(command, env=site.environment, capture_output=True, text=True, timeout=100, check=False)
     assert refused.returncode != 0
     assert "TLS" in refused.stderr + refused.stdout
 
