@@ -94,12 +94,17 @@ def leading(pair: ArmPair) -> None:
     eventually(lambda: stat(pair, "frames_received")() >= 25, what="half a second of frames")
 
 
-def nothing_more(pair: ArmPair) -> None:
-    """From now on no servo is told anything."""
+def quiet(pair: ArmPair) -> bool:
+    """True when no servo was told anything meanwhile."""
     pair.follower.ask("state")
     began = time.monotonic()
     time.sleep(QUIET_S)
-    assert pair.following.last_write() <= began
+    return pair.following.last_write() <= began
+
+
+def nothing_more(pair: ArmPair) -> None:
+    """From now on no servo is told anything."""
+    assert quiet(pair)
 
 
 @pytest.mark.parametrize("age_s", [120.0, -30.0])
@@ -188,6 +193,8 @@ def test_a_halt_in_mid_stream_ends_it_and_locks_nothing(pair: ArmPair) -> None:
 def test_a_lost_leader_leaves_the_arm_where_it_led_it_and_its_successor_is_not_taken_for_it(pair: ArmPair) -> None:
     leading(pair)
     pair.replace_leader()
+    eventually(stat(pair, "holding"), what="the follower holds its position")
+    eventually(lambda: quiet(pair), what="the end of the hold's own write")
     nothing_more(pair)
     assert pair.following.ask("torque") == [True] * 6
     assert pair.follower.ask("state")
