@@ -11,6 +11,7 @@ import ipaddress
 import math
 import re
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,26 @@ def install_line(extra: str) -> str:
 def missing_extra(what: str, extra: str) -> MissingExtraError:
     """Return the error for a missing package, with the command that installs it."""
     return MissingExtraError(f"{what} needs the [{extra}] extra: {install_line(extra)}.")
+
+
+def optional_module(name: str, *, what: str, extra: str) -> Any:
+    """Return the module ``name``, imported where it is used.
+
+    Raises:
+        MissingExtraError: it is not installed; ``what`` needs it, and ``extra`` has it.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as exc:
+        raise missing_extra(what, extra) from exc
+
+
+def is_loopback_host(host: str) -> bool:
+    """Return True for an address of loopback, and for ``localhost``."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def shown(value: object) -> str:

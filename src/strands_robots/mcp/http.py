@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import secrets
 import signal
 import socket
@@ -31,6 +30,7 @@ from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.server import GONE, build
 from strands_robots.mcp.tokens import Token, TokenFile
+from strands_robots.utils import is_loopback_host
 
 PATH = "/mcp"
 PICTURES = "/pictures/"
@@ -67,10 +67,7 @@ class Address:
     @property
     def loopback(self) -> bool:
         """True where no other machine reaches it."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return is_loopback_host(self.host)
 
     @property
     def url(self) -> str:

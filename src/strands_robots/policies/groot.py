@@ -16,7 +16,7 @@ import json
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from importlib import import_module
+from functools import partial
 from typing import Any
 
 from strands_robots.policies.base import Action
@@ -31,7 +31,9 @@ from strands_robots.policies.policy_server import (
 )
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
-from strands_robots.utils import ValidationError, missing_extra, shown
+from strands_robots.utils import ValidationError, optional_module, shown
+
+_module = partial(optional_module, what="The groot policy", extra="groot")
 
 LAYOUTS = ("n1.6", "n1.6-flat", "n1.5")
 LANGUAGE = "annotation.human.task_description"
@@ -251,10 +253,3 @@ def _decoded(found: dict[Any, Any]) -> Any:
         stated = found.get("as_json", found.get("as_dict"))
         return json.loads(stated) if isinstance(stated, str) else stated
     return found
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as exc:
-        raise missing_extra("The groot policy", "groot") from exc

@@ -11,12 +11,11 @@ machine, or at the other end of a tunnel. It has one policy and one queue: it se
 
 from __future__ import annotations
 
-import ipaddress
 import itertools
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from importlib import import_module
+from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -33,7 +32,9 @@ from strands_robots.policies.policy_server import (
 )
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
-from strands_robots.utils import ValidationError, missing_extra, shown
+from strands_robots.utils import ValidationError, is_loopback_host, optional_module, shown
+
+_module = partial(optional_module, what="The lerobot_async policy", extra="lerobot-async")
 
 PORT = 8080
 SERVICE = "/transport.AsyncInference/"
@@ -172,7 +173,7 @@ class LeRobotAsyncPolicy(ServedPolicy):
         super().__init__(profile)
         where = f"profile {self.profile.name}"
         address = urlsplit(self.profile.url)
-        if address.scheme != "grpc" or not _is_here(str(address.hostname)):
+        if address.scheme != "grpc" or not is_loopback_host(str(address.hostname)):
             raise ValidationError(
                 f"{where}: url must be grpc:// on this machine, not {shown(self.profile.url)}: the server runs what "
                 "anyone sends it. Reach one elsewhere by a tunnel, ssh -L 8080:127.0.0.1:8080."
@@ -244,13 +245,6 @@ class LeRobotAsyncPolicy(ServedPolicy):
         return pickled("RemotePolicyConfig", state)
 
 
-def _is_here(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def _field(number: int, value: bytes) -> bytes:
     """Return a field of bytes, as protobuf has it."""
     return bytes([number << 3 | 2]) + _varint(len(value)) + value
@@ -288,10 +282,3 @@ def _first_field(message: bytes) -> bytes:
     if message[0] != (1 << 3 | 2) or len(message) - at != length:
         raise PolicyServerError("the policy server sent a message that is none of LeRobot's")
     return message[at:]
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as exc:
-        raise missing_extra("The lerobot_async policy", "lerobot-async") from exc

@@ -15,7 +15,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Mapping
-from importlib import import_module
+from functools import partial
 from typing import Any
 
 from strands_robots.policies.base import Action
@@ -30,7 +30,9 @@ from strands_robots.policies.policy_server import (
 )
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
-from strands_robots.utils import ValidationError, missing_extra, shown
+from strands_robots.utils import ValidationError, optional_module, shown
+
+_module = partial(optional_module, what="The openpi policy", extra="remote")
 
 LAYOUTS = ("libero", "droid", "aloha")
 DROID_JOINTS = 7
@@ -205,10 +207,3 @@ def _array(found: dict[Any, Any]) -> Any:
     if b"__npgeneric__" in found:
         return values[0].item()
     return values.reshape(tuple(int(each) for each in found[b"shape"]))
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as exc:
-        raise missing_extra("The openpi policy", "remote") from exc

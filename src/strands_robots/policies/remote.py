@@ -21,12 +21,14 @@ import math
 import threading
 import time
 from collections.abc import Mapping
-from importlib import import_module
+from functools import partial
 from typing import Any, NoReturn
 
 from strands_robots.policies.base import Action, Ranges, checked_action, numbers
 from strands_robots.policies.policy_server import CHUNK_MAX, SLICE_S, PolicyServerError
-from strands_robots.utils import ValidationError, choice, dial_host_error, flag, missing_extra, number, shown, whole
+from strands_robots.utils import ValidationError, choice, dial_host_error, flag, number, optional_module, shown, whole
+
+_module = partial(optional_module, what="The remote policy", extra="remote")
 
 DEFAULT_PORT = 8765
 _CLOSE_S = 0.5
@@ -189,10 +191,3 @@ class RemotePolicy:
         if not isinstance(answer, dict):
             self._refuse(answer)
         return answer
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as exc:
-        raise missing_extra("The remote policy", "remote") from exc
