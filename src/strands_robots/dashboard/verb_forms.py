@@ -8,7 +8,7 @@ from typing import Any
 
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, REQUIRED, Kind, Verb
+from strands_robots.serving.verbs import LEASE_NAMES, REQUIRED, Kind, Verb
 
 LEFT_OUT = frozenset({*CONTROL_VERBS, "resume", "ping", "teleop_status", "teleop_receive", "teleop_stop"})
 """Verbs that the page has a control of its own for, or none."""
@@ -56,7 +56,7 @@ def peer_forms(verbs: Iterable[Verb] = tuple(PEER_VERBS.values())) -> tuple[dict
 
 
 def _form(name: object, kind: str, summary: object, parameters: list[dict[str, Any]]) -> dict[str, Any]:
-    given = [each for each in parameters if each["name"] not in {LEASE_ID, LEASE_TTL_S}][:PARAMETERS_MAX]
+    given = [each for each in parameters if each["name"] not in LEASE_NAMES][:PARAMETERS_MAX]
     told = str(summary or "").strip().partition("\n")[0][:TEXT_MAX]
     return {"name": str(name or "")[:100], "kind": kind, "summary": told, "parameters": given}
 

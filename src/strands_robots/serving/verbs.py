@@ -93,6 +93,7 @@ _LEASE_TTL = Parameter(
 )
 
 OF_THE_LEASE = (_LEASE_ID, _LEASE_TTL)
+LEASE_NAMES = frozenset(each.name for each in OF_THE_LEASE)
 
 
 def _nonce(name: str, value: object) -> str:
@@ -160,7 +161,7 @@ class Verb:
         missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
         if not unknown and not missing:
             return None
-        takes = ", ".join(name for name in self.by_name if name not in {LEASE_ID, LEASE_TTL_S}) or "no parameters"
+        takes = ", ".join(name for name in self.by_name if name not in LEASE_NAMES) or "no parameters"
         problem = f"it has no {', '.join(unknown)}" if unknown else f"{', '.join(missing)} is missing"
         return f"{self.name} takes {takes}: {problem}."
 
