@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from fixtures.bodies import ScriptedPolicy
+from fixtures.bodies import LoadingPolicy, ScriptedPolicy
 from fixtures.devices import BlindDevice, FailingDevice, RecordingDevice, WedgingDevice
 from fixtures.leaders import ScriptedLeader
 from fixtures.planes import own_plane
@@ -20,7 +20,6 @@ from strands_robots.contract import RolloutEvent, TaskRobot
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
 from strands_robots.hardware import robot as robots
-from strands_robots.policies.base import Ranges
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.utils import ValidationError
 
@@ -152,23 +151,11 @@ def test_a_stop_of_a_loop_that_outlives_it_says_stopped_false(
     assert robot.halt().stopped is True
 
 
-class Loading(ScriptedPolicy):
-    """Loads its weights for as long as the test wants."""
-
-    def __init__(self) -> None:
-        super().__init__([], always={"pan.pos": 99.0})
-        self.loads, self.loaded = threading.Event(), threading.Event()
-
-    def reset(self, instruction: str, ranges: Ranges) -> None:
-        self.loads.set()
-        assert self.loaded.wait(60)
-
-
 @pytest.mark.parametrize("stop", ["halt", "stop_task"])
 def test_a_stop_while_a_policy_loads_says_stopped_at_once_and_it_never_moves_the_robot(
     robot: HardwareRobot, monkeypatch: pytest.MonkeyPatch, stop: str
 ) -> None:
-    loading = Loading()
+    loading = LoadingPolicy()
     monkeypatch.setattr(policies, "policy_factory", lambda name: lambda: loading)
     robot.start_task("wave")
     assert loading.loads.wait(20)

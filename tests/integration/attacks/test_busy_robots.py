@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 
 import pytest
-from fixtures.bodies import ScriptedPolicy
+from fixtures.bodies import LoadingPolicy
 from fixtures.devices import TorqueDevice
 from fixtures.nats_server import NatsServer
 from fixtures.planes import own_plane
@@ -20,7 +19,6 @@ from strands_robots import policies
 from strands_robots.device_connect import LinkConfig, init_device_connect_sync, stop_device_connect
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.hardware import HardwareRobot
-from strands_robots.policies.base import Ranges
 from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.plane import plane
@@ -41,18 +39,6 @@ def busy_machine() -> Iterator[None]:
         for burner in burners:
             burner.kill()
             burner.wait()
-
-
-class Loading(ScriptedPolicy):
-    """Loads until it may go on, and would then move the arm."""
-
-    def __init__(self) -> None:
-        super().__init__([], always={"pan.pos": 99.0})
-        self.loads, self.loaded = threading.Event(), threading.Event()
-
-    def reset(self, instruction: str, ranges: Ranges) -> None:
-        self.loads.set()
-        assert self.loaded.wait(60)
 
 
 @pytest.mark.usefixtures("busy_machine")
@@ -85,7 +71,7 @@ def test_an_arm_whose_policy_loads_is_stopped_at_each_stop_and_never_moves(monke
     with own_plane(20.0) as safety:
         safety.register("arm", robot)
         for _ in range(STOPS):
-            loading = Loading()
+            loading = LoadingPolicy()
             monkeypatch.setattr(policies, "policy_factory", lambda name, loading=loading: lambda: loading)
             robot.start_task("wave")
             assert loading.loads.wait(20)
