@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Makes .venv-policies: this project with LeRobot 0.4.4 and a torch, for policies that are computed here and for training.
 # Does nothing when it is there. LeRobot's metadata asks for an older torch, and for viewers and drivers that no policy
-# uses, so it is installed without what it asks for, beside what its policies and its datasets do use.
+# uses, so it is installed without what it asks for, beside what its policies and its datasets do use. So is openpi's own
+# client, which asks for a numpy before 2 and works with this one.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 dir=.venv-policies
@@ -14,7 +15,7 @@ stamp=$dir/.installed-lerobot
 want=$(cat "$0" "$dir"/.installed-dev.lock | sha256sum)
 [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$want" ] && exit 0
 echo "Installing LeRobot 0.4.4 and torch into $dir (once; some minutes)..."
-"$dir/bin/pip" install --quiet --disable-pip-version-check --no-deps "${pins[0]}"
+"$dir/bin/pip" install --quiet --disable-pip-version-check --no-deps "${pins[0]}" openpi-client==0.1.2
 "$dir/bin/pip" install --quiet --disable-pip-version-check "${pins[@]:1}"
 # A torchvision for CUDA beside a torch for the CPU fails when it registers operators that no policy uses.
 "$dir/bin/python" -c 'import torchvision' 2>/dev/null ||

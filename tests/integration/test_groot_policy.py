@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -43,6 +44,24 @@ def older(steps: int = 16) -> dict[str, Any]:
 
 def modality(keys: list[str], deltas: list[int]) -> dict[str, Any]:
     return {"__ModalityConfig_class__": True, "as_json": {"modality_keys": keys, "delta_indices": deltas}}
+
+
+def in_place_of_an_array(file: Any) -> list[Any]:
+    """An answer of which one array is something else."""
+    return [{"single_arm": {"__ndarray_class__": True, "as_npy": file}, "gripper": numpy.zeros((1, 1, 1))}, {}]
+
+
+def archive() -> bytes:
+    file = io.BytesIO()
+    numpy.savez(file, actions=numpy.zeros(3))
+    return file.getvalue()
+
+
+def stating(shape: tuple[int, ...]) -> bytes:
+    """An array without its bytes."""
+    file = io.BytesIO()
+    numpy.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    return file.getvalue()
 
 
 @pytest.fixture
@@ -145,6 +164,10 @@ def test_modalities_are_read_in_each_form_of_the_wire(make: Make, form: str) -> 
         ([], "without actions"),
         ("fine", "without actions"),
         ([{"single_arm": numpy.array([[[None, 1]]]), "gripper": numpy.zeros((1, 1, 1))}, {}], "unreadable answer"),
+        (in_place_of_an_array(archive()), "unreadable answer"),
+        (in_place_of_an_array(stating((10**12,))), "unreadable answer"),
+        (in_place_of_an_array(b"\x93NUMPY\x01\x00\x20\x03" + 800 * b"("), "unreadable answer"),
+        (in_place_of_an_array(7), "unreadable answer"),
     ],
     ids=lambda value: str(value)[:40],
 )

@@ -112,6 +112,7 @@ def test_a_batch_axis_is_taken_off(make: Make) -> None:
         (b"\xc1", "cannot be read"),
         ([1, 2], "answered"),
         ({"actions": {b"__ndarray__": True, b"data": b"12", b"dtype": "<f4", b"shape": [4, 3]}}, "cannot be read"),
+        ({"actions": 0, "took": {b"__npgeneric__": True, b"data": "x", b"dtype": "<f4"}}, "cannot be read"),
         ({"actions": {b"__ndarray__": True, b"data": b"12345678", b"dtype": "|O", b"shape": [1]}}, "cannot be read"),
     ],
     ids=lambda value: str(value)[:40],

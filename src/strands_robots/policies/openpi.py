@@ -2,7 +2,8 @@
 
 The server speaks first, with a map of metadata that may be empty. Then each observation, one map, is answered by one
 map with ``actions``: (horizon, dimension), in the policy's units. An error is a text frame, and the server closes.
-Arrays are maps with the binary keys ``__ndarray__``, ``data``, ``dtype`` and ``shape``. Source: openpi's
+Arrays are maps with the binary keys ``__ndarray__``, ``data``, ``dtype`` and ``shape``, scalars of numpy maps with
+``__npgeneric__``, ``dtype`` and a plain number as ``data``. Source: openpi's
 ``msgpack_numpy.py`` and ``websocket_policy_server.py``; vLLM-Omni's variant adds a batch axis and errors as maps.
 
 There are no ids: after a missed deadline the connection is dropped, or the late answer would be taken for the next one.
@@ -203,7 +204,6 @@ def _array(found: dict[Any, Any]) -> Any:
     dtype = numpy.dtype(found[b"dtype"])
     if dtype.kind not in _KINDS:
         raise ValidationError(f"an array of the kind {dtype.kind}")
-    values = numpy.frombuffer(found[b"data"], dtype)
     if b"__npgeneric__" in found:
-        return values[0].item()
-    return values.reshape(tuple(int(each) for each in found[b"shape"]))
+        return dtype.type(found[b"data"]).item()
+    return numpy.frombuffer(found[b"data"], dtype).reshape(tuple(int(each) for each in found[b"shape"]))
