@@ -10,10 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy
 import pytest
 from fixtures.devices import RANGES
-from fixtures.groot_server import GrootServer
+from fixtures.groot_server import GrootServer, packed
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.policies import create_policy
@@ -150,6 +151,21 @@ def test_modalities_are_read_in_each_form_of_the_wire(make: Make, form: str) -> 
     policy.act(SEEN)
     policy.close()
     assert server.seen[-1]["observation"]["language"] == {"annotation.task": [["pick up the cube"]]}
+
+
+def test_an_answer_with_any_byte_changed_is_read_or_refused(make: Make) -> None:
+    whole = msgpack.packb(newer(2), default=packed)
+    frames = [whole[:at] + bytes([whole[at] ^ flip]) + whole[at + 1 :] for at in range(len(whole)) for flip in (1, 64)]
+    answers = iter([newer(2), *frames])
+    _, policy = make(lambda data: next(answers))
+    read = 0
+    for _ in frames:
+        try:
+            policy.act(SEEN)
+        except PolicyServerError:
+            continue
+        read += 1
+    assert 0 < read < len(frames)
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy
 import pytest
 from fixtures.devices import RANGES, RecordingDevice
-from fixtures.openpi_server import OpenPiServer
+from fixtures.openpi_server import OpenPiServer, packed
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.hardware import HardwareRobot
@@ -91,6 +92,21 @@ def test_droid_has_joints_and_gripper_apart() -> None:
         policy.close()
     with pytest.raises(ValidationError, match="layout droid"):
         OpenPiPolicy(Profile("pi", "openpi", KEYS, KEYS, url="ws://localhost", layout="droid"))
+
+
+def test_an_answer_with_any_byte_changed_is_read_or_refused(make: Make) -> None:
+    whole = msgpack.packb(chunk(), default=packed)
+    frames = [whole[:at] + bytes([whole[at] ^ flip]) + whole[at + 1 :] for at in range(len(whole)) for flip in (1, 64)]
+    answers = iter([chunk(), *frames])
+    _, policy = make(lambda observation: next(answers))
+    read = 0
+    for _ in frames:
+        try:
+            policy.act(SEEN)
+        except PolicyServerError:
+            continue
+        read += 1
+    assert 0 < read < len(frames)
 
 
 def test_a_batch_axis_is_taken_off(make: Make) -> None:

@@ -71,7 +71,7 @@ class GrootConnection:
         frame = wait_for_answer(self._url, self._receive, deadline, interrupted, self.close)
         try:
             answer = _module("msgpack").unpackb(frame, object_hook=_decoded, strict_map_key=False)
-        except (ValueError, TypeError, RecursionError) as exc:
+        except (ValueError, TypeError, OverflowError, RecursionError) as exc:
             raise PolicyServerError(f"the policy server at {self._url} sent an unreadable answer: {exc}") from exc
         if isinstance(answer, Mapping) and "error" in answer:
             raise PolicyServerError(f"the policy server at {self._url} failed: {shown(answer['error'])}")

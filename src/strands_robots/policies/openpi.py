@@ -183,7 +183,8 @@ def _encoded(value: Any) -> Any:
 def _decoded(frame: bytes) -> dict[str, Any]:
     try:
         answer = _module("msgpack").unpackb(frame, object_hook=_array, strict_map_key=False)
-    except (ValueError, TypeError, RecursionError) as exc:
+    except (ValueError, TypeError, KeyError, OverflowError, SyntaxError, RecursionError) as exc:
+        # numpy.dtype raises SyntaxError for some texts that are no type.
         raise PolicyServerError(f"the policy server sent a frame that cannot be read: {exc}") from exc
     if not isinstance(answer, dict):
         raise PolicyServerError(f"the policy server answered {shown(answer)}")
