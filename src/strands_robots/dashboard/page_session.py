@@ -22,7 +22,7 @@ from strands_robots.dashboard.operator_key import KeyRefusedError, OperatorKey
 from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
 from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
-from strands_robots.utils import ValidationError, shown, text
+from strands_robots.utils import ValidationError, json_object, shown, text
 
 logger = logging.getLogger(__name__)
 
@@ -158,12 +158,8 @@ class PageSession:
 
     def _take(self, payload: str) -> None:
         """Act on one message of the page; none of them makes the next one wait."""
-        try:
-            message = json.loads(payload)
-        except (ValueError, RecursionError):
-            return
-        kind = message.get("type") if isinstance(message, dict) else None
-        key = message.get("key", "") if isinstance(message, dict) else ""
+        message = json_object(payload)
+        kind, key = message.get("type"), message.get("key", "")
         if not isinstance(kind, str) or not isinstance(key, str):
             return
         if kind == "beat":

@@ -17,6 +17,7 @@ from typing import Any
 from device_connect_edge.messaging.exceptions import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.utils import json_object
 
 logger = logging.getLogger(__name__)
 
@@ -109,8 +110,5 @@ def named_in(data: bytes) -> Iterable[str]:
     """Return the devices in a beat; none for the heartbeat of a single one."""
     if MARK not in data:
         return ()
-    try:
-        devices = json.loads(data).get("devices")
-    except (ValueError, AttributeError, RecursionError):
-        return ()
+    devices = json_object(data).get("devices")
     return [each for each in devices if isinstance(each, str)] if isinstance(devices, list) else ()

@@ -26,7 +26,7 @@ from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.stopping import Outcome, explain, grade
-from strands_robots.utils import ValidationError, device_id, shown, text
+from strands_robots.utils import ValidationError, device_id, json_object, shown, text
 
 T = TypeVar("T")
 
@@ -341,11 +341,10 @@ class EventSubscription:
 
 def _event(data: bytes, subject: str) -> DeviceEvent | None:
     tokens = parts(subject)
-    try:
-        notification = json.loads(data)
-    except ValueError:
+    notification = json_object(data)
+    if not notification:
         return None
-    payload = notification.get("params") if isinstance(notification, Mapping) else None
+    payload = notification.get("params")
     return DeviceEvent(tokens[2], tokens[-1], payload if isinstance(payload, Mapping) else {})
 
 
@@ -360,11 +359,8 @@ def _push(arrived: queue.Queue[DeviceEvent], event: DeviceEvent) -> None:
 
 
 def _answer(device: str, function: str, data: bytes) -> Envelope:
-    try:
-        reply = json.loads(data)
-    except ValueError:
-        reply = None
-    if not isinstance(reply, Mapping):
+    reply = json_object(data)
+    if not reply:
         raise CallRefusedError(f"{device} answered {function} with {shown(data)}, which is no JSON-RPC.")
     problem = reply.get("error")
     if problem is not None:

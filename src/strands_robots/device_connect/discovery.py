@@ -22,6 +22,7 @@ from strands_robots import settings
 from strands_robots.device_connect.backends.base import Backend, NoResponderError
 from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.utils import json_object
 
 logger = logging.getLogger(__name__)
 
@@ -317,14 +318,14 @@ class Discovery:
     async def _ask(self, leaf: str, method: str, params: Mapping[str, Any], within: float) -> Mapping[str, Any]:
         request = {"jsonrpc": "2.0", "id": uuid.uuid4().hex, "method": method, "params": params}
         data = await self._messaging.request_once(f"{self._root}.{leaf}", json.dumps(request).encode(), within)
-        reply = _read(data)
+        reply = json_object(data)
         result = reply.get("result")
         if not isinstance(result, Mapping):
             raise RegistryError(str(_object(reply, "error").get("message") or "an answer without a result")[:200])
         return result
 
     async def _on_presence(self, data: bytes, subject: str, reply: str | None) -> None:
-        presence, name = _read(data), parts(subject)[2]
+        presence, name = json_object(data), parts(subject)[2]
         # Access rules guard the topic, so it outranks the id in the message.
         if presence.get("device_id") != name:
             return
@@ -357,14 +358,6 @@ def parts(subject: str) -> list[str]:
     """Return the tokens of a subject or a key, at least four."""
     tokens = subject.split("/" if "/" in subject else ".")
     return tokens if len(tokens) > 3 else ["", "", "", ""]
-
-
-def _read(data: bytes) -> Mapping[str, Any]:
-    try:
-        message = json.loads(data)
-    except (ValueError, RecursionError):
-        return {}
-    return message if isinstance(message, Mapping) else {}
 
 
 def _object(message: Mapping[str, Any], key: str) -> Mapping[str, Any]:

@@ -21,7 +21,7 @@ from strands_robots.safety.lockout import OVERFLOW
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, covered
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, json_object
 
 LATE_S = 1.0
 """Time from the press to its receipt, above which a stop is late."""
@@ -317,11 +317,7 @@ def params_of(payload: bytes) -> dict[str, Any]:
     """Return the parameters of a JSON-RPC notification; empty for anything else."""
     if len(payload) > PARSED_MAX_BYTES:
         return {}
-    try:
-        message = json.loads(payload)
-    except (ValueError, RecursionError):
-        return {}
-    params = message.get("params") if isinstance(message, dict) else None
+    params = json_object(payload).get("params")
     return params if isinstance(params, dict) else {}
 
 

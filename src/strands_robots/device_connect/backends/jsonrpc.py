@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
-from ...utils import shown
+from ...utils import json_object, shown
 
 PARSE_ERROR = -32700
 INVALID_REQUEST = -32600
@@ -115,10 +115,7 @@ def valid_json(data: bytes) -> bool:
 
 def _id_of(data: bytes) -> RpcId:
     """The id of an encoded reply, as far as it is readable."""
-    try:
-        rpc_id = json.loads(data).get("id")
-    except (ValueError, RecursionError, AttributeError):
-        return None
+    rpc_id = json_object(data).get("id")
     return rpc_id if isinstance(rpc_id, str | int | float) else None
 
 

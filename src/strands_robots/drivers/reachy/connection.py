@@ -6,7 +6,6 @@ for 1.5 seconds: after a restart an old socket stays open and silent, so the soc
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import threading
@@ -27,7 +26,7 @@ from strands_robots.drivers.reachy.links import (
 )
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
 from strands_robots.drivers.reachy.target import HeadPose
-from strands_robots.utils import ValidationError, choice, port
+from strands_robots.utils import ValidationError, choice, json_object, port
 
 logger = logging.getLogger(__name__)
 
@@ -167,20 +166,13 @@ class Feed:
         payload, at = self._raw.get(kind, ("", -math.inf))
         if time.monotonic() - at > within_s or not payload:
             return None
-        try:
-            message = json.loads(payload)
-        except ValueError:
-            return None
-        return message if isinstance(message, dict) else None
+        return json_object(payload) or None
 
 
 def _joints(payload: str | bytes, at: float) -> JointSample | None:
-    try:
-        message = json.loads(payload)
-        head = _numbers(message["head_joint_positions"], 7)
-        antennas = _numbers(message["antennas_joint_positions"], 2)
-    except (ValueError, KeyError, TypeError):
-        return None
+    message = json_object(payload)
+    head = _numbers(message.get("head_joint_positions"), 7)
+    antennas = _numbers(message.get("antennas_joint_positions"), 2)
     return JointSample(head, (antennas[0], antennas[1]), at) if head and antennas else None
 
 

@@ -28,7 +28,7 @@ from strands_robots.drivers.reachy.rest import (
     url_host,
 )
 from strands_robots.drivers.reachy.target import Target
-from strands_robots.utils import ValidationError, identifier, missing_extra, shown
+from strands_robots.utils import ValidationError, identifier, json_object, missing_extra, shown
 
 logger = logging.getLogger(__name__)
 
@@ -160,11 +160,7 @@ def _kind(frame: str | bytes) -> str:
         return ""
     if frame.startswith('{"type":"'):
         return frame[9 : frame.find('"', 9)]
-    try:
-        message = json.loads(frame)
-    except ValueError:
-        return ""
-    return str(message.get("type", "")) if isinstance(message, dict) else ""
+    return str(json_object(frame).get("type", ""))
 
 
 class PubSub(Protocol):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import logging
 import threading
 import time
@@ -27,7 +26,7 @@ from strands_robots.envelope import error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.safety.stopping import StopVerdict, halt_each
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, json_object
 
 logger = logging.getLogger(__name__)
 
@@ -145,15 +144,13 @@ class MoveUpdates:
         deadline = time.monotonic() + within_s
         while (left := deadline - time.monotonic()) > 0:
             try:
-                update = json.loads(self._socket.recv(left))
+                update = json_object(self._socket.recv(left))
             except TimeoutError:
                 return None
-            except ValueError:
-                continue
             except Exception as exc:
                 raise DaemonUnreachableError(f"The daemon's updates of moves broke: {exc}.") from exc
-            if isinstance(update, dict) and update.get("uuid") == uuid and update.get("type") in MOVE_ENDS:
-                return MoveEnd(MOVE_ENDS[update["type"]], str(update.get("details") or ""))
+            if update.get("uuid") == uuid and str(update.get("type")) in MOVE_ENDS:
+                return MoveEnd(MOVE_ENDS[str(update["type"])], str(update.get("details") or ""))
         return None
 
     def close(self) -> None:
