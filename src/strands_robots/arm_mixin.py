@@ -130,7 +130,7 @@ class ArmMixin:
     def arm_pose(self, robot_name: str = "") -> Envelope:
         """Return the pose of the tip, the joints (degrees) and the gripper's opening.
 
-        ``x``, ``y``, ``z`` in metres, ``approach`` in degrees below the horizontal, and ``holding``.
+        ``x``, ``y``, ``z`` in metres, ``approach`` in degrees below the horizontal, ``holding``, and the ``model``.
         """
         import numpy as np  # noqa: PLC0415 - loaded with the first motion
 
@@ -153,6 +153,7 @@ class ArmMixin:
             joints=joints,
             gripper=None if state.opening is None else round(min(max(state.opening, 0.0), 1.0), 4),
             holding=self._holding(body.name, arm),
+            model=arm.chain.label,
             frame="base",
             age_s=round(age_s, 4),
         )

@@ -22,6 +22,7 @@ from strands_robots.dashboard.operator_key import KeyRefusedError, OperatorKey
 from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
 from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
+from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.utils import ValidationError, json_object, shown, text
 
 logger = logging.getLogger(__name__)
@@ -38,6 +39,9 @@ THUMBNAILS_MAX = 12
 ANSWER_MAX = 20_000
 RESUME_S = 5.0
 FORGET_S = 5.0
+POSE_AGAIN_S = 10.0
+"""Seconds until a pose that could not be drawn is tried again."""
+
 
 Message = Mapping[str, Any]
 
@@ -49,6 +53,7 @@ class Shared:
     Attributes:
         source: the caller that robots see.
         signed: emergency stops are signed.
+        starting: ids of robots that were started and will come.
     """
 
     model: FleetModel
@@ -56,6 +61,7 @@ class Shared:
     operator_key: OperatorKey
     source: str
     signed: bool
+    starting: tuple[str, ...] = ()
     pictures: Pictures = field(default_factory=Pictures)
 
 
@@ -76,6 +82,7 @@ class PageSession:
         self._control = HandControl(self.tell)
         self._waiting: asyncio.Queue[dict[str, Any]] = asyncio.Queue(WAITING_MAX)
         self._watched, self._joints_at = "", 0.0
+        self._looking: asyncio.Task[None] | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._thumbnails: dict[str, asyncio.Task[None]] = {}
         self._sending = asyncio.Lock()
@@ -96,8 +103,9 @@ class PageSession:
         except (WebSocketDisconnect, KeyError, RuntimeError) as gone:
             logger.debug("A page is gone, or sent bytes: %s", type(gone).__name__)
         finally:
-            for task in (*([sending] if sending else []), *self._thumbnails.values()):
-                task.cancel()
+            for task in (sending, self._looking, *self._thumbnails.values()):
+                if task is not None:
+                    task.cancel()
             await asyncio.shield(asyncio.ensure_future(self._control.leave()))
 
     def _hello(self) -> dict[str, Any]:
@@ -110,6 +118,7 @@ class PageSession:
             "operator_key": server.operator_key.present,
             "signed": server.signed,
             "source": server.source,
+            "starting": server.starting,
             "networks": [feed.network for feed in server.feeds.values()],
         }
 
@@ -225,20 +234,30 @@ class PageSession:
 
     def _watch(self, key: str) -> None:
         self._watched, self._joints_at = key, 0.0
-        if not key:
-            return
+        if self._looking is not None:
+            self._looking.cancel()
+        self._looking = asyncio.create_task(self._look(key)) if key else None
 
-        async def look() -> None:
-            with contextlib.suppress(ValidationError):
-                feed, robot = self._feed(key)
-                self._tell_details(key)
-                await feed.look_closer(robot)
-                if self._watched == key:
-                    self._tell_details(key)
+    async def _look(self, key: str) -> None:
+        with contextlib.suppress(ValidationError):
+            feed, robot = self._feed(key)
+            self._tell_details(key)
+            await feed.look_closer(robot)
+            self._tell_details(key)
+            while why := await self._no_pose(key, feed, robot):
+                self.tell({"type": "pose", "key": key, "why": why})
+                await asyncio.sleep(POSE_AGAIN_S)
+            self.tell({"type": "pose", "key": key, "why": ""})
 
-        task = asyncio.create_task(look())
-        self._calls.add(task)
-        task.add_done_callback(self._calls.discard)
+    async def _no_pose(self, key: str, feed: FleetFeed, robot: str) -> str:
+        """Return why no pose can be drawn of a robot, after drawing one; empty where its server draws it."""
+        row = self._server.model.row(key)
+        if row is None or OVERVIEW in row.cameras:
+            return ""
+        if all(form["name"] != "getPose" for form in row.forms):
+            return "it has no arm whose joints are told in degrees."
+        drawn = await self._server.pictures.poses.picture(feed, robot)
+        return text_of(drawn) if is_error(drawn) else ""
 
     def _tell_details(self, key: str) -> None:
         details = self._server.model.details(key)
@@ -262,7 +281,7 @@ class PageSession:
         with contextlib.suppress(ValidationError, WebSocketDisconnect, RuntimeError):
             feed, robot = self._feed(key)
             head = key.encode()
-            frames = self._server.pictures.frames(feed, robot, "", SMALL, SMALL_HZ)
+            frames = self._server.pictures.camera(feed, robot, "", SMALL, SMALL_HZ)
             async with contextlib.aclosing(frames):
                 async for frame in frames:
                     async with self._sending:

@@ -1,4 +1,4 @@
-"""Pictures of the robots' cameras: one stream for all who look at the same one."""
+"""Pictures of the robots' cameras and poses: one stream for all who look at the same one."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, field
 
+from strands_robots.dashboard import poses
 from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.envelope import Envelope, is_error
 
-LARGE, SMALL = (640, 480), (192, 144)
+LARGE, SMALL = (640, 480), (320, 240)
 LARGE_HZ, SMALL_HZ = 12.0, 1.0
 ANSWER_S = 5.0
 AGAIN_S = 2.0
@@ -34,22 +35,32 @@ class Pictures:
     """Streams of JPEG pictures by robot, camera and size; on the server's loop."""
 
     def __init__(self) -> None:
+        self.poses = poses.Poses()
         self._streams: dict[tuple[str, str, tuple[int, int]], _Stream] = {}
 
-    async def frames(
+    def camera(
         self, feed: FleetFeed, robot: str, camera: str, size: tuple[int, int] = LARGE, hz: float = LARGE_HZ
     ) -> AsyncGenerator[bytes, None]:
-        """Yield pictures as they come; a slow reader misses some."""
+        """Yield the pictures of a camera as they come; a slow reader misses some."""
+        params = {"camera": camera, "width": size[0], "height": size[1]}
         key = (f"{feed.network}:{robot}", camera, size)
+        return self._frames(key, lambda: feed.call(robot, "getPicture", params, ANSWER_S), hz)
+
+    def pose(self, feed: FleetFeed, robot: str) -> AsyncGenerator[bytes, None]:
+        """Yield pictures of a robot's pose, drawn here; a slow reader misses some."""
+        # No camera has this size.
+        key = (f"{feed.network}:{robot}", "", (0, 0))
+        return self._frames(key, lambda: self.poses.picture(feed, robot), poses.HZ)
+
+    async def _frames(
+        self, key: tuple[str, str, tuple[int, int]], ask: Callable[[], Awaitable[Envelope]], hz: float
+    ) -> AsyncGenerator[bytes, None]:
         stream = self._streams.get(key)
         if stream is None:
             if len(self._streams) >= STREAMS_MAX:
                 return
             stream = self._streams[key] = _Stream()
-            params = {"camera": camera, "width": size[0], "height": size[1]}
-            stream.task = asyncio.create_task(
-                _take(stream, lambda: feed.call(robot, "getPicture", params, ANSWER_S), hz)
-            )
+            stream.task = asyncio.create_task(_take(stream, ask, hz))
         stream.viewers += 1
         seen = 0
         try:
@@ -66,19 +77,21 @@ class Pictures:
                 if stream.task is not None:
                     stream.task.cancel()
 
-    async def mjpeg(self, feed: FleetFeed, robot: str, camera: str) -> AsyncGenerator[bytes, None]:
-        """Yield the parts of a ``multipart/x-mixed-replace`` answer."""
-        async for frame in self.frames(feed, robot, camera):
-            head = b"--%s\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % (BOUNDARY, len(frame))
-            # The first part is shown only once the second begins, so every part is followed by a boundary.
-            yield head + frame + b"\r\n"
-
     def close(self) -> None:
         """End every stream."""
         for stream in self._streams.values():
             if stream.task is not None:
                 stream.task.cancel()
         self._streams.clear()
+        self.poses.close()
+
+
+async def mjpeg(frames: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:
+    """Yield the parts of a ``multipart/x-mixed-replace`` answer."""
+    async for frame in frames:
+        head = b"--%s\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % (BOUNDARY, len(frame))
+        # The first part is shown only once the second begins, so every part is followed by a boundary.
+        yield head + frame + b"\r\n"
 
 
 async def _take(stream: _Stream, ask: Callable[[], Awaitable[Envelope]], hz: float) -> None:

@@ -26,7 +26,7 @@ from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.operator_key import OperatorKey
 from strands_robots.dashboard.page_session import PageSession, Shared
-from strands_robots.dashboard.pictures import BOUNDARY
+from strands_robots.dashboard.pictures import BOUNDARY, mjpeg
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +58,7 @@ class Dashboard:
         operator_key: frees robots and takes control.
         source: the caller that robots see.
         signed: emergency stops are signed.
+        starting: ids of robots that were started and will come.
     """
 
     def __init__(
@@ -69,12 +70,13 @@ class Dashboard:
         *,
         source: str = "dashboard",
         signed: bool = False,
+        starting: tuple[str, ...] = (),
     ) -> None:
         self.model = model
         self.feeds: Mapping[str, FleetFeed] = {feed.network: feed for feed in feeds}
         self.access = access
         self.stop = FleetStop(model, self.feeds.values())
-        self._shared = Shared(model, self.feeds, operator_key or OperatorKey(None), source, signed)
+        self._shared = Shared(model, self.feeds, operator_key or OperatorKey(None), source, signed, starting)
         self._sessions: dict[str, PageSession] = {}
 
     def app(self) -> ASGIApp:
@@ -190,7 +192,10 @@ class Dashboard:
             return PlainTextResponse("This page's ticket is needed.\n", 403)
         if row is None or feed is None:
             return PlainTextResponse("No such robot.\n", 404)
-        stream = self._shared.pictures.mjpeg(feed, row.id, asked.get("camera", "")[:128])
+        pictures = self._shared.pictures
+        posed = asked.get("pose", "") != ""
+        frames = pictures.pose(feed, row.id) if posed else pictures.camera(feed, row.id, asked.get("camera", "")[:128])
+        stream = mjpeg(frames)
         return StreamingResponse(stream, media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY.decode()}")
 
 

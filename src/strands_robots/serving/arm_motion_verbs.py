@@ -139,7 +139,7 @@ _VERBS = (
         "getPose",
         Kind.READ,
         "Read where the tip of the gripper is, its approach and the joints, in metres and degrees in the base frame.",
-        returns="x, y, z, approach, joints, gripper, holding",
+        returns="x, y, z, approach, joints, gripper, holding, model",
         run=of_arm("arm_pose"),
     ),
     Verb(

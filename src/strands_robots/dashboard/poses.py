@@ -1,0 +1,85 @@
+"""3-D poses of arms that bring no picture of themselves: drawn from their joints, while somebody looks."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.envelope import Envelope, error, is_error, success, text_of
+
+HZ = 5.0
+SIZE = (640, 480)
+ANSWER_S = 5.0
+DRAW_S = 30.0
+"""Seconds for one picture; the first loads MuJoCo."""
+
+IDLE_S = 20.0
+"""Seconds without a picture after which the process that draws ends."""
+
+PROGRAM = (sys.executable, "-m", "strands_robots.dashboard.pose_process")
+
+
+class Poses:
+    """Pictures of arms, drawn by one process that lives while they are asked for."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="dashboard-poses")
+        self._process: subprocess.Popen[str] | None = None
+        self._idle: asyncio.TimerHandle | None = None
+
+    async def picture(self, feed: FleetFeed, robot: str) -> Envelope:
+        """Return ``jpeg`` of a robot in the pose of its joints, or an error that says why there is none."""
+        pose = await feed.call(robot, "getPose", {}, ANSWER_S)
+        if is_error(pose):
+            return error(text_of(pose)[:300])
+        loop = asyncio.get_running_loop()
+        order = {name: pose.get(name) for name in ("model", "joints", "gripper")}
+        size = {"width": SIZE[0], "height": SIZE[1]}
+        drawn = await loop.run_in_executor(self._thread, self._drawn, json.dumps({**order, **size}, default=str))
+        if self._idle is not None:
+            self._idle.cancel()
+        self._idle = loop.call_later(IDLE_S, self._thread.submit, self._end)
+        if "jpeg" not in drawn:
+            return error(str(drawn.get("error"))[:300])
+        return success("The pose.", jpeg=drawn["jpeg"])
+
+    def close(self) -> None:
+        """End the process, and draw no more."""
+        if self._idle is not None:
+            self._idle.cancel()
+        self._thread.submit(self._end)
+        self._thread.shutdown(wait=False, cancel_futures=False)
+
+    # On the thread.
+
+    def _drawn(self, order: str) -> dict[str, Any]:
+        if self._process is None:
+            self._process = subprocess.Popen(
+                PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+            )
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None
+        late = threading.Timer(DRAW_S, process.kill)
+        late.start()
+        try:
+            process.stdin.write(order + "\n")
+            process.stdin.flush()
+            drawn: dict[str, Any] = json.loads(process.stdout.readline())
+        except (OSError, ValueError):
+            self._end()
+            return {"error": "The process that draws the pose ended."}
+        finally:
+            late.cancel()
+        return drawn
+
+    def _end(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.communicate()  # closes its pipes, too
