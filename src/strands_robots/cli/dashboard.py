@@ -103,6 +103,7 @@ def dashboard(
             OperatorKey(operator_key),
             source=source,
             signed=signer is not None,
+            starting=() if robots is None else tuple(DEMO_ROBOTS),
         )
         stack.callback(page.close)
         _serve(screen, page, sockets, remote, robots, browser=not no_browser)

@@ -152,7 +152,7 @@ def test_page_works_by_keyboard_alone(page: Any, served: ServedPage) -> None:
     assert {"stop", "search", "filter", "name", "stop-one"} <= reached
     page.locator("#stop").focus()
     page.keyboard.press("Enter")
-    shows(page, "document.getElementById('stop-said').textContent.length > 0")
+    shows(page, "document.getElementById('stop-said').textContent.includes('STOP pressed')")
     assert len(served.feed.controller.presses) == 1
 
 

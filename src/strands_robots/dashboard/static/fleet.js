@@ -51,7 +51,7 @@ export class Fleet {
     const wanted = text.trim().toLowerCase();
     return [...this.rows.values()]
       .filter((row) => !wanted ||
-        `${row.id} ${row.kind} ${row.model} ${row.task.instruction || ""} ${S.network[row.network] || ""}`.toLowerCase().includes(wanted))
+        `${row.id} ${row.kind} ${kindText(row)} ${row.task.instruction || ""}`.toLowerCase().includes(wanted))
       .filter((row) => which === "all" || (which === "attention" && this.attention(row) < 5) ||
         (which === "locked" && row.locked) || (which === "moving" && this.moving(row)) ||
         (which === "idle" && !this.moving(row) && row.locked === false))
@@ -90,6 +90,10 @@ export function lockText(row) {
   return `${S.lockedBy(first.source, at)}${why}${row.lockouts.length > 1 ? ` (×${row.lockouts.length})` : ""}`;
 }
 
+export function kindText(row) {
+  return [row.model, S.kinds[row.kind] || row.kind, S.network[row.network] || row.network].filter(Boolean).join(" · ");
+}
+
 export function taskText(row) {
   const task = row.task;
   if (!task.state || task.state === "idle") return S.idle;
@@ -113,7 +117,9 @@ class Card {
   constructor(row, onStop) {
     this.key = row.key;
     const href = `#/robot/${encodeURIComponent(row.key)}`;
-    this.picture = el("img", { class: "thumb", alt: "", hidden: true });
+    this.picture = el("img", { class: "thumb", alt: "" });
+    // A second link to the same place, for a pointer.
+    this.shot = el("a", { class: "shot", href, tabindex: -1, "aria-hidden": "true", hidden: true }, this.picture);
     this.name = el("a", { class: "name", href });
     this.kind = el("span", { class: "kind" });
     this.task = el("p", { class: "task" });
@@ -124,17 +130,19 @@ class Card {
     this.age = el("span", { class: "age" });
     this.stop = el("button", { type: "button", class: "stop-one", title: S.stopOne(row.id), "aria-label": S.stopOne(row.id), text: S.stopOneShort });
     this.stop.addEventListener("click", () => onStop(row.id));
-    this.node = el("li", { class: "card", "data-key": row.key },
-      el("div", { class: "head" }, el("div", { class: "who" }, this.name, this.kind), this.stop),
-      el("div", { class: "body" }, this.picture,
-        el("div", { class: "facts" }, this.task, this.lock, this.verdict,
-          el("p", { class: "small" }, this.control, this.check, this.age))));
+    this.node = el("li", { class: "card", "data-key": row.key }, this.shot,
+      el("div", { class: "body" },
+        el("div", { class: "head" }, el("div", { class: "who" }, this.name, this.kind), this.stop),
+        el("div", { class: "now" }, this.task, this.lock), this.verdict,
+        el("p", { class: "small" }, this.control, this.check, this.age)));
   }
 
   show(fleet, row) {
     setText(this.name, row.id);
-    setText(this.kind, [row.model, row.kind, S.network[row.network]].filter(Boolean).join(" · "));
+    setText(this.kind, kindText(row));
     setText(this.task, taskText(row));
+    setAttr(this.task, "data-on", fleet.moving(row) ? "yes" : "no");
+    this.shot.hidden = !row.pictures;
     setAttr(this.node, "data-attention", fleet.attention(row));
     setText(this.lock, lockText(row));
     setAttr(this.lock, "data-tone", row.alarm ? "bad" : row.locked === false ? "quiet" : "warn");
@@ -159,16 +167,18 @@ export class FleetView {
     this.cards = new Map();
     this.visible = new Set();
     this.drawn = new Map();
+    this.starting = [];
     this.search = el("input", { id: "search", type: "search", placeholder: S.searchHint, autocomplete: "off", spellcheck: "false" });
     this.filter = el("select", { id: "filter" });
     for (const [value, text] of Object.entries(S.filters)) this.filter.append(el("option", { value, text }));
     this.count = el("span", { id: "count", role: "status" });
     this.list = el("ul", { id: "cards" });
+    this.coming = el("ul", { id: "coming", "aria-label": S.coming });
     this.empty = el("p", { class: "empty" });
     this.node = el("div", { id: "fleet" },
       el("div", { class: "tools" }, el("label", { for: "search", text: S.search }), this.search,
         el("label", { for: "filter", text: S.filter }), this.filter, this.count),
-      this.empty, this.list);
+      this.empty, this.list, this.coming);
     for (const control of [this.search, this.filter]) control.addEventListener("input", () => { this.order = ""; this.draw(); });
     this.observer = new IntersectionObserver((entries) => {
       for (const entry of entries) {
@@ -182,7 +192,8 @@ export class FleetView {
   draw() {
     const rows = this.fleet.sorted(this.search.value, this.filter.value);
     setText(this.count, S.shown(rows.length, this.fleet.rows.size));
-    setText(this.empty, !this.admitted ? "" : this.fleet.rows.size === 0 ? S.none : rows.length === 0 ? S.noMatch : "");
+    this.drawComing();
+    setText(this.empty, !this.admitted || this.coming.childElementCount ? "" : this.fleet.rows.size === 0 ? S.none : rows.length === 0 ? S.noMatch : "");
     this.empty.hidden = this.empty.textContent === "";
     for (const row of rows) {
       let card = this.cards.get(row.key);
@@ -198,6 +209,16 @@ export class FleetView {
     // A card that has the focus or the pointer is not moved away under it.
     const busy = this.list.querySelector(":hover, :focus-within") !== null;
     if (order !== this.order && !(busy && this.sameKeys(rows))) this.arrange(rows, order);
+  }
+
+  // Robots that the server has started and that are not on the network yet.
+  drawComing() {
+    const known = new Set([...this.fleet.rows.values()].map((row) => row.id));
+    const names = this.starting.filter((name) => !known.has(name));
+    if (names.join() === this.drawnComing) return;
+    this.drawnComing = names.join();
+    this.coming.replaceChildren(...names.map((name) => el("li", {}, el("strong", { text: name }), ` ${S.starting}`)));
+    this.coming.hidden = names.length === 0;
   }
 
   sameKeys(rows) {
@@ -235,7 +256,6 @@ export class FleetView {
     if (!card) return;
     const old = card.picture.src;
     card.picture.src = URL.createObjectURL(new Blob([new Uint8Array(data, 2 + length)], { type: "image/jpeg" }));
-    card.picture.hidden = false;
     if (old.startsWith("blob:")) URL.revokeObjectURL(old);
   }
 }

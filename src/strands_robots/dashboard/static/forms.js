@@ -66,5 +66,5 @@ export function verbForm(form, ask, canMove) {
     setText(said, answer ? `${answer.text}${facts}`.slice(0, 4000) : S.noAnswer);
   });
   return el("details", { class: "verb" },
-    el("summary", {}, el("code", { text: form.name }), ` ${form.kind === "read" ? S.reads : S.moves}`), node);
+    el("summary", {}, el("code", { text: form.name }), " ", el("span", { class: "does", "data-kind": form.kind, text: STOPS.includes(form.name) ? S.stops : form.kind === "read" ? S.reads : S.moves })), node);
 }

@@ -67,7 +67,7 @@ export class Jog {
 
   button(kind, axis, direction, label, text, keyHint) {
     const what = { kind, axis, direction, label };
-    const node = el("button", { type: "button", class: "jog", disabled: !this.enabled, "aria-label": label, "aria-keyshortcuts": keyHint || null, "data-key": keyHint || null, text });
+    const node = el("button", { type: "button", class: "jog", disabled: !this.enabled, "aria-label": label, "aria-keyshortcuts": keyHint || null, "data-key": keyHint || null, "data-way": direction > 0 ? "plus" : "minus", text });
     node.addEventListener("pointerdown", (event) => {
       if (event.button !== 0) return;
       // Released over the button or anywhere else, the pointer is ours.

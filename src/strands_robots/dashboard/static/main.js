@@ -50,7 +50,12 @@ function route() {
   try { key = found ? decodeURIComponent(found[1]) : ""; } catch { key = ""; }
   if (key) {
     robot.open(key);
-    if (robot.node.parentNode !== main) { main.replaceChildren(robot.node); view.askThumbnails(); main.focus(); }
+    if (robot.node.parentNode !== main) {
+      main.replaceChildren(robot.node);
+      view.askThumbnails();
+      main.focus({ preventScroll: true });
+      window.scrollTo(0, 0);
+    }
   } else {
     if (robot.key) robot.close();
     if (view.node.parentNode !== main) { main.replaceChildren(view.node); view.asked = ""; view.askThumbnails(); }
@@ -72,6 +77,7 @@ function draw() {
 state.addEventListener("hello", ({ detail }) => {
   robot.hello = resume.hello = detail;
   setText(document.getElementById("stop-hint"), detail.signed ? S.stopAllSigned : S.stopAll);
+  view.starting = detail.starting;
   fleet.rows.clear();
   fleet.events = [];
   fleet.mine.clear();

@@ -1,5 +1,6 @@
 // Resume stands far from STOP, in words and in place, and asks for the passphrase each time.
 import { el, setText, toast } from "./dom.js";
+import { byName } from "./fleet.js";
 import { S } from "./strings.js";
 
 export class Resume {
@@ -18,14 +19,14 @@ export class Resume {
     document.getElementById("resume-area").append(this.node);
   }
 
-  locked() { return [...this.fleet.rows.values()].filter((row) => row.locked); }
+  locked() { return [...this.fleet.rows.values()].filter((row) => row.locked).sort((a, b) => byName.compare(a.id, b.id)); }
 
   draw() {
     const locked = this.locked(), hello = this.hello;
     this.node.parentNode.hidden = locked.length === 0 && !this.node.open;
     setText(this.which, locked.length ? S.resumeWhich(locked.map((row) => row.id).slice(0, 40).join(", ")) : "");
     const why = !hello ? "" : hello.role !== "operator" ? S.viewer : !hello.local ? S.resumeRemote : !hello.operator_key ? S.resumeNoKey : "";
-    setText(this.hint, why);
+    setText(this.hint, why || (hello && hello.starting.length ? S.resumeDemo : ""));
     this.form.hidden = why !== "" || !hello;
   }
 

@@ -1,6 +1,6 @@
 // One robot: cameras, joints, driving by hand, its verbs and its timeline.
 import { el, setAttr, setText } from "./dom.js";
-import { ageText, controlText, lockText, taskText, verdictText, verdictTone } from "./fleet.js";
+import { ageText, controlText, kindText, lockText, taskText, verdictText, verdictTone } from "./fleet.js";
 import { verbForm } from "./forms.js";
 import { Jog } from "./jog.js";
 import { Plot } from "./plot.js";
@@ -31,13 +31,14 @@ export class RobotView {
     this.chosen = el("select", { id: "camera-name" });
     this.chosen.addEventListener("change", () => this.showCamera());
     this.pictures = el("section", { class: "panel pictures", "aria-labelledby": "camera-title" },
-      el("div", { class: "tools" }, el("h3", { id: "camera-title", text: S.camera }), el("label", { for: "camera-name", class: "hidden", text: S.camera }), this.chosen),
-      this.camera, this.noCamera = el("p", { class: "small", text: S.noCamera }), el("h3", { text: S.pose }), this.pose,
-      this.noPose = el("p", { class: "small", text: S.noPose }));
+      el("div", { class: "tools" }, el("h3", { id: "camera-title", text: S.camera }), el("label", { for: "camera-name", class: "hidden", text: S.cameraWhich }), this.chosen),
+      this.camera, this.noCamera = el("p", { class: "small", text: S.noCamera }));
+    this.posePanel = el("section", { class: "panel pose", "aria-labelledby": "pose-title" }, el("h3", { id: "pose-title", text: S.pose }), this.pose,
+      this.noPose = el("p", { class: "small", role: "status" }));
     this.joints = el("div", { class: "bars" });
     const canvas = el("canvas", { class: "plot", role: "img", "aria-label": S.plot });
     this.plot = new Plot(canvas);
-    this.jointsPanel = el("section", { class: "panel", "aria-labelledby": "joints-title" }, el("h3", { id: "joints-title", text: S.joints }), this.joints,
+    this.jointsPanel = el("section", { class: "panel joints", "aria-labelledby": "joints-title" }, el("h3", { id: "joints-title", text: S.joints }), this.joints,
       el("h3", { text: S.plot }), canvas);
     this.jogSaid = el("p", { class: "said", role: "status", "aria-live": "polite", text: S.jogHint });
     this.jog = new Jog(state, this.jogSaid);
@@ -53,13 +54,13 @@ export class RobotView {
     this.pads = el("div", { class: "pads" });
     this.drive = el("section", { class: "panel drive", "aria-labelledby": "drive-title" }, el("h3", { id: "drive-title", text: S.drive }), this.control,
       el("div", { class: "tools" }, this.take, el("label", { for: "jog-speed", text: S.speed }), this.speed), this.passphraseField, this.jogSaid, this.pads);
-    this.verbs = el("section", { class: "panel", "aria-labelledby": "verbs-title" });
+    this.verbs = el("section", { class: "panel verbs", "aria-labelledby": "verbs-title" });
     this.timeline = new Timeline(fleet);
     this.node = el("div", { id: "robot" },
       el("p", {}, el("a", { href: "#/", text: S.back })),
-      el("div", { class: "head" }, el("div", {}, this.title, this.kind), el("div", { class: "stop-own" }, this.stop, el("p", { class: "small", text: S.stopOneWhy }))),
-      this.task, this.lock, this.verdict, this.age, this.forget,
-      el("div", { class: "columns" }, el("div", {}, this.pictures, this.jointsPanel), el("div", {}, this.drive, this.verbs)), this.timeline.node);
+      el("div", { class: "head" }, el("div", {}, this.title, this.kind, el("div", { class: "now" }, this.task, this.lock, this.verdict, this.age), this.forget), el("div", { class: "stop-own" }, this.stop, el("p", { class: "small", text: S.stopOneWhy }))),
+      el("div", { class: "columns" }, this.pictures, this.drive, this.posePanel, this.jointsPanel), this.verbs, this.timeline.node);
+    state.addEventListener("pose", ({ detail }) => { if (detail.key === this.key) this.showPose(detail.why); });
     state.addEventListener("robot", ({ detail }) => { if (detail.key === this.key) this.details(detail); });
     state.addEventListener("joints", ({ detail }) => { if (detail.key === this.key) this.take_joints(detail); });
   }
@@ -76,6 +77,8 @@ export class RobotView {
     this.verbs.replaceChildren(el("h3", { id: "verbs-title", text: S.verbs }));
     this.signature = "";
     this.cameras = "";
+    this.showPose(S.poseComing);
+    this.takeRefused = false;
     this.jog.key = key;
     this.jog.axes = [];
     this.watch();
@@ -115,19 +118,26 @@ export class RobotView {
     this.noCamera.hidden = !none;
     for (const node of [this.camera, this.chosen]) node.hidden = none;
     this.showCamera();
-    const pose = names.includes("overview");
-    this.pose.hidden = !pose;
-    this.noPose.hidden = pose;
-    if (pose) this.show(this.pose, "overview");
+    this.ownPose = names.includes("overview");
+    if (this.ownPose) this.showPose("");
+  }
+
+  // A simulation draws its own; of another arm the page's server draws one from the joints that it tells.
+  showPose(why) {
+    this.pose.hidden = why !== "";
+    this.noPose.hidden = why === "";
+    setText(this.noPose, why && why !== S.poseComing ? S.noPose(why) : why);
+    if (why) this.pose.removeAttribute("src");
+    else if (!this.pose.getAttribute("src")) this.show(this.pose, "overview", !this.ownPose);
   }
 
   showCamera() { if (this.chosen.value) this.show(this.camera, this.chosen.value); }
 
-  show(image, camera) {
+  show(image, camera, drawn = false) {
     const row = this.row();
     if (!this.hello || !row) return;
-    image.alt = S.pictureOf(row.id, camera);
-    image.src = `camera?${new URLSearchParams({ robot: this.key, camera, ticket: this.hello.ticket })}`;
+    image.alt = drawn ? S.poseOf(row.id) : S.pictureOf(row.id, camera);
+    image.src = `camera?${new URLSearchParams({ robot: this.key, camera, ticket: this.hello.ticket, ...(drawn ? { pose: "1" } : {}) })}`;
   }
 
   take_joints(detail) {
@@ -158,11 +168,12 @@ export class RobotView {
     this.jog.axes = [];
     const groups = [], names = this.names || new Set();
     const moving = (this.jointNames || []).filter((name) => name !== "gripper");
-    const pair = (kind, axis, [minus, plus], index) => {
+    const pair = (kind, axis, [minus, plus], index, name = "") => {
       const [up, down] = index === null ? ["", ""] : this.jog.keysOf(index);
-      return el("div", { class: "pair" }, this.jog.button(kind, axis, -1, minus, minus, down), this.jog.button(kind, axis, 1, plus, plus, up));
+      return el("div", { class: name ? "pair named" : "pair" }, name ? el("span", { text: name }) : null,
+        this.jog.button(kind, axis, -1, minus, name ? "\u2212" : minus, down), this.jog.button(kind, axis, 1, plus, name ? "+" : plus, up));
     };
-    if (names.has("moveJoints") && moving.length) groups.push(el("fieldset", {}, el("legend", { text: S.jogJoint }), ...moving.slice(0, 10).map((name, index) => pair("joint", name, [S.minus(name), S.plus(name)], index))));
+    if (names.has("moveJoints") && moving.length) groups.push(el("fieldset", {}, el("legend", { text: S.jogJoint }), ...moving.slice(0, 10).map((name, index) => pair("joint", name, [S.minus(name), S.plus(name)], index, name))));
     if (names.has("moveBy")) groups.push(el("fieldset", {}, el("legend", { text: S.jogTip }), ...Object.entries(S.tip).map(([axis, ways]) => pair("tip", axis, ways, null))));
     if (names.has("setGripper")) {
       groups.push(el("fieldset", {}, el("legend", { text: S.jogGripper }), el("div", { class: "pair" },
@@ -178,8 +189,10 @@ export class RobotView {
     const secret = this.passphrase.value;
     this.passphrase.value = "";
     const answer = await this.state.ask(mine ? { type: "give", key: this.key } : { type: "take", key: this.key, part: "", passphrase: secret });
+    this.takeRefused = !mine && !(answer && answer.ok);
     setText(this.jogSaid, answer ? answer.text : S.noAnswer);
     this.jogSaid.dataset.tone = answer && answer.ok ? "good" : "bad";
+    this.draw();
   }
 
   control_changed(detail) {
@@ -192,8 +205,9 @@ export class RobotView {
     setText(this.title, row.id);
     setAttr(this.stop, "aria-label", S.stopOne(row.id));
     setAttr(this.stop, "title", S.stopOne(row.id));
-    setText(this.kind, [row.model, row.kind, S.network[row.network]].filter(Boolean).join(" · "));
+    setText(this.kind, kindText(row));
     setText(this.task, taskText(row));
+    setAttr(this.task, "data-on", this.fleet.moving(row) ? "yes" : "no");
     setText(this.lock, lockText(row) + (row.lockouts.length ? ` · ${S.epoch} ${row.lockouts[0].epoch}` : ""));
     setAttr(this.lock, "data-tone", row.alarm ? "bad" : row.locked === false ? "quiet" : "warn");
     setText(this.verdict, row.stop ? `${S.lastStop}: ${verdictText(row.stop)}` : "");
@@ -204,8 +218,10 @@ export class RobotView {
     setText(this.control, `${controlText(this.fleet, row)}${row.locked ? `. ${S.lockedHere}` : ""}`);
     const mine = this.fleet.mine.has(this.key), operator = this.hello && this.hello.role === "operator";
     setText(this.take, mine ? S.give : S.take);
+    setAttr(this.take, "class", mine ? "" : "primary");
     this.take.disabled = !operator;
-    this.passphraseField.hidden = mine || !(this.hello && this.hello.operator_key && this.hello.local);
+    const signable = this.hello && this.hello.operator_key && this.hello.local;
+    this.passphraseField.hidden = mine || !signable || !(this.takeRefused || row.control.held);
     this.jog.setEnabled(Boolean(mine && operator && row.locked === false));
     if (!operator && this.hello) setText(this.jogSaid, S.viewer);
     this.timeline.draw(this.key);
@@ -224,7 +240,7 @@ class Bar {
   show(value, [low, high]) {
     const share = Math.min(1, Math.max(0, (value - low) / (high - low)));
     this.mark.style.left = `${(share * 100).toFixed(2)}%`;
-    setText(this.value, value.toFixed(3));
+    setText(this.value, value.toFixed(2));
     for (const [name, number] of [["aria-valuenow", value], ["aria-valuemin", Math.min(low, value)], ["aria-valuemax", Math.max(high, value)]]) setAttr(this.meter, name, number.toFixed(3));
     this.meter.dataset.edge = share < 0.02 || share > 0.98 ? "yes" : "no";
   }

@@ -15,6 +15,7 @@ export class Stop {
     this.id = 0;
     this.unconfirmed = new Map();
     this.notSent = "";
+    this.silentSince = 0;
     this.button = document.getElementById("stop");
     this.said = document.getElementById("stop-said");
     this.alarm = document.getElementById("alarm");
@@ -47,8 +48,10 @@ export class Stop {
     if (!this.channel.alive) return S.noServer;
     if (!this.link) return S.connecting;
     if (Object.values(this.link.links).some((up) => !up)) return S.noNetwork;
-    if (!this.link.can_stop) return S.silentNetwork((this.link.silent_s || 0).toFixed(1));
-    return "";
+    // The time stands still: a text that counts would be read out again and again.
+    if (this.link.can_stop) this.silentSince = 0;
+    else this.silentSince = this.silentSince || Date.now() - (this.link.silent_s || 0) * 1000;
+    return this.silentSince ? S.silentNetwork(S.when(new Date(this.silentSince))) : "";
   }
 
   look() {
@@ -68,10 +71,11 @@ export class Stop {
     const answers = [...this.fleet.rows.values()].filter((row) => row.stop).sort((a, b) => byName.compare(a.id, b.id));
     const latest = this.link ? this.link.pressed_at : this.pressedAt;
     this.pressedAt = latest;
-    const signature = JSON.stringify([latest, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
+    const ready = answers.length === 0 && document.body.dataset.canStop === "yes" ? this.fleet.rows.size : 0;
+    const signature = JSON.stringify([ready, latest, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
     if (signature === this.signature) return;
     this.signature = signature;
-    if (!latest && answers.length === 0) { this.said.replaceChildren(); return; }
+    if (!latest && answers.length === 0) { this.said.replaceChildren(...(ready ? [el("p", { "data-tone": "quiet", text: S.ready(ready) })] : [])); return; }
     const groups = new Map(ORDER.map((state) => [state, []]));
     for (const row of answers) (groups.get(row.stop.state) || groups.get("unknown")).push(row);
     const bad = ORDER.slice(0, -1).some((state) => groups.get(state).length) || answers.some((row) => row.stop.alarm);
@@ -83,7 +87,7 @@ export class Stop {
     let summary = counts;
     if (answers.length === 0) summary = running ? S.waitingAnswers : S.noneAnswered;
     else if (freed) summary = S.freedAll(counts);
-    else if (!bad && !running && !someFreed) summary = S.allStopped(stopped);
+    else if (!bad && !running && !someFreed) summary = `${S.allStopped(stopped)} ${S.nowLocked}`;
     const head = el("p", { class: "stop-head", "data-tone": bad || answers.length === 0 ? "bad" : running ? "warn" : someFreed ? "quiet" : "good" },
       el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)))}: ` : "" }), summary);
     const list = el("ul", { class: "answers" });

@@ -3,6 +3,7 @@ import { el } from "./dom.js";
 import { S } from "./strings.js";
 
 const SHOWN_MAX = 100;
+const EMPTY = ["", "[]", "{}", null];
 
 export class Timeline {
   constructor(fleet) {
@@ -11,7 +12,7 @@ export class Timeline {
     this.which = el("select", { id: "timeline-which", "aria-label": S.timelineFilter });
     for (const [value, text] of Object.entries(S.withAudit)) this.which.append(el("option", { value, text }));
     this.list = el("ol", { class: "events" });
-    this.node = el("section", { class: "panel", "aria-labelledby": "timeline-title" }, el("h2", { id: "timeline-title", text: S.timeline }),
+    this.node = el("section", { class: "panel", "aria-labelledby": "timeline-title" }, el("h3", { id: "timeline-title", text: S.timeline }),
       el("div", { class: "tools" }, el("label", { for: "timeline-filter", text: S.timelineFilter }), this.filter, this.which), this.list);
     for (const control of [this.filter, this.which]) control.addEventListener("input", () => this.draw(this.robot, true));
   }
@@ -30,7 +31,7 @@ export class Timeline {
       .slice(-SHOWN_MAX).reverse();
     this.list.replaceChildren(...shown.map((each) => el("li", { "data-audit": each.audit ? "yes" : "no" },
       el("time", { text: S.when(new Date(each.at * 1000)) }), " ", el("strong", { text: each.event }), ` ${each.robot} `,
-      el("small", { text: Object.entries(each.facts).filter(([, value]) => value !== "" && value !== null).map(([name, value]) => `${name}: ${value}`).join(" · ") }))));
+      el("small", { text: Object.entries(each.facts).filter(([, value]) => !EMPTY.includes(value)).map(([name, value]) => `${name}: ${value}`).join(" · ") }))));
     if (!shown.length) this.list.append(el("li", { text: S.nothing }));
   }
 }
