@@ -19,6 +19,8 @@ from typing import Any
 import psutil
 from fixtures.child import Child
 from fixtures.command_line import Machine
+from fixtures.network_lab import NetworkLab, missing
+from fixtures.page_lab import page_beyond
 from fixtures.page_site import PageServer, browser, shows
 from fixtures.stop_robots import robots
 from fixtures.waiting import eventually
@@ -183,21 +185,39 @@ def _hide(page: Any) -> float:
     return _monotonic(hidden)
 
 
-def _silences(bench: Bench, times: int, process: Any) -> list[float]:
-    """Milliseconds from a process's SIGSTOP until the page says that it cannot stop."""
+def _silences(page: Any, times: int, gone: Callable[[bool], object]) -> list[float]:
+    """Milliseconds from when something is gone until the page says that it cannot stop."""
     took = []
-    with bench.page() as page:
-        for _ in range(times):
-            shows(page, "document.body.dataset.canStop === 'yes' && window.alarmedAt === 0", 60.0)
-            began = time.monotonic()
-            os.kill(process.pid, signal.SIGSTOP)
-            try:
-                shows(page, "window.alarmedAt > 0", 60.0)
-                # Before the process goes on, which ends the alarm.
-                took.append((_monotonic(page.evaluate("window.alarmedAt")) - began) * 1000)
-            finally:
-                os.kill(process.pid, signal.SIGCONT)
+    for _ in range(times):
+        shows(page, "document.body.dataset.canStop === 'yes' && window.alarmedAt === 0", 60.0)
+        began = time.monotonic()
+        gone(True)
+        try:
+            shows(page, "window.alarmedAt > 0", 60.0)
+            # Before it comes back, which ends the alarm.
+            took.append((_monotonic(page.evaluate("window.alarmedAt")) - began) * 1000)
+        finally:
+            gone(False)
     return took
+
+
+def _hangs(bench: Bench, times: int, process: Any) -> list[float]:
+    with bench.page() as page:
+        return _silences(page, times, lambda gone: os.kill(process.pid, signal.SIGSTOP if gone else signal.SIGCONT))
+
+
+def _cuts(times: int) -> list[Row]:
+    """Cut the network between the page's server and the robots, which needs root."""
+    rows = []
+    for transport in () if missing() else ("zenoh", "nats"):
+        with NetworkLab() as lab, tempfile.TemporaryDirectory() as folder:
+
+            def cut(gone: bool, lab: NetworkLab = lab) -> None:
+                lab.weather.parted = gone
+
+            with page_beyond(lab, Path(folder), transport, NOTE_INPUT) as (_, page):
+                rows.append(_row(f"network cut until the page says so, {transport}", _silences(page, times, cut), 1000))
+    return rows
 
 
 def _paint(bench: Bench) -> list[float]:
@@ -278,8 +298,8 @@ def run(*, quick: bool = False) -> list[Row]:
             _row("tab hidden during a jog to the last write", _jogs(bench, jogs, _hide), 300),
             _row("browser killed during a jog to the last write", _kills(bench, kills), 500),
             _row("first useful paint, four robots", _paint(bench), 1500),
-            _row("server hangs until the page says so", _silences(bench, silences, bench.server.process), 1000),
-            _row("network silent until the page says so", _silences(bench, silences, bench.arms), 1000),
+            _row("server hangs until the page says so", _hangs(bench, silences, bench.server.process), 1000),
+            _row("network silent until the page says so", _hangs(bench, silences, bench.arms), 1000),
             _weight(bench),
         ]
-    return [*rows, *hundred(10.0 if quick else 60.0)]
+    return [*rows, *_cuts(silences), *hundred(10.0 if quick else 60.0)]
