@@ -250,7 +250,7 @@ class PageSession:
             self.tell({"type": "pose", "key": key, "why": ""})
 
     async def _no_pose(self, key: str, feed: FleetFeed, robot: str) -> str:
-        """Return why no pose can be drawn of a robot, after drawing one; empty where its server draws it."""
+        """Return why no pose of a robot can be drawn, after drawing one; else empty."""
         row = self._server.model.row(key)
         if row is None or OVERVIEW in row.cameras:
             return ""

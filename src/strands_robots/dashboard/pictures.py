@@ -1,4 +1,4 @@
-"""Pictures of the robots' cameras and poses: one stream for all who look at the same one."""
+"""Pictures of cameras and poses: one stream for all who look at the same."""
 
 from __future__ import annotations
 

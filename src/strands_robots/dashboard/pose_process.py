@@ -1,7 +1,8 @@
-"""Program that draws arms in the pose of their joints: ``python -m strands_robots.dashboard.pose_process``.
+"""Program that draws arms as their joints are.
 
-It reads one JSON object a line and answers each with one, ``jpeg`` in base64 or ``error``; it ends with its input. It
-is a process of its own, so that neither MuJoCo nor OpenGL can hold up, or take down, the server that sends stops.
+``python -m strands_robots.dashboard.pose_process`` reads one JSON object a line and answers each with one, ``jpeg`` in
+base64 or ``error``; it ends with its input. It is a process of its own, so that neither MuJoCo nor OpenGL can hold up,
+or take down, the server that sends stops.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ class PosePainter:
         self._renderer = Renderer()
 
     def positions(self, joints: object, gripper: object) -> dict[str, float]:
-        """Return the model's joint positions (rad) for degrees by name and an opening from 0 to 1.
+        """Return the model's joint positions (rad) by name.
+
+        ``joints`` are degrees by name, ``gripper`` is an opening from 0 to 1 or None.
 
         Raises:
             ValidationError: a joint is missing or no number.
@@ -64,7 +67,7 @@ class PosePainter:
         self._renderer.close()
 
     def draw(self, joints: object, gripper: object, width: int, height: int) -> bytes:
-        """Draw the arm as a JPEG; without OpenGL in lines and planes. Raises as :meth:`positions`."""
+        """Draw the arm as a JPEG, without OpenGL too. Raises as :meth:`positions`."""
         from strands_robots.recording.cameras import jpeg  # noqa: PLC0415 - as above
         from strands_robots.simulation import projection  # noqa: PLC0415 - as above
         from strands_robots.simulation.rendering import OVERVIEW, RenderingError, camera_view  # noqa: PLC0415 - as above
@@ -83,7 +86,7 @@ class PosePainter:
 
 
 def main(orders: IO[str], answers: IO[str]) -> None:
-    """Answer orders with ``model``, ``joints``, ``gripper``, ``width`` and ``height`` until there are no more."""
+    """Answer orders, each with a model, joints, a gripper and a size, to their end."""
     painters: dict[str, PosePainter] = {}
     try:
         for line in orders:

@@ -1,4 +1,4 @@
-"""3-D poses of arms that bring no picture of themselves: drawn from their joints, while somebody looks."""
+"""3-D poses of arms, drawn from their joints while a page looks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PROGRAM = (sys.executable, "-m", "strands_robots.dashboard.pose_process")
 
 
 class Poses:
-    """Pictures of arms, drawn by one process that lives while they are asked for."""
+    """Pictures of arms, drawn by one process while they are asked for."""
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="dashboard-poses")
@@ -34,7 +34,7 @@ class Poses:
         self._idle: asyncio.TimerHandle | None = None
 
     async def picture(self, feed: FleetFeed, robot: str) -> Envelope:
-        """Return ``jpeg`` of a robot in the pose of its joints, or an error that says why there is none."""
+        """Return ``jpeg`` of a robot as its joints are, or an error with the reason."""
         pose = await feed.call(robot, "getPose", {}, ANSWER_S)
         if is_error(pose):
             return error(text_of(pose)[:300])
