@@ -109,6 +109,12 @@ def test_a_bad_peer_id_is_refused(peer: object) -> None:
         Mesh(None, peer)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("kind", ["", None, 5, True, "a\nb", "x" * 101])
+def test_peer_type_that_is_no_text_is_refused(kind: object) -> None:
+    with pytest.raises(ValueError, match="peer_type"):
+        Mesh(None, "watcher", kind)  # type: ignore[arg-type]
+
+
 def test_the_kill_switch_overrides_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_MESH", "no")
     assert init_mesh(Arm(), "arm-1") is None

@@ -97,6 +97,34 @@ def test_coarse_solver_of_a_model_is_not_the_worlds(world: Simulation, file: Pat
     assert (option.iterations, option.solver, option.tolerance) == (100, 2, 1e-8)
 
 
+@pytest.mark.parametrize(
+    "own", ['magnetic="0 0 9"', 'timestep="0.01"', 'integrator="RK4"', 'gravity="0 0 3"', 'o_margin="1"']
+)
+def test_option_of_a_model_is_not_the_worlds(world: Simulation, file: Path, own: str) -> None:
+    def options() -> str:
+        return str(world.physics.stage.model.opt)
+
+    before = options()
+    file.write_text(mjcf(f"<option {own}/>"))
+    assert world.add_robot("rod", file)["status"] == "success"
+    assert options() == before
+
+
+def test_buffers_of_a_model_do_not_limit_the_world(world: Simulation, file: Path) -> None:
+    file.write_text(mjcf('<size memory="10K"/>'))
+    world.add_robot("rod", file)
+    world.step(1000)
+    assert height_of_the_cube(world) == pytest.approx(0.02, abs=0.002)
+
+
+def test_floor_of_a_model_carries_a_cube_like_ours(world: Simulation, file: Path) -> None:
+    soft = '<geom type="plane" size="1 1 1" priority="9" solref="-1 -1" margin="0.1"/>'
+    file.write_text(mjcf(f"<worldbody>{soft}</worldbody>"))
+    world.add_robot("rod", file)
+    world.step(1000)
+    assert height_of_the_cube(world) == pytest.approx(0.02, abs=0.002)
+
+
 def test_wall_of_a_model_is_no_floor(world: Simulation, file: Path) -> None:
     file.write_text(mjcf('<worldbody><geom type="plane" size="1 1 1" pos="-2 0 0" zaxis="1 0 0"/></worldbody>'))
     world.add_robot("rod", file)

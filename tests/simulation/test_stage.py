@@ -204,8 +204,8 @@ def test_engine_warning_is_logged_and_leaves_no_file(
     monkeypatch.chdir(tmp_path)
     body = '<body><joint name="hinge"/><geom size="0.1"/></body>'
     model = tmp_path / "leaf.xml"
-    model.write_text(f'<mujoco><option impratio="10"/><worldbody>{body}</worldbody></mujoco>')
-    with pytest.warns(UserWarning, match="impratio"):
+    model.write_text(f'<mujoco><size nuserdata="3"/><worldbody>{body}</worldbody></mujoco>')
+    with pytest.warns(UserWarning, match="nuserdata"):
         assert empty.add_robot("leaf", str(model))["status"] == "success"
     assert "Attach conflict" in caplog.text
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()

@@ -44,7 +44,7 @@ from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
-from strands_robots.utils import number
+from strands_robots.utils import number, text
 
 logger = logging.getLogger(__name__)
 
@@ -100,13 +100,13 @@ class Mesh(SensorLoopsMixin):
         parts: clock, transport, registry, audit and safety plane, where they are not the process's own.
 
     Raises:
-        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process, or
-            ``robot`` is no robot.
+        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process,
+            ``peer_type`` is no text, or ``robot`` is no robot.
     """
 
     def __init__(self, robot: Any, peer_id: str, peer_type: str = "robot", *, parts: Parts | None = None) -> None:
         self.peer_id = validate_peer_id(peer_id)
-        self.peer_type = peer_type
+        self.peer_type = text("peer_type", peer_type, longest=100)
         self.robot = None if robot is None else served(robot)
         self._parts = parts or Parts()
         self._lifecycle_lock = threading.Lock()

@@ -7,7 +7,7 @@ by name, or left at the world's value, so that no model changes the physics of i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from strands_robots.simulation.engine import mujoco
@@ -21,8 +21,20 @@ _REFUSED_FLAGS = ("passive", "spring", "damper", "clampctrl", "filterparent", "a
 
 MuJoCo 3.3 has ``passive`` where later ones have ``spring`` and ``damper``."""
 
-_EXACTNESS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "impratio")
+_EXACTNESS = (
+    "iterations",
+    "ls_iterations",
+    "noslip_iterations",
+    "ccd_iterations",
+    "sdf_iterations",
+    "sdf_initpoints",
+    "impratio",
+    "cone",
+)
 """Options of the solver of which the larger value is the more exact one."""
+
+_BUFFERS = ("memory", "njmax", "nconmax", "nstack")
+"""Sizes of MuJoCo's buffers: what is enough for a model alone overflows beside others."""
 
 
 def load_fitted(robot: RobotPlan, plan: Plan) -> Any:
@@ -40,18 +52,28 @@ def load_fitted(robot: RobotPlan, plan: Plan) -> Any:
         _confine_flags(child)
     except ValidationError as exc:
         raise ValidationError(f"model {shown(robot.source.label)} cannot share a world: {exc}") from exc
-    _set_exactness(child.option)
-    set_options(child, plan)
+    for geom in filter(is_floor, child.worldbody.geoms):
+        _make_common(geom)
     return child
 
 
-def set_options(spec: Any, plan: Plan) -> None:
-    """Set the options that the world decides, for itself and for every model in it."""
-    option = spec.option
+def set_options(world: Any, models: Sequence[Any], plan: Plan) -> None:
+    """Give the world and every model in it the options of the world.
+
+    A file may make the solver more exact, never less; the world decides everything else.
+    """
+    option = mujoco.MjSpec().option
+    for name in _EXACTNESS:
+        setattr(option, name, max(getattr(spec.option, name) for spec in (world, *models)))
     option.timestep = plan.timestep
     option.gravity = [0, 0, plan.gravity]
     option.density, option.viscosity = plan.density, plan.viscosity
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for spec in (world, *models):
+        for name in (name for name in dir(option) if not name.startswith("_")):
+            setattr(spec.option, name, getattr(option, name))
+        for name in _BUFFERS:
+            setattr(spec, name, -1)
 
 
 def name_parts(child: Any) -> None:
@@ -116,7 +138,10 @@ def _require_medium(option: Any, plan: Plan) -> None:
 
 
 def _confine_flags(child: Any) -> None:
-    """Apply flags to the model's own parts and clear them, or refuse them."""
+    """Apply flags to the model's own parts, or refuse them.
+
+    The flags that are not named here choose between ways to compute the same, or report more.
+    """
     option, bits = child.option, mujoco.mjtDisableBit
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
         raise ValidationError("its flag override would set every contact in it.")
@@ -134,8 +159,6 @@ def _confine_flags(child: Any) -> None:
         constraint = bit != bits.mjDSBL_GRAVITY and option.disableflags & bits.mjDSBL_CONSTRAINT
         if option.disableflags & bit or constraint:
             confine(child)
-    # The other flags choose between ways to compute the same, or report more.
-    option.disableflags = option.enableflags = 0
 
 
 def _without_contacts(child: Any) -> None:
@@ -165,10 +188,8 @@ def _without_gravity(child: Any) -> None:
         body.gravcomp = 1.0
 
 
-def _set_exactness(option: Any) -> None:
-    """Keep the world's solver; a file may make it more exact, never less."""
-    usual = mujoco.MjSpec().option
-    for name in _EXACTNESS:
-        setattr(option, name, max(getattr(option, name), getattr(usual, name)))
-    for name in ("solver", "jacobian", "tolerance", "ls_tolerance", "noslip_tolerance", "ccd_tolerance"):
-        setattr(option, name, getattr(usual, name))
+def _make_common(floor: Any) -> None:
+    """Give a floor MuJoCo's own contact parameters: everything in the world stands on it."""
+    usual = mujoco.MjSpec().worldbody.add_geom()
+    for name in ("priority", "solmix", "solref", "solimp", "margin", "gap"):
+        setattr(floor, name, getattr(usual, name))

@@ -97,15 +97,15 @@ def compile_stage(plan: Plan) -> Stage:
     """
     spec = mujoco.MjSpec()
     spec.modelname = "world"
-    set_options(spec, plan)
     homes: dict[str, Floats] = {}
     controls: dict[str, float] = {}
     if hasattr(mujoco, "mjtConflict"):
-        # Solver options that only a robot's file sets are taken over; timestep, gravity and integrator are the world's.
+        # Sizes of user data that only a robot's file sets are taken over.
         spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
     own_floor = own_lights = True
-    for robot in plan.robots:
-        child = load_fitted(robot, plan)
+    children = [load_fitted(robot, plan) for robot in plan.robots]
+    set_options(spec, children, plan)
+    for robot, child in zip(plan.robots, children, strict=True):
         own_floor = own_floor and not any(map(is_floor, child.worldbody.geoms))
         own_lights = own_lights and not child.lights
         home, control = _attach(spec, robot, child)
