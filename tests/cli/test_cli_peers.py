@@ -93,7 +93,7 @@ def test_unknown_device_and_function_name_the_near_ones(run: Run, fleet: FakeFle
     fleet.answer = NoSuchDeviceError("No device 'amr-1' in tenant 'default'.")
     assert "Near it: arm-1, arm-2." in run("call", "amr-1", "execute").stderr
     fleet.answer = CallRefusedError("Unknown method: exceute", -32601)
-    assert "Near it: execute." in run("call", "arm-1", "exceute").stderr
+    assert "exceute. Near it: execute." in run("call", "arm-1", "exceute").stderr
     fleet.answer = CallRefusedError("Unknown method: zzz", -32601)
     assert "There are: execute, stop." in run("call", "arm-1", "zzz").stderr
 

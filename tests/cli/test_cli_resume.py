@@ -126,6 +126,14 @@ def test_wrong_passphrase_frees_no_robot(run: Run, fleet: FakeFleet, signed: tup
     assert fleet.presented == []
 
 
+def test_local_resume_says_that_the_state_directory_cannot_be_written(
+    run: Run, fleet: FakeFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resume, "state_problem", lambda: "The state directory /x cannot be written.")
+    output = run("resume", "--local")
+    assert (output.exit_code, "/x cannot be written" in output.output) == (1, True)
+
+
 def test_robot_that_is_off_is_cleared_locally_and_audited(run: Run, fleet: FakeFleet) -> None:
     hold = Lockout(A, "desk", "a hand", 0.0)
     LockoutStore().save({"hardware:so101:left": StoredLockout(LockoutState((hold,)), name="arm-1")})

@@ -170,5 +170,14 @@ def test_progress_never_exceeds_its_total() -> None:
 def test_device_without_joints_says_so() -> None:
     view = DeviceView("rover", {})
     assert "reports no joints" in drawn(view.draw())
+    assert "reports no joints" in view.summary
     view.take(event("observationUpdate", joints={"pan": 0.5}))
     assert "reports no joints" not in drawn(view.draw())
+    assert view.summary == "idle"
+
+
+def test_unavailable_device_says_why_it_has_no_joints() -> None:
+    view = DeviceView("head", {})
+    view.take_state({"task_status": "idle", "instruction": "", "unavailable": "no daemon at 10.0.0.7"})
+    assert view.summary == "unavailable. no daemon at 10.0.0.7"
+    assert "no daemon at 10.0.0.7" in drawn(view.draw())

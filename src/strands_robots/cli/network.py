@@ -186,7 +186,8 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
     except CallRefusedError as exc:
         known = [peer.functions for peer in fleet.peers(1.0) if peer.id == device] if exc.code == NO_METHOD else []
         near = _near(function, [str(each.get("name", "")) for functions in known for each in functions])
-        raise CliError(plain(f"{exc}{near}", 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+        said = f"{str(exc).rstrip('.')}.{near}" if near else str(exc)
+        raise CliError(plain(said, 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
 
 
 def near_devices(fleet: FleetClient, device: str) -> str:

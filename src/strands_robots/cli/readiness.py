@@ -51,8 +51,9 @@ def state_problem() -> str:
             return ""
     except OSError as exc:
         return (
-            f"The state directory {folder} cannot be written ({exc.strerror}): a restart forgets a lockout, answers "
-            "are not signed, and nothing is audited. Set STRANDS_STATE_DIR to a directory that this user can write."
+            f"The state directory {folder} cannot be written ({exc.strerror}): a restart forgets a lockout, resume "
+            "--local frees no robot, answers are not signed, and nothing is audited. Set STRANDS_STATE_DIR to a "
+            "directory that this user can write."
         )
 
 

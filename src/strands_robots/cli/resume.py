@@ -15,6 +15,7 @@ from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.network import Network, describe, mesh_peer, temporary_mesh_id
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
+from strands_robots.cli.readiness import state_problem
 from strands_robots.cli.resume_mesh import ask_peers, lockable_peers, resume_peers
 from strands_robots.envelope import Envelope, text_of
 from strands_robots.safety.approval import GRANT_S, Grants, state_dir
@@ -257,7 +258,8 @@ def _lockout_rows(name: str, lockouts: Iterable[Lockout]) -> list[tuple[str, str
 def _clear_locally(screen: Screen, wanted: list[str]) -> None:
     names = wanted or sorted(_stored_lockouts())
     if not names:
-        raise CliError("This machine's file has no lockout; name the robots whose process runs here.", devices={})
+        why = state_problem() or "This machine's file has no lockout; name the robots whose process runs here."
+        raise CliError(why, devices={})
     try:
         cleared = clear_here(operator(), names)
     except (OSError, ValueError) as exc:

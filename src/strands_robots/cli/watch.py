@@ -84,8 +84,8 @@ def watch(
             elif screen.live:
                 _draw_live(screen, _present_state(fleet, device, limits), frames)
             else:
-                now = _present_state(fleet, device, limits).task
-                print_changes(screen, device, now, (event for events, _ in frames for event in events))
+                now = _present_state(fleet, device, limits)
+                print_changes(screen, device, now.summary, (event for events, _ in frames for event in events))
 
 
 class SignsOfLife:
@@ -138,10 +138,13 @@ class DeviceView:
         self._limits = limits
         self._joints: dict[str, Mapping[str, Any]] = {}
         self.task = "idle"
+        self.no_joints = NO_JOINTS
 
     def take_state(self, state: Mapping[str, Any]) -> None:
         """Update from an answer to getState or getStatus."""
         self.task = describe_state(state) or self.task
+        if state.get("unavailable"):
+            self.task, self.no_joints = "unavailable", plain(str(state["unavailable"]), 200)
         robots = state.get("robots")
         if isinstance(state.get("joints"), Mapping):
             self._joints[""] = state["joints"]
@@ -157,6 +160,11 @@ class DeviceView:
             self._joints[robot] = joints
         self.task = describe_task(event) or self.task
 
+    @property
+    def summary(self) -> str:
+        """The task, and why there are no joints where there are none."""
+        return self.task if self._joints else f"{self.task}. {self.no_joints}"
+
     def draw(self, age_s: float = 0.0) -> RenderableType:
         """Return the device, its task, the age of its last sign of life, and its joints."""
         late = "bold red" if age_s > LATE_S else "bright_black"
@@ -165,7 +173,7 @@ class DeviceView:
             label(f"last heard {age_s:.1f} s ago", late),
         ]
         if not self._joints:
-            parts.append(label(NO_JOINTS, "bright_black"))
+            parts.append(label(self.no_joints, "bright_black"))
         for robot, joints in self._joints.items():
             if len(self._joints) > 1:
                 parts.append(label(robot))
@@ -197,7 +205,9 @@ def describe_state(facts: Mapping[str, Any]) -> str:
         ]
         return "; ".join(tasks) or "idle"
     status = str(facts.get("task_status", ""))
-    return f"{status}: {facts.get('instruction', '')!r}, step {facts.get('step_count', 0)}" if status else ""
+    if not status or not facts.get("instruction"):
+        return status
+    return f"{status}: {facts['instruction']!r}, step {facts.get('step_count', 0)}"
 
 
 def follow(signs: SignsOfLife, longest: float | None, device: str) -> Iterator[Frame]:

@@ -16,6 +16,7 @@ from fixtures.waiting import accepts, eventually
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 WITHIN_S = 60.0
+PYTHON = [sys.executable, "-W", "error::DeprecationWarning"]
 pytestmark = pytest.mark.timeout(300)
 
 
@@ -27,7 +28,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
 @contextmanager
 def example(name: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
     """A running example; it has to end in order on Ctrl-C."""
-    process = subprocess.Popen([sys.executable, EXAMPLES / name], env=environment, text=True)
+    process = subprocess.Popen([*PYTHON, EXAMPLES / name], env=environment, text=True)
     try:
         yield process
         process.send_signal(signal.SIGINT)
@@ -51,14 +52,14 @@ def test_the_served_arm_is_driven_by_an_agents_tools(environment: dict[str, str]
         eventually(lambda: live(environment, "so100-lab-1"), within=WITHIN_S, what="the arm is live")
         # A caller that came before the arm may have had the meeting port, and the arm takes it when that one goes.
         eventually(lambda: accepts(int(environment["STRANDS_DC_PORT"])), within=WITHIN_S, what="the arm has the port")
-        line = [sys.executable, EXAMPLES / "drive_from_agent.py"]
+        line = [*PYTHON, EXAMPLES / "drive_from_agent.py"]
         driven = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
         assert driven.returncode == 0, driven.stderr
         assert "Driving so100-lab-1." in driven.stdout
 
 
 def test_without_a_robot_the_agent_says_so(environment: dict[str, str]) -> None:
-    line = [sys.executable, EXAMPLES / "drive_from_agent.py"]
+    line = [*PYTHON, EXAMPLES / "drive_from_agent.py"]
     driven = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
     assert driven.returncode != 0
 
