@@ -34,7 +34,7 @@ _EXACTNESS = (
 """Options of the solver of which the larger value is the more exact one."""
 
 _BUFFERS = ("memory", "njmax", "nconmax", "nstack")
-"""Sizes of MuJoCo's buffers: what is enough for a model alone overflows beside others."""
+"""Sizes of buffers: what is enough for a model alone is not beside others."""
 
 
 def load_fitted(robot: RobotPlan, plan: Plan) -> Any:
@@ -189,7 +189,7 @@ def _without_gravity(child: Any) -> None:
 
 
 def _make_common(floor: Any) -> None:
-    """Give a floor MuJoCo's own contact parameters: everything in the world stands on it."""
+    """Give a floor, on which everything stands, the usual contact parameters."""
     usual = mujoco.MjSpec().worldbody.add_geom()
     for name in ("priority", "solmix", "solref", "solimp", "margin", "gap"):
         setattr(floor, name, getattr(usual, name))
