@@ -31,7 +31,7 @@ def lerobot_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def patience(lerobot_home: None) -> None:
+def patience() -> None:
     """A busy machine may hold the emulated servos up for longer than LeRobot waits."""
     if importlib.util.find_spec("lerobot") is not None:
         be_patient()
@@ -51,7 +51,7 @@ def calibration(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def arm(bus: FeetechBus, calibration: Path, tmp_path: Path) -> Iterator[Arm]:
+def arm(bus: FeetechBus, calibration: Path, tmp_path: Path, patient_halts: None) -> Iterator[Arm]:
     """Makes real robots on ``bus`` and lets go of them at the end."""
     from strands_robots.robot import Robot  # noqa: PLC0415 - the one place that needs it
 

@@ -154,11 +154,11 @@ def test_a_wedged_bus_is_deaf_and_comes_back(line: Line, bus: FeetechBus) -> Non
     eventually(lambda: line.ask(Packet(1, PING), within=0.2), what="an answer")
 
 
-def test_dropped_replies_are_some_of_them(line: Line, bus: FeetechBus) -> None:
-    bus.drop_share = 0.5
-    answers = [bool(line.ask(Packet(1, PING), within=0.1)) for _ in range(20)]
-    assert True in answers
-    assert False in answers
+def test_answers_to_every_second_request_are_dropped(line: Line, bus: FeetechBus) -> None:
+    bus.drop_every = 2
+    assert line.ask(Packet(1, PING)) == [Packet(1, 0)]
+    assert line.ask(Packet(1, PING), within=0.1) == []
+    assert line.ask(Packet(1, PING)) == [Packet(1, 0)]
 
 
 def test_latency_holds_every_answer_up(line: Line, bus: FeetechBus) -> None:

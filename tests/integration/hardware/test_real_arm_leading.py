@@ -6,13 +6,14 @@ import itertools
 import json
 import math
 import os
+import sys
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.command_line import COMMAND, on_a_terminal
+from fixtures.command_line import on_a_terminal
 from fixtures.feetech_bus import MOTORS, FeetechBus, arm_calibration, arm_servos
 from fixtures.waiting import eventually
 from typer.testing import CliRunner
@@ -141,7 +142,8 @@ def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) ->
     words = ["calibrate", "so101", "--port", fresh.port, "--id", name, *(["--json"] if machine else [])]
     for servo in fresh.servos.values():
         servo.put("torque_enable", 1)
-    with on_a_terminal([*COMMAND, *words], os.environ) as terminal:
+    line = [sys.executable, "-m", "fixtures.feetech_bus.patient", "strands_robots.cli", *words]
+    with on_a_terminal(line, os.environ) as terminal:
         eventually(lambda: not any(servo.torque for servo in fresh.servos.values()), within=30, what="the torque off")
         eventually(lambda: machine or "the middle of its motion" in terminal.drawn, what="the first question")
         for number, servo in fresh.servos.items():

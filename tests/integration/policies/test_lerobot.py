@@ -11,6 +11,7 @@ from typing import Any
 import numpy
 import pytest
 from fixtures.bodies import StepClock
+from fixtures.ending import NAMED, ended
 
 from strands_robots.evaluation.episode import run_episode
 from strands_robots.policies import create_policy
@@ -193,6 +194,14 @@ def test_an_environment_of_another_size_is_refused(make: Make, tmp_path: Path) -
     checkpoint = tiny.act(tmp_path / "act")
     with pytest.raises(PolicyCheckError, match="environment size"):
         make(checkpoint, environment=["cube.x"])
+
+
+def test_a_process_that_ends_while_torch_computes_keeps_its_exit_code() -> None:
+    # Each product comes back to Python, which ends the thread there once the interpreter shuts down.
+    computes = "import torch; one = torch.rand(500, 500)\n    while True: one @ one"
+    process = ended(computes, "import torch; sys.exit(3)")
+    assert NAMED.fullmatch(process.stderr), process.stderr
+    assert process.returncode == 3
 
 
 def test_a_checkpoint_is_used_through_a_profile_alone(tmp_path: Path) -> None:
