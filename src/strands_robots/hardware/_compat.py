@@ -1,4 +1,4 @@
-"""Use of LeRobot 0.4.4 beyond its documented interface.
+"""Use of LeRobot 0.4.4 and 0.6.1 beyond its documented interface.
 
 LeRobot's motor drivers need no torch, but importing them loads helpers that do: ``lerobot.utils.utils`` imports torch,
 accelerate and datasets at its top, and ``lerobot.processor``, of which the drivers use two type aliases, all of torch

@@ -5,9 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
+from typing import Any, TypeVar
 
 from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
@@ -18,6 +18,8 @@ from strands_robots.policies.base import Action, checked_speeds, is_velocity, nu
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.stopping import StopLevel
 from strands_robots.utils import ValidationError, number, shown
+
+T = TypeVar("T")
 
 READ_TRIES = 3
 """Joint reads that fail before a motor counts as silent; LeRobot waits 50 ms for each answer."""
@@ -141,18 +143,9 @@ class DeviceBody:
     def get_observation(self) -> dict[str, Any]:
         """Read joints and pictures; repeat as :meth:`get_joints` does."""
         with self.lock:
-            for left in reversed(range(READ_TRIES)):
-                began = time.monotonic()
-                forget_input(self.device)
-                try:
-                    observation = dict(self.device.get_observation())
-                except ConnectionError:
-                    if not left or self._stops:
-                        raise
-                    continue
-                self._latest = (began, numbers(observation))
-                return observation
-            raise AssertionError  # the last try returns or raises
+            began, observation = self._exchange(lambda: (time.monotonic(), dict(self.device.get_observation())))
+            self._latest = (began, numbers(observation))
+            return observation
 
     def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
         """Read the joints; repeat after a lost answer unless a stop waits for the bus.
@@ -167,13 +160,17 @@ class DeviceBody:
         return self.get_joints()
 
     def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
-        with self.lock:
+        def send() -> Any:
             if not permit.valid:
                 raise PermitVoidError(f"{self.name} was stopped")
             if self._limp:
                 self._stiffen()
             self.driven = True
-            sent = self.device.send_action(dict(action))
+            # A driver that bounds the step reads the joints first, whose answer may be lost.
+            return self.device.send_action(dict(action))
+
+        with self.lock:
+            sent = self._exchange(send)
             told = sent if isinstance(sent, Mapping) else dict(action)
             self.targets |= numbers(told)
             return told
@@ -262,17 +259,20 @@ class DeviceBody:
         return nullcontext()
 
     def _joints(self, tries: int, *, urgent: bool = False) -> dict[str, float]:
+        joints = self._exchange(lambda: read_joints(self.device), tries, urgent=urgent)
+        self._latest = (time.monotonic(), joints)
+        return dict(joints)
+
+    def _exchange(self, exchange: Callable[[], T], tries: int = READ_TRIES, *, urgent: bool = False) -> T:
+        """Repeat an exchange after a lost answer unless a stop waits for the bus."""
         for left in reversed(range(tries)):
             # An answer that came late would be taken for this one's, and every read after it be old.
             forget_input(self.device)
             try:
-                joints = read_joints(self.device)
+                return exchange()
             except ConnectionError:
                 if not left or (self._stops and not urgent):
                     raise
-                continue
-            self._latest = (time.monotonic(), joints)
-            return dict(joints)
         raise AssertionError  # the last try returns or raises
 
     def _hold(self, *, urgent: bool = False) -> None:

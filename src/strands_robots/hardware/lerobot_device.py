@@ -1,7 +1,7 @@
 """LeRobot devices by name, followers and leaders, made but not connected.
 
 LeRobot keeps its devices in registries of configuration classes (``RobotConfig``, ``TeleoperatorConfig``,
-``CameraConfig``), filled when the module of each device is imported. Written against LeRobot 0.4.
+``CameraConfig``), filled when the module of each device is imported. Run on LeRobot 0.4.4 and 0.6.1.
 """
 
 from __future__ import annotations
@@ -70,6 +70,10 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
     asked = {each.name: each for each in dataclasses.fields(known[kind])}
     if "id" not in fields and "id" in asked:
         fields["id"] = name
+    if "num_read_retries" in asked:
+        # Reads are repeated here: LeRobot (from 0.6 on) takes the late answer to one try for that of the next, and
+        # leaves the bus to no stop between two tries.
+        fields.setdefault("num_read_retries", 0)
     # Of a robot on a network the port is a number.
     if "port" in asked and str(asked["port"].type) in ("str", "<class 'str'>"):
         check_port(str(name), fields.get("port"), needed=asked["port"].default is dataclasses.MISSING)
