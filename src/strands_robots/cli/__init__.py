@@ -38,6 +38,9 @@ def _leave(code: object) -> NoReturn:
     Native network threads may still release callbacks. If the interpreter shut down under them, the C library would
     abort the process, and a script would read -6 in place of the exit code.
     """
+    policies = sys.modules.get("strands_robots.policies.unfinished")
+    if policies is not None:
+        policies.name_unfinished()
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
         try:

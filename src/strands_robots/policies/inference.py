@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from strands_robots.policies.unfinished import computing
+
 logger = logging.getLogger(__name__)
 
 Infer = Callable[[Any], Any]
@@ -105,7 +107,8 @@ class InferenceWorker:
                 began = self._asked_at if self._asked_at is not None else self._now()
                 value, failure = None, None
                 try:
-                    value = self._infer(request[0])
+                    with computing(f"The inference of the policy {self._name}"):
+                        value = self._infer(request[0])
                 except BaseException as exc:  # noqa: BLE001 - raised again in the control thread
                     failure = exc
                 self._answers.put(InferenceResult(value, failure, self._now() - began))

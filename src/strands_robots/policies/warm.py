@@ -8,6 +8,7 @@ from collections.abc import Callable, Hashable
 from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.envelope import error
+from strands_robots.policies.unfinished import computing
 from strands_robots.safety.gate import MotionRefused
 
 logger = logging.getLogger(__name__)
@@ -62,7 +63,8 @@ class WarmModels:
 
     def _load(self, key: Hashable, load: Callable[[], Any]) -> None:
         try:
-            model = load()
+            with computing("The loading of a policy"):
+                model = load()
         except BaseException as exc:  # noqa: BLE001 - whatever a loader raises is told to the next caller
             logger.warning("A policy could not be loaded: %s: %s", type(exc).__name__, exc)
             with self._lock:
