@@ -268,6 +268,13 @@ def test_a_failing_device_ends_the_task_in_error_and_on_hold() -> None:
     assert device.writes[-1].action == device.writes[-2].action
 
 
+def test_a_write_that_failed_twice_does_not_end_the_task() -> None:
+    device = FailingDevice(good=3, failures=2)
+    answer = make(device).run_task("wave", duration=60, n_steps=10)
+    assert answer["status"] == "success", answer
+    assert answer["step_count"] == 10
+
+
 def test_joints_are_read_while_the_camera_fails() -> None:
     robot = make(BlindDevice())
     state = robot.get_state()
