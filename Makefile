@@ -1,4 +1,4 @@
-.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next dds-security models
+.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next lerobot lerobot-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -78,7 +78,11 @@ lerobot:  ## LeRobot 0.4.4 with torch, in .venv-policies, and the tests of polic
 	@./scripts/lerobot.sh
 	@./scripts/tests.sh $(POLICIES)/python tests/integration/policies $(ARGS)
 
-real-arm-next:  ## The same on LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-lerobot-0.6.1
+lerobot-next:  ## The same on LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-policies-0.6.1
+	@./scripts/lerobot.sh 0.6.1
+	@./scripts/tests.sh .venv-policies-0.6.1/bin/python tests/integration/policies $(ARGS)
+
+real-arm-next:  ## The arm driver of LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-lerobot-0.6.1
 	@./scripts/real-arm.sh 0.6.1
 	@./scripts/tests.sh .venv-lerobot-0.6.1/bin/python tests/integration/hardware $(ARGS)
 

@@ -21,9 +21,8 @@ import numpy as np
 import torch
 from datasets.utils.logging import disable_progress_bar
 from examples.openpi_server import serve_checkpoint
-from lerobot.configs.types import FeatureType
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import dataset_to_policy_features
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
@@ -91,11 +90,13 @@ def batches(dataset: LeRobotDataset, steps: int) -> Iterator[dict[str, Any]]:
 
 def train(dataset: LeRobotDataset, folder: Path, steps: int) -> None:
     """Train a small ACT without pictures, and save it with its processors."""
-    features = dataset_to_policy_features(dataset.features)
-    outputs = {key: each for key, each in features.items() if each.type is FeatureType.ACTION}
+    joints = (len(JOINTS),)
     config = ACTConfig(
-        input_features={key: each for key, each in features.items() if key not in outputs},
-        output_features=outputs,
+        input_features={
+            "observation.state": PolicyFeature(FeatureType.STATE, joints),
+            "observation.environment_state": PolicyFeature(FeatureType.ENV, (len(TARGET),)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, joints)},
         chunk_size=CHUNK,
         n_action_steps=CHUNK,
         dim_model=128,

@@ -9,7 +9,7 @@ version=${1:-0.4.4}
 dir=.venv-lerobot
 draccus=0.10.0 hub=0.35.3
 if [ "$version" != 0.4.4 ]; then
-  dir=.venv-lerobot-$version draccus=0.11.5 hub=1.2.0
+  dir=.venv-lerobot-$version draccus=0.11.6 hub=1.33.0
   export PYTHON=${PYTHON:-python3.12}
 fi
 pins=("lerobot==$version" feetech-servo-sdk==1.0.0 pyserial==3.5 "draccus==$draccus" mergedeep==1.3.4 pyyaml-include==1.4.1
