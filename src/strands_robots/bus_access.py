@@ -81,6 +81,21 @@ def read_joints(device: Any) -> dict[str, float]:
         return joints
 
 
+def write_joints(device: Any, targets: Mapping[str, float]) -> None:
+    """Write joint targets without a read, by the motor buses of a LeRobot device.
+
+    LeRobot's drivers read every joint before they write a bounded step (``max_relative_target``), and one silent motor
+    fails that for all. Other devices are sent an action. Raises what the device raises.
+    """
+    buses = motor_buses(device)
+    if not buses or not all(callable(getattr(bus, "sync_write", None)) for _, bus in buses):
+        device.send_action(dict(targets))
+        return
+    for prefix, bus in buses:
+        names = {name: f"{prefix}{name}.pos" for name in bus.motors}
+        bus.sync_write("Goal_Position", {name: targets[key] for name, key in names.items() if key in targets})
+
+
 def action_ranges(device: Any) -> dict[str, tuple[float, float]]:
     """Return the range of every action key; infinite where none is known.
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, TypeVar
 
-from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_joints
+from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_joints, write_joints
 from strands_robots.hardware._compat import drop, forget_input, unplugged
 from strands_robots.hardware.calibration import answer_lost, write_to_servos
 from strands_robots.hardware.device_facts import require_port
@@ -296,11 +296,11 @@ class DeviceBody:
         except ConnectionError:
             # One silent motor must not leave the others running to their goals while it is asked again.
             if age <= HOLD_FRESH_S and (targets := still | self._targets(known)):
-                self.device.send_action(targets)
+                write_joints(self.device, targets)
             present = self._joints(READ_TRIES, urgent=urgent)
         targets = still | self._targets(present)
         if targets:
-            self.device.send_action(targets)
+            self._exchange(lambda: self.device.send_action(targets), urgent=urgent)
         # A bus does not confirm targets; what it answers after them shows that it took them.
         self._joints(READ_TRIES, urgent=urgent)
 
@@ -334,7 +334,7 @@ class DeviceBody:
         try:
             targets = self._targets(present)
             if targets:
-                self.device.send_action(targets)
+                self._exchange(lambda: self.device.send_action(targets))
             for motor in limp:
                 bus, own = self._torque[motor]
                 enable = getattr(bus, "enable_torque", None)

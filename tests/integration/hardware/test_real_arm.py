@@ -178,8 +178,11 @@ def test_a_dead_servo_ends_the_rollout_and_is_never_called_stopped(arm: Arm, bus
     assert robot.start_task("wave", duration=0.2)["status"] == "success"
 
 
-def test_a_servo_that_dies_in_motion_leaves_the_others_held(arm: Arm, bus: FeetechBus) -> None:
-    robot = arm()
+@pytest.mark.parametrize("options", [{}, {"max_relative_target": 120.0}], ids=["plain", "bounded by LeRobot"])
+def test_a_servo_that_dies_in_motion_leaves_the_others_held(
+    arm: Arm, bus: FeetechBus, options: dict[str, float]
+) -> None:
+    robot = arm(**options)
     robot.send_action({"shoulder_pan.pos": 90.0, "wrist_flex.pos": 80.0})
     time.sleep(0.1)
     robot.get_state()
