@@ -26,7 +26,9 @@ _ending = threading.Event()
 
 @contextmanager
 def computing(what: str) -> Iterator[None]:
-    """Note native code that runs on a daemon thread; nothing begins once the process ends.
+    """Note native code that runs on a daemon thread.
+
+    None begins once the process ends.
 
     Args:
         what: its name in the message about one that hangs.
@@ -63,7 +65,7 @@ def _end() -> None:
 
 
 def _keep_threads() -> None:
-    """Let a thread that glibc unwinds sleep, and the process leave with its own code."""
+    """Let a thread that glibc unwinds sleep, and keep the exit code."""
     libc, libstdcxx = ctypes.CDLL(None), ctypes.CDLL("libstdc++.so.6")
     std_set_terminate = libstdcxx._ZSt13set_terminatePFvvE
     std_set_terminate(ctypes.cast(libc.pause, ctypes.c_void_p))
