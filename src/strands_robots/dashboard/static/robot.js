@@ -174,8 +174,10 @@ export class RobotView {
         this.jog.button(kind, axis, -1, minus, name ? "\u2212" : minus, down), this.jog.button(kind, axis, 1, plus, name ? "+" : plus, up));
     };
     if (names.has("moveJoints") && moving.length) groups.push(el("fieldset", {}, el("legend", { text: S.jogJoint }), ...moving.slice(0, 10).map((name, index) => pair("joint", name, [S.minus(name), S.plus(name)], index, name))));
-    if (names.has("moveBy")) groups.push(el("fieldset", {}, el("legend", { text: S.jogTip }), ...Object.entries(S.tip).map(([axis, ways]) => pair("tip", axis, ways, null))));
-    if (names.has("setGripper")) {
+    // Hardware has the verbs of an arm, be it one or not; a base tells no joints.
+    const arm = moving.length > 0 || !names.has("drive");
+    if (arm && names.has("moveBy")) groups.push(el("fieldset", {}, el("legend", { text: S.jogTip }), ...Object.entries(S.tip).map(([axis, ways]) => pair("tip", axis, ways, null))));
+    if (arm && names.has("setGripper")) {
       groups.push(el("fieldset", {}, el("legend", { text: S.jogGripper }), el("div", { class: "pair" },
         this.jog.button("gripper", "", -1, S.closeGripper, S.closeGripper, ""), this.jog.button("gripper", "", 1, S.openGripper, S.openGripper, ""))));
     }
