@@ -17,7 +17,7 @@ pytestmark = pytest.mark.system
 
 MINUTE_S = 60.0
 HZ = 50.0
-RATE_SHARE = 0.3
+RATE_SHARE = 0.05
 """Of all steps, on a machine that does other things; benchmarks/ measures the rate."""
 READ_EVERY_S = 0.1
 
