@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from strands_robots.envelope import Envelope, error
-from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.safety import gate as module
+from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 
 
 class Latch:
@@ -175,3 +179,50 @@ def test_a_motion_is_not_renewed_over_a_halt_or_a_lock() -> None:
     gate.attach(Latch())
     with pytest.raises(MotionRefused, match="locked"):
         gate.renew(permit)
+
+
+def revoked(gate: MotionGate, permit: Permit) -> Permit:
+    """Revoke, as a halt does; return the permit of that halt's settling."""
+    return gate.settling(gate.revoke())
+
+
+@pytest.mark.parametrize("first", [revoked, MotionGate.renew])
+def test_what_comes_after_a_halt_never_takes_its_place(
+    first: Callable[[MotionGate, Permit], Permit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    second_ran = threading.Event()
+
+    class TellingLock:
+        """A lock that tells of the thread that waits for it."""
+
+        def __init__(self) -> None:
+            self._lock = threading.Lock()
+
+        def __enter__(self) -> None:
+            if not self._lock.acquire(blocking=False):
+                second_ran.set()
+                self._lock.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            self._lock.release()
+
+    class SecondHaltBeforeEachStore(MotionGate):
+        def __setattr__(self, name: str, value: Any) -> None:
+            if type(value) is int and value == 1:
+                second.start()
+                assert second_ran.wait(20)
+            super().__setattr__(name, value)
+
+    def halt() -> None:
+        newest.append(gate.revoke())
+        second_ran.set()
+
+    newest: list[int] = []
+    second = threading.Thread(target=halt)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "threading", SimpleNamespace(Lock=TellingLock, local=threading.local))
+        gate = SecondHaltBeforeEachStore()
+    permit = first(gate, gate.permit("reset"))
+    second.join(20)
+    assert gate.generation == newest[0], "the older halt is stored after the newer"
+    assert not permit.valid, "a halt is lost"

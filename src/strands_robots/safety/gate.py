@@ -3,7 +3,7 @@
 Every motion source (a rollout, a teleoperation session, a single ``send_action``) asks :meth:`MotionGate.permit`
 before it moves and looks at :attr:`Permit.valid` under the same lock as each write to the device. A halt calls
 :meth:`MotionGate.revoke` first and then waits for the write that may be in flight, so that after its verdict no
-action reaches the device. Revoking is one assignment: it takes no lock and cannot be held up.
+action reaches the device. Revoking counts up by one, under a lock that nothing else is done under.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import functools
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from itertools import count
 from typing import ParamSpec, Protocol
 
 from strands_robots.envelope import Envelope, error
@@ -149,12 +148,12 @@ class Waiting:
 
 
 class MotionGate:
-    """Gate of one robot; thread-safe without a lock."""
+    """Gate of one robot; thread-safe."""
 
     def __init__(self, latch: Latch | None = None) -> None:
         self._latches: tuple[Latch, ...] = () if latch is None else (latch,)
         self._attaching = threading.Lock()
-        self._numbers = count(1)
+        self._counting = threading.Lock()
         self._generation = 0
         self._here = threading.local()
         self._watchers: tuple[Callable[[], None], ...] = ()
@@ -239,8 +238,9 @@ class MotionGate:
 
     def revoke(self) -> int:
         """Void every permit given so far; return the generation of this halt."""
-        mine = self._generation = next(self._numbers)
-        return mine
+        with self._counting:
+            self._generation += 1
+            return self._generation
 
     def settling(self, generation: int) -> Permit:
         """Return leave for the motion that is a part of the halt of ``generation``.
@@ -254,15 +254,14 @@ class MotionGate:
 
         Raises :class:`MotionRefused` where another caller has halted or locked the robot since ``permit`` was given.
         """
-        permit.check()
-        mine = self._generation = next(self._numbers)
-        fresh = Permit(self, Asked(mine), permit.verb)
-        if mine != permit.generation + 1:
-            raise MotionRefused(error(_LATE.format(permit.verb)))
-        refusal = self._refusal(permit.verb, Asked(mine))
+        with self._counting:
+            permit.check()
+            self._generation += 1
+            asked = Asked(self._generation)
+        refusal = self._refusal(permit.verb, asked)
         if refusal is not None:
             raise MotionRefused(refusal)
-        return fresh
+        return Permit(self, asked, permit.verb)
 
     def _asked_here(self) -> Asked:
         return getattr(self._here, "asked", None) or Asked(self._generation)
