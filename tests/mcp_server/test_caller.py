@@ -46,7 +46,8 @@ class FakeFleet:
 
 def description(*parameters: str) -> Envelope:
     """Return the description of a robot whose verbs have these parameters."""
-    schema = {"type": "object", "properties": {name: {"type": "string"} for name in parameters}}
+    properties = {name: {"type": "string", "description": "As lease_ttl_s."} for name in parameters}
+    schema = {"type": "object", "properties": properties}
     functions = [{"name": verb, "parameters": schema} for verb in ("moveTo", "execute")]
     return {"device_id": "arm-1", "status": {}, "capabilities": {"functions": functions}}
 
@@ -115,6 +116,7 @@ async def test_motion_that_ended_by_itself_is_not_stopped() -> None:
         (description("x", "lease_id"), False),
         (description("x"), False),
         ({"device_id": "arm-1"}, False),
+        ({"capabilities": {"functions": [{"name": "moveTo", "parameters": ["lease_ttl_s"]}]}}, False),
         (DeviceTimeoutError("arm-1 did not answer."), True),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -298,7 +297,8 @@ class Caller:
             return True
         functions = Peer.of(description).functions
         published = next((each.get("parameters") for each in functions if each.get("name") == verb), None)
-        if LEASE_TTL_S not in json.dumps(published):
+        names = published.get("properties") if isinstance(published, Mapping) else None
+        if not isinstance(names, Mapping) or LEASE_TTL_S not in names:
             return False
         self._binding.add((robot, verb))
         return True
