@@ -27,6 +27,12 @@ def test_connections_of_the_server_end_five_seconds_after_the_last_sign_of_a_mac
     assert kept["TCP_USER_TIMEOUT"] == GONE_S * 1000
 
 
+def test_answers_of_the_server_do_not_wait_for_more() -> None:
+    with listener("127.0.0.1", 0) as listening:
+        with socket.create_connection(listening.getsockname()), listening.accept()[0] as accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
+
+
 def test_server_listens_on_the_sixth_version_of_the_address() -> None:
     try:
         listening = listener("::1", 0)
