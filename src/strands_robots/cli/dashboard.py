@@ -201,7 +201,8 @@ def _announce(screen: Screen, url: str, remote: RemoteAddress | None) -> None:
             screen.say(f"For a phone, as {role}:")
             screen.copyable(f"  {remote.url(role)}")
             for line in qr_code(remote.url(role)).splitlines():
-                screen.copyable(line)
+                # A terminal with dark letters on white would show its negative, which some phones do not read.
+                screen.copyable(line, "bright_white on black")
         screen.say("The browser asks about the certificate once. Its SHA-256 fingerprint:")
         screen.copyable(f"  {remote.fingerprint}")
     screen.data(facts)

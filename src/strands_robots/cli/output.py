@@ -100,10 +100,10 @@ class Screen:
         """Print one sentence for people."""
         self.show(label(text, style))
 
-    def copyable(self, text: str) -> None:
+    def copyable(self, text: str, style: str = "") -> None:
         """Print a line to paste elsewhere, never broken at the terminal's width."""
         if not self.machine:
-            self.out.print(label(text), soft_wrap=True)
+            self.out.print(label(text), style=style, soft_wrap=True)
 
     def show(self, thing: RenderableType) -> None:
         """Print a table or panel for people."""

@@ -24,12 +24,3 @@ export function typing(target) {
   return target instanceof HTMLTextAreaElement ||
     (target instanceof HTMLInputElement && !["button", "submit", "range"].includes(target.type));
 }
-
-let toastTimer = 0;
-export function toast(text, bad = false) {
-  const node = document.getElementById("toast");
-  node.textContent = text;
-  node.dataset.bad = bad ? "yes" : "no";
-  clearTimeout(toastTimer);
-  toastTimer = setTimeout(() => { node.textContent = ""; }, bad ? 15000 : 6000);
-}

@@ -1,5 +1,5 @@
 // Resume stands far from STOP, in words and in place, and asks for the passphrase each time.
-import { el, setText, toast } from "./dom.js";
+import { el, setText } from "./dom.js";
 import { byName } from "./fleet.js";
 import { S } from "./strings.js";
 
@@ -35,9 +35,7 @@ export class Resume {
     this.passphrase.value = "";
     setText(this.said, S.sending);
     const answer = await this.state.ask({ type: "resume", keys, passphrase });
-    const text = answer ? answer.text : S.noAnswer;
-    setText(this.said, text);
+    setText(this.said, answer ? answer.text : S.noAnswer);
     this.said.dataset.tone = answer && answer.ok ? "good" : "bad";
-    toast(text, !(answer && answer.ok));
   }
 }

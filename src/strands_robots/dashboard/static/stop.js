@@ -91,7 +91,8 @@ export class Stop {
     const head = el("p", { class: "stop-head", "data-tone": bad || answers.length === 0 ? "bad" : running ? "warn" : someFreed ? "quiet" : "good" },
       el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)))}: ` : "" }), summary);
     const list = el("ul", { class: "answers" });
-    const worst = ORDER.flatMap((state) => groups.get(state));
+    // Once all are free the cards say the rest.
+    const worst = freed ? [] : ORDER.flatMap((state) => groups.get(state));
     for (const row of worst.slice(0, NAMES_MAX)) {
       list.append(el("li", { "data-tone": verdictTone(row.stop), "data-state": row.stop.state, "data-key": row.key },
         el("strong", { text: row.id }), ` ${verdictText(row.stop)}`));

@@ -140,7 +140,7 @@ export const S = {
   resumeHint: "Go and look first. A resume frees robots; it starts no motion.",
   resumeWhich: (names) => `Locked: ${names}`,
   resumePassphrase: "Passphrase of the operator's key",
-  resumeDemo: "The demo has printed it in the terminal where you started it.",
+  resumeDemo: "The demo printed its passphrase in the terminal where you started it.",
   resumeButton: "Resume the locked robots",
   resumeRemote: "A resume is possible only on the machine where this page's server runs.",
   resumeNoKey: "This page was started without --operator-key. In a terminal: strands-robots resume --local, at the robot's own machine.",
