@@ -41,8 +41,14 @@ SETTLED_S, SETTLED_FOR_SURE_S = 0.2, 0.6
 That is where at least one device has answered; a device answers a probe within milliseconds.
 """
 
-SETTLED_HERE_S, SETTLED_FOR_SURE_HERE_S = 0.15, 0.3
+SETTLED_HERE_S, SETTLED_FOR_SURE_HERE_S = 0.15, 0.2
 """The same on this machine alone, where links come up in milliseconds."""
+
+GAPS = 4
+"""Times the longest gap so far between two devices or links, which a thorough collection on this machine waits for.
+
+On a busy machine, where devices answer late, it waits longer in proportion.
+"""
 
 SETTLED_AMONG_SCOUTED_S = 0.4
 """The same where peers are found by multicast, because their links come up one by one."""
@@ -137,7 +143,7 @@ class Discovery:
         self._unserved = False
         """True while the last question to the registry found none."""
         self._listens_since = 0.0
-        self._changed_at = 0.0
+        self._changed_at = self._longest_gap_s = 0.0
         self._found: Found = lambda peer: None
 
     @property
@@ -179,31 +185,26 @@ class Discovery:
         def found_once(peer: Peer) -> None:
             if peer.id not in named:
                 named.add(peer.id)
-                self._changed_at = loop.time()
+                self._changed(loop.time())
                 found(peer)
 
-        link = self._messaging.link
-        if link.meeting_point:
-            settled = SETTLED_FOR_SURE_HERE_S if thorough else SETTLED_HERE_S
-        elif thorough:
-            settled = SETTLED_FOR_SURE_S
-        else:
-            settled = SETTLED_AMONG_SCOUTED_S if link.uses_multicast else SETTLED_S
         self._found = found_once
         began = self._changed_at = loop.time()
+        self._longest_gap_s = 0.0
         listing = asyncio.create_task(self._list(within))
         try:
             probe_at, pause, links = began, PROBE_EVERY_S, 0
             while (now := loop.time()) < began + within:
                 if (linked := self._messaging.links) > links:
-                    probe_at = self._changed_at = now
+                    probe_at = now
+                    self._changed(now)
                 if now >= probe_at:
                     probe_at = now + (PROBE_AGAIN_S if linked > links else pause)
                     # Hundreds of devices answer each probe.
                     pause *= 1 if linked > links else 2
                     await self._messaging.publish(f"{self._root}.discovery.probe", b'{"probe": true}')
                 links = linked
-                if named and self._registry_heard(listing, now - began) and now - self._changed_at >= settled:
+                if named and self._registry_heard(listing, now - began) and self._settled(now, thorough):
                     break
                 await asyncio.sleep(min(LOOK_EVERY_S, within))
             await self._settle_registry(listing, began, sure=thorough and not named)
@@ -214,6 +215,21 @@ class Discovery:
         # A device's own word is newer than the registry's.
         everyone = {**self._listed, **self._described, **self._present}
         return [self._with_last_beat(everyone[name]) for name in sorted(everyone)]
+
+    def _changed(self, now: float) -> None:
+        self._longest_gap_s = max(self._longest_gap_s, now - self._changed_at)
+        self._changed_at = now
+
+    def _settled(self, now: float, thorough: bool) -> bool:
+        """Return True when no further device or link is to be expected."""
+        link = self._messaging.link
+        if link.meeting_point:
+            settled = max(SETTLED_FOR_SURE_HERE_S, GAPS * self._longest_gap_s) if thorough else SETTLED_HERE_S
+        elif thorough:
+            settled = SETTLED_FOR_SURE_S
+        else:
+            settled = SETTLED_AMONG_SCOUTED_S if link.uses_multicast else SETTLED_S
+        return now - self._changed_at >= settled
 
     def _with_last_beat(self, peer: Peer) -> Peer:
         beat = self._beats.get(peer.id)
