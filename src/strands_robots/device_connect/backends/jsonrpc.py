@@ -34,8 +34,11 @@ _TRACE = ("traceparent", "tracestate", "baggage", "source_device")
 
 RpcId = str | int | float | None
 
+# A tuple: a union of types is made anew each time that it is read in a function.
+_SCALARS = (str, int, float)
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(slots=True)
 class RpcRequest:
     """A well-formed command, parsed; ``data`` is the message it came as."""
 
@@ -116,14 +119,14 @@ def valid_json(data: bytes) -> bool:
 def _id_of(data: bytes) -> RpcId:
     """The id of an encoded reply, as far as it is readable."""
     rpc_id = json_object(data).get("id")
-    return rpc_id if isinstance(rpc_id, str | int | float) else None
+    return rpc_id if isinstance(rpc_id, _SCALARS) else None
 
 
 def _check_request(request: dict[str, Any], data: bytes) -> RpcRequest | Refusal:
     if "id" not in request:
         return Refusal(INVALID_REQUEST, "id is missing")
     rpc_id = request["id"]
-    if isinstance(rpc_id, bool) or not (rpc_id is None or isinstance(rpc_id, str | int | float)):
+    if isinstance(rpc_id, bool) or not (rpc_id is None or isinstance(rpc_id, _SCALARS)):
         return Refusal(INVALID_REQUEST, f"id must be a string or a number, not {_kind(rpc_id)}")
     if isinstance(rpc_id, float) and not math.isfinite(rpc_id):
         return Refusal(INVALID_REQUEST, "id must be a finite number")
@@ -147,7 +150,7 @@ def _params_problem(params: object) -> str:
     if not isinstance(meta, dict):
         return f"_dc_meta must be an object, not {_kind(meta)}"
     for name, value in meta.items():
-        if value is not None and not isinstance(value, str if name in _TRACE else str | int | float):
+        if value is not None and not isinstance(value, str if name in _TRACE else _SCALARS):
             return f"_dc_meta.{shown(name)[1:-1]} must be text, not {_kind(value)}"
     source = meta.get("source_device", params.get("source_device"))
     if source is not None and not isinstance(source, str):

@@ -75,6 +75,7 @@ class ZenohBackend(Backend):
         self._callbacks: tuple[Callable[[], Awaitable[None]] | None, ...] = (None, None)
         self._tasks: set[asyncio.Task[Any]] = set()
         self._tries, self._retry_delay = 13, 0.05
+        self._query = _QUERY
 
     async def connect(
         self,
@@ -102,6 +103,7 @@ class ZenohBackend(Backend):
             reason = str(error).partition(" at /")[0].strip()
             raise MessagingConnectionError(redacted(f"no Zenoh link at {where}: {reason}")) from error
         self._closed = False
+        self._query = _QUERY_OF_A_PEER if link.is_peer else _QUERY
         self._shared.watch(self._on_link)
 
     async def publish(self, subject: str, data: bytes) -> None:
@@ -150,11 +152,36 @@ class ZenohBackend(Backend):
             pause = min(2 * pause, self._retry_delay)
 
     async def request_once(self, subject: str, data: bytes, within: float) -> bytes:
-        """Return the first reply to ``data``, asking the devices that are linked now."""
-        answer = await self._request_once(key_of(subject), data, max(within, 0.001))
-        if answer is None:
-            raise NoResponderError(f"no device answers on {subject}")
-        return answer
+        """Return the first reply to ``data``, asking the devices that are linked now.
+
+        Raises:
+            PublishError: the subject is malformed, or the other side refused.
+        """
+        session, loop, wait_s = self._connected().session, asyncio.get_running_loop(), max(within, 0.001)
+        request, key = _Request(loop, self._outcomes), key_of(subject)
+        token: Any = zenoh.CancellationToken()
+        handler = zenoh_session.direct(request.on_reply, request.on_end)
+        get = partial(session.get, key, handler, payload=data, timeout=wait_s, cancellation_token=token, **self._query)
+        deadline = loop.call_later(wait_s + _GRACE_S, request.on_deadline)
+        try:
+            if len(data) < LARGE_BYTES:
+                get()
+            else:
+                await on_a_thread(get)
+            answer = await request.future
+        except zenoh.ZError as error:
+            raise PublishError(f"cannot ask {key}: {error}") from error
+        finally:
+            deadline.cancel()
+            if not request.answered:
+                token.cancel()
+        if answer is not None:
+            return answer
+        if request.failure == "Timeout":
+            raise RequestTimeoutError(f"no reply on {key} in time")
+        if request.failure:
+            raise PublishError(f"{key} refused: {request.failure}")
+        raise NoResponderError(f"no device answers on {subject}")
 
     async def close(self) -> None:
         """Undeclare everything and release the session."""
@@ -263,38 +290,6 @@ class ZenohBackend(Backend):
         with contextlib.suppress(RuntimeError):
             if self._loop is not None:
                 self._loop.call_soon_threadsafe(function)
-
-    async def _request_once(self, key: str, data: bytes, wait_s: float) -> bytes | None:
-        """Return the first reply on ``key`` to ``data``; None when no device serves it.
-
-        Raises:
-            RequestTimeoutError: a device serves it and gave no reply within ``wait_s`` seconds.
-            PublishError: the key is malformed, or the other side refused.
-        """
-        session, loop = self._connected().session, asyncio.get_running_loop()
-        request = _Request(loop, self._outcomes)
-        token: Any = zenoh.CancellationToken()
-        options = _QUERY_OF_A_PEER if self._link.is_peer else _QUERY
-        handler = zenoh_session.direct(request.on_reply, request.on_end)
-        get = partial(session.get, key, handler, payload=data, timeout=wait_s, cancellation_token=token, **options)
-        deadline = loop.call_later(wait_s + _GRACE_S, request.on_deadline)
-        try:
-            if len(data) < LARGE_BYTES:
-                get()
-            else:
-                await on_a_thread(get)
-            answer = await request.future
-        except zenoh.ZError as error:
-            raise PublishError(f"cannot ask {key}: {error}") from error
-        finally:
-            deadline.cancel()
-            if not request.answered:
-                token.cancel()
-        if answer is None and request.failure == "Timeout":
-            raise RequestTimeoutError(f"no reply on {key} in time")
-        if answer is None and request.failure:
-            raise PublishError(f"{key} refused: {request.failure}")
-        return answer
 
     def _settle_requests(self) -> None:
         while (outcome := self._outcomes.take()) is not None:

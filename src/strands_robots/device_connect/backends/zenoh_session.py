@@ -174,6 +174,7 @@ class SharedSession:
         self._lock = threading.RLock()
         self._topics: dict[str, _Topic] = {}
         self._was_linked = False
+        self._is_peer = link.is_peer
         self._watchers: list[Callable[[bool], None]] = []
         self._meeting: MeetingPort | None = None
 
@@ -204,7 +205,7 @@ class SharedSession:
     def linked(self) -> bool:
         """True for an open peer, and for a client that has its router."""
         opened = self._linked_session
-        return opened is not None and (self.link.is_peer or bool(opened.remotes))
+        return opened is not None and (self._is_peer or bool(opened.remotes))
 
     @property
     def links(self) -> int:
