@@ -1,6 +1,7 @@
 """Commands side by side and bounded, events in order, one wake-up for many messages."""
 
 import asyncio
+import contextlib
 import contextvars
 import json
 import logging
@@ -11,7 +12,7 @@ import pytest
 from fixtures.waiting import until
 
 from strands_robots.device_connect.backends import dispatch, jsonrpc
-from strands_robots.device_connect.backends.dispatch import start_now
+from strands_robots.device_connect.backends.dispatch import EagerTasks
 
 
 def command(method="move", rpc_id=1):
@@ -291,8 +292,12 @@ def at_once(work):
     started = asyncio.get_running_loop().create_future()
 
     def start():
-        task = start_now(work)
-        started.set_result((task, seen_at_start()))
+        try:
+            task = EagerTasks().start(work)
+        except ValueError as error:
+            started.set_exception(error)
+        else:
+            started.set_result((task, seen_at_start()))
 
     seen = []
 
@@ -310,8 +315,58 @@ async def test_work_that_does_not_wait_is_done_when_start_returns():
     started, seen = at_once(coroutine := work())
     task, at_start = await started
     assert at_start == ["done"]
-    assert await task is None
+    assert task is None
     assert coroutine.cr_frame is None
+
+
+async def test_work_that_does_not_wait_leaves_the_spare_task_to_the_next():
+    loop, tasks, gate, seen = asyncio.get_running_loop(), EagerTasks(), asyncio.Event(), []
+
+    async def work(name, *, waits):
+        assert asyncio.current_task() is not None
+        token = VARIABLE_OF_A_TASK.set(name)
+        if waits:
+            await gate.wait()
+        seen.append(VARIABLE_OF_A_TASK.get())
+        VARIABLE_OF_A_TASK.reset(token)
+
+    def start():
+        for number, waits in enumerate((False, True, False, True, False)):
+            started.append(tasks.start(work(f"{number}", waits=waits)))
+
+    started = []
+    loop.call_soon(start)
+    await until(lambda: len(started) == 5)
+    assert seen == ["0", "2", "4"]
+    assert [task is not None for task in started] == [False, True, False, True, False]
+    gate.set()
+    await asyncio.gather(started[1], started[3])
+    assert seen == ["0", "2", "4", "1", "3"]
+    for spare in tasks.close():
+        spare.cancel()
+
+
+async def test_work_that_cancels_its_task_in_its_first_step_harms_no_other():
+    loop, tasks, gate, seen = asyncio.get_running_loop(), EagerTasks(), asyncio.Event(), []
+
+    async def cancels_itself():
+        asyncio.current_task().cancel()
+
+    async def work():
+        await gate.wait()
+        seen.append("done")
+
+    def start():
+        with contextlib.suppress(asyncio.CancelledError):
+            tasks.start(cancels_itself())
+        started.append(tasks.start(work()))
+
+    started = []
+    loop.call_soon(start)
+    await until(lambda: started)
+    gate.set()
+    await started[0]
+    assert seen == ["done"]
 
 
 async def test_work_that_waits_continues_later():
@@ -365,9 +420,8 @@ async def test_exception_is_the_tasks_outcome(wait_first):
         raise ValueError("broken")
 
     started, _ = at_once(work())
-    task, _ = await started
     with pytest.raises(ValueError, match="broken"):
-        await task
+        await (await started)[0]
 
 
 @pytest.mark.parametrize("let_it_run", [False, True])
@@ -382,7 +436,7 @@ async def test_cancelled_task_cleans_up_and_cancels_its_future(let_it_run):
             seen.append("cleaned up")
 
     def start():
-        task = start_now(work())
+        task = EagerTasks().start(work())
         if let_it_run:
             loop.call_soon(loop.call_soon, task.cancel)
         else:
@@ -416,7 +470,7 @@ async def test_work_started_inside_a_task_begins_in_the_next_turn():
     async def work():
         seen.append(asyncio.current_task())
 
-    task = start_now(work())
+    task = EagerTasks().start(work())
     assert not seen
     await task
     assert seen == [task]
