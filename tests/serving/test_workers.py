@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import threading
 import time
+import weakref
 
 import pytest
 from fixtures.waiting import eventually
@@ -36,6 +38,17 @@ def test_an_idle_thread_is_used_again() -> None:
         threads.add(share.call(threading.current_thread).result(20))
         eventually(lambda: pool.idle == 1)
     assert len(threads) == 1
+
+
+def test_idle_thread_keeps_nothing_of_the_call_that_started_it() -> None:
+    pool = WorkerPool(idle_s=60.0)
+    robot = threading.Event()
+    left = weakref.ref(robot)
+    Share(pool=pool).call(robot.set).result(20.0)
+    eventually(lambda: pool.idle == 1)
+    del robot
+    eventually(lambda: gc.collect() >= 0 and left() is None, what="the end of the robot")
+    assert pool.idle == 1
 
 
 def test_no_job_is_lost_when_threads_end_and_start() -> None:

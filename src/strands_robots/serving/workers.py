@@ -119,7 +119,9 @@ class Share:
                 pool._idle -= 1
                 pool._jobs.put((job, self))
                 return
-        thread = threading.Thread(target=pool._work, args=(job, self), name="robot-call", daemon=True)
+        # Taken out when it begins: a thread keeps its arguments, here a robot, until it ends.
+        first = [job]
+        thread = threading.Thread(target=lambda: pool._work(first.pop(), self), name="robot-call", daemon=True)
         try:
             thread.start()
         except RuntimeError:
