@@ -47,6 +47,9 @@ PROBE_TIMEOUT_S = 1.0
 PROBES, PROBE_EVERY_S = 3, 0.05
 """Number of times that a peer asks for its own id before the id counts as free, and the seconds between them."""
 
+ALL_LINKED_S = 1.0
+"""Seconds after which a session at a meeting point is linked to every peer that was there before it."""
+
 PRESENCE_WAIT_S = 0.25
 """Seconds in which a live device has announced itself after a probe, where access rules forbid to call it."""
 
@@ -55,6 +58,10 @@ EXIT_TIMEOUT_S = 3.0
 
 LEAVE_TIMEOUT_S = 15.0
 """Seconds that a device's end waits for the link of its e-stop listener to close."""
+
+
+RUNTIME_LOGGER = "device_connect_edge.device."
+"""Prefix of the name of the framework's logger of a device."""
 
 
 class DuplicateDeviceError(StrandsRobotsError, RuntimeError):
@@ -148,7 +155,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
             before_live=before_live,
         )
     except BaseException:
-        await asyncio.shield(_leave(registration))
+        await asyncio.shield(_leave(name, registration))
         raise
     if isinstance(driver, RobotDriver):
         runtime.set_heartbeat_provider(driver.heartbeat)
@@ -385,7 +392,8 @@ async def _answers(name: str, link: LinkConfig, messaging: Any) -> bool:
     request = {"jsonrpc": "2.0", "id": "probe", "method": "requestRegistration", "params": {}}
     if link.is_peer:
         # At a meeting point peers learn of one another one by one; any other open link knows all its peers.
-        messaging.configure_d2d_retry(retries=PROBES if link.meet_port else 1, delay=PROBE_EVERY_S)
+        learning = link.meet_port and messaging.linked_for_s < ALL_LINKED_S
+        messaging.configure_d2d_retry(retries=PROBES if learning else 1, delay=PROBE_EVERY_S)
     try:
         await messaging.request(
             f"device-connect.{link.tenant}.{name}.cmd", json.dumps(request).encode(), timeout=PROBE_TIMEOUT_S
@@ -409,13 +417,16 @@ async def _live(runtime: Runtime, registration: asyncio.Task[SafetyRegistration 
         await runtime.run()
     finally:
         # Closing a link blocks, so it is done on a thread, to its end.
-        await asyncio.shield(_leave(registration))
+        await asyncio.shield(_leave(runtime.device_id, registration))
 
 
-async def _leave(registration: asyncio.Task[SafetyRegistration | None]) -> None:
+async def _leave(name: str, registration: asyncio.Task[SafetyRegistration | None]) -> None:
     (taken,) = await asyncio.gather(registration, return_exceptions=True)
-    if isinstance(taken, SafetyRegistration):
-        await called(_REGISTRATIONS, taken.leave, LEAVE_TIMEOUT_S)
+    try:
+        if isinstance(taken, SafetyRegistration):
+            await called(_REGISTRATIONS, taken.leave, LEAVE_TIMEOUT_S)
+    finally:
+        _forget_warnings(name)
 
 
 def _ended(runtime: Runtime, task: asyncio.Task[None]) -> None:
@@ -437,13 +448,24 @@ class _LastWarning(logging.Handler):
 
 def _framework_warnings(name: str) -> _LastWarning:
     """Attach a handler to the runtime's logger, which would else write to stderr."""
-    framework = logging.getLogger(f"device_connect_edge.device.{name}")
+    framework = logging.getLogger(RUNTIME_LOGGER + name)
     for handler in framework.handlers:
         if isinstance(handler, _LastWarning):
             return handler
     last = _LastWarning()
     framework.addHandler(last)
     return last
+
+
+def _forget_warnings(name: str) -> None:
+    """Drop the runtime's logger, which Python keeps for every id that there ever was.
+
+    One that the application has set up stays.
+    """
+    framework = logging.getLogger(RUNTIME_LOGGER + name)
+    ours = all(isinstance(each, _LastWarning) for each in framework.handlers)
+    if ours and not framework.filters and framework.level == logging.NOTSET:
+        framework.manager.loggerDict.pop(framework.name, None)
 
 
 def _depart_at_exit() -> None:

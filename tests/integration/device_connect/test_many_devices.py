@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import logging
 import threading
 import time
+import weakref
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -26,6 +30,7 @@ from strands_robots.device_connect import (
     stop_device_connect,
 )
 from strands_robots.envelope import Envelope, success
+from strands_robots.serving.workers import POOL
 
 
 class Idle:
@@ -262,6 +267,41 @@ def test_rounds_of_joins_and_leaves_leave_nothing(link: LinkConfig) -> None:
         turn()
     # Workers end after two idle seconds, Zenoh's pool stays.
     eventually(lambda: device_threads() == 0 and me.num_threads() <= threads + 2 and me.num_fds() <= files + 2)
+
+
+def test_rounds_of_joins_and_leaves_leave_no_object(link: LinkConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every round has devices of other ids, so that what is kept for each id ever seen counts as well."""
+    left: list[weakref.ref[Idle]] = []
+    # The test's own log would keep its records.
+    monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)
+
+    def turn(number: int) -> None:
+        names = [f"arm-{number}-{each}" for each in range(10)]
+        robots = [Idle(name) for name in names]
+        left.extend(weakref.ref(each) for each in robots)
+        for runtime in [
+            init_device_connect_sync(robot, peer_id=name, link=link, allow_insecure=True)
+            for name, robot in zip(names, robots, strict=True)
+        ]:
+            stop_device_connect(runtime)
+
+    def none_left() -> bool:
+        gc.collect()
+        left[:] = [each for each in left if each() is not None]
+        return not left
+
+    def objects() -> Counter[str]:
+        # Workers of the last round may still stand in a call of it.
+        eventually(lambda: POOL.idle == 0 and none_left(), what="the end of the robots of a round")
+        return Counter(type(each).__module__ + "." + type(each).__qualname__ for each in gc.get_objects())
+
+    turn(0)
+    turn(1)
+    before = objects()
+    for number in range(2, 6):
+        turn(number)
+    # Of anything that is kept for each device there would be forty more.
+    assert {name: more for name, more in (objects() - before).items() if more >= 40} == {}
 
 
 def test_last_device_ends_the_thread_and_the_next_one_starts_it_again(link: LinkConfig) -> None:
