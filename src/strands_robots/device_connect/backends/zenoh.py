@@ -202,6 +202,11 @@ class ZenohBackend(Backend):
         return shared.links if shared is not None and self._link.is_peer else 0
 
     @property
+    def linked_for_s(self) -> float:
+        """Seconds since the session was opened."""
+        return 0.0 if self._shared is None else time.monotonic() - self._shared.opened_at
+
+    @property
     def is_connected(self) -> bool:
         """True for an open peer, and for a client that has its router."""
         return self._shared is not None and self._shared.linked

@@ -169,6 +169,7 @@ class SharedSession:
     def __init__(self, link: LinkConfig) -> None:
         self.link = link
         self.users = 0
+        self.opened_at = time.monotonic()
         self.session: Any = None
         self._linked_session: LinkedSession | None = None
         self._lock = threading.RLock()
@@ -184,6 +185,7 @@ class SharedSession:
             if self.session is not None:
                 return
             self._linked_session = opened = self._opened()
+            self.opened_at = time.monotonic()
             self.session, self._was_linked = opened.zenoh, self.link.is_peer
             _ever_opened.set()
             opened.watch_links()
