@@ -1,13 +1,16 @@
 """Many devices in one process, for :mod:`benchmarks.fleet`: ``python -m benchmarks.fleet_children KIND ...``.
 
-``KIND FIRST COUNT TRANSPORT ENDPOINT``: joins ``COUNT`` devices, ``ours`` or ``bare`` (the framework's runtimes on one
-loop), reports, and then obeys lines on its standard input: ``idle SECONDS``, ``halts`` and ``end``. ``agent`` finds
-``COUNT`` devices with the framework's agent tools and calls each of them.
+``KIND FIRST COUNT TRANSPORT ENDPOINT`` joins ``COUNT`` devices, reports, and then obeys lines on its standard input:
+``idle SECONDS``, ``halts`` and ``end``. They are ``ours``, ``settled`` (idle after each group) or ``bare``, the
+framework's runtimes on one loop. ``agent`` finds ``COUNT`` devices with the framework's agent tools and calls each of
+them; ``rounds`` joins and leaves.
 """
 
 from __future__ import annotations
 
 import asyncio
+import ctypes
+import gc
 import json
 import logging
 import os
@@ -25,6 +28,10 @@ from strands_robots.envelope import Envelope, success
 
 GROUP = 25
 HALTS: dict[str, float] = {}
+FULL_PASSES = {"began": 0.0, "cpu": 0.0}
+"""Seconds of CPU of Python's full collections: by the size of the process, one for each quarter that it grows by."""
+IDLE_S = 3.0
+"""Seconds after which the workers of the last joins have ended."""
 
 
 class Idle:
@@ -50,11 +57,20 @@ class Idle:
 def snapshot() -> dict[str, float]:
     me = psutil.Process()
     return {
-        "cpu": time.process_time(),
+        "cpu": time.process_time() - FULL_PASSES["cpu"],
         "mb": me.memory_info().rss / 1e6,
         "threads": me.num_threads(),
         "fds": me.num_fds(),
     }
+
+
+def on_collection(phase: str, info: dict[str, int]) -> None:
+    if info["generation"] == 2:
+        now = time.thread_time()
+        if phase == "start":
+            FULL_PASSES["began"] = now
+        else:
+            FULL_PASSES["cpu"] += now - FULL_PASSES["began"]
 
 
 def report(**facts: Any) -> None:
@@ -67,14 +83,17 @@ def link_to(transport: str, endpoint: str) -> LinkConfig:
     return LinkConfig(transport=transport, connect=(endpoint,))
 
 
-def ours(first: int, count: int, link: LinkConfig) -> None:
+def ours(first: int, count: int, link: LinkConfig, *, settled: bool = False) -> None:
+    """Join devices; ``settled`` waits after each group until they are idle."""
+    gc.callbacks.append(on_collection)
     marks, runtimes = [snapshot()], []
     for number in range(first, first + count):
         name = f"arm-{number}"
         runtimes.append(init_device_connect_sync(Idle(name), peer_id=name, link=link, allow_insecure=True))
         if len(runtimes) % GROUP == 0:
+            time.sleep(IDLE_S if settled else 0.0)
             marks.append(snapshot())
-    report(marks=marks, at=time.monotonic())
+    report(marks=marks, collected=FULL_PASSES["cpu"])
     obey()
     for each in runtimes:
         stop_device_connect(each)
@@ -82,19 +101,23 @@ def ours(first: int, count: int, link: LinkConfig) -> None:
 
 
 def rounds(turns: int, count: int, link: LinkConfig) -> None:
-    """Join and leave, again and again."""
+    """Join and leave, again and again, under other names each time."""
     marks = []
-    for _ in range(turns):
+    for turn in range(turns):
+        names = [f"arm-{turn}-{each}" for each in range(count)]
         runtimes = [
-            init_device_connect_sync(Idle(f"arm-{each}"), peer_id=f"arm-{each}", link=link, allow_insecure=True)
-            for each in range(count)
+            init_device_connect_sync(Idle(name), peer_id=name, link=link, allow_insecure=True) for name in names
         ]
         for each in runtimes:
             stop_device_connect(each)
-        marks.append(snapshot())
-    # The pool's workers end after two idle seconds.
-    time.sleep(3.0)
-    report(marks=[*marks, snapshot()])
+        if turn + 1 in (turns // 3, turns):
+            runtimes.clear()
+            time.sleep(IDLE_S)
+            gc.collect()
+            # What the allocator keeps between two uses says nothing of who uses it.
+            ctypes.CDLL(None).malloc_trim(0)
+            marks.append({**snapshot(), "objects": len(gc.get_objects())})
+    report(marks=marks)
 
 
 def bare(first: int, count: int, transport: str, endpoint: str) -> None:
@@ -121,7 +144,7 @@ def bare(first: int, count: int, transport: str, endpoint: str) -> None:
         asyncio.run_coroutine_threadsafe(join(f"bare-{number}"), loop).result(60.0)
         if (number - first + 1) % GROUP == 0:
             marks.append(snapshot())
-    report(marks=marks, at=time.monotonic())
+    report(marks=marks, collected=0.0)
     obey()
     os._exit(0)
 
@@ -172,7 +195,11 @@ def main() -> None:
     elif kind == "agent":
         agent(int(count), transport, endpoint)
     else:
-        (rounds if kind == "rounds" else ours)(int(first), int(count), link_to(transport, endpoint))
+        link = link_to(transport, endpoint)
+        if kind == "rounds":
+            rounds(int(first), int(count), link)
+        else:
+            ours(int(first), int(count), link, settled=kind == "settled")
 
 
 if __name__ == "__main__":
