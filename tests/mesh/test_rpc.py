@@ -8,6 +8,7 @@ import pytest
 from tests.mesh.peers import Fleet, ScriptedPeer
 
 from strands_robots.mesh import safety
+from strands_robots.mesh.rpc import REPEAT_S
 from strands_robots.mesh.transport.memory import MemoryTransport
 
 
@@ -38,6 +39,39 @@ def test_peer_that_answers_only_errors_did_not_stop(peers: Fleet, monkeypatch: p
     refusing.join()
     recorded = peers.events("emergency_stop")[0]
     assert (recorded["not_stopped"], recorded["silent"]) == (["refusing"], [])
+
+
+def test_stop_of_one_peer_whose_message_is_lost_is_sent_again(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    console = peers.join(None, "console")
+    there = ScriptedPeer(peers, "there", 0.0)
+    sent = lose_commands(peers, monkeypatch, 1)
+    assert console.send("there", {"action": "stop"}, timeout=60)["type"] == "response"
+    there.join()
+    assert (len(sent), len(there.turns)) == (2, 1)
+
+
+def test_motion_whose_message_is_lost_is_never_sent_again(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    console = peers.join(None, "console")
+    sent = lose_commands(peers, monkeypatch, 100)
+    assert console.send("there", {"action": "reset"}, timeout=3 * REPEAT_S)["status"] == "timeout"
+    assert len(sent) == 1
+
+
+def lose_commands(peers: Fleet, monkeypatch: pytest.MonkeyPatch, first: int) -> list[str]:
+    """Lose the ``first`` commands of the console; return the keys of all that it sends."""
+    sent: list[str] = []
+    transport = peers.transports["console"]
+    put = transport.put
+
+    def lossy(key: str, payload: Any) -> None:
+        if key.endswith("/cmd"):
+            sent.append(key)
+            if len(sent) <= first:
+                return
+        put(key, payload)
+
+    monkeypatch.setattr(transport, "put", lossy)
+    return sent
 
 
 @pytest.mark.parametrize("taken", [True, None])

@@ -32,6 +32,7 @@ BROADCAST_RESPONDER = "\x00broadcast"
 REPLIES_MAX = 4096
 _NO_ID = frozenset("/*$?#")
 REPEAT_S = 0.5
+"""Seconds after which an unanswered stop is sent again: its message or its answer may be lost."""
 
 
 @dataclass(slots=True)
@@ -94,12 +95,14 @@ class Requester:
             self._close(turn)
 
     def _answer(self, turn: Turn, command: dict[str, Any], seconds: float) -> dict[str, Any] | None:
-        """Wait for the reply; towards a 0.5 peer ask for a stop or a read again."""
+        """Wait for the reply; ask for a stop again, and towards a 0.5 peer for a read."""
         deadline = time.monotonic() + seconds
-        repeats = PEER_VERBS[command["action"]].kind in (Kind.STOP, Kind.READ)
+        kind = PEER_VERBS[command["action"]].kind
         while True:
             left = max(0.0, deadline - time.monotonic())
-            pause = ASK_AGAIN_S if repeats and self._context.registry.older() else left
+            pause = REPEAT_S if kind is Kind.STOP else left
+            if kind in (Kind.STOP, Kind.READ) and self._context.registry.older():
+                pause = ASK_AGAIN_S
             try:
                 return turn.next(min(left, pause))
             except Empty:
