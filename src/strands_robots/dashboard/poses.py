@@ -16,7 +16,7 @@ from strands_robots.envelope import Envelope, error, is_error, success, text_of
 HZ = 5.0
 SIZE = (640, 480)
 ANSWER_S = 5.0
-DRAW_S = 30.0
+DRAW_S = 60.0
 """Seconds for one picture; the first loads MuJoCo."""
 
 IDLE_S = 20.0
