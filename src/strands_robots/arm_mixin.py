@@ -407,7 +407,8 @@ class ArmMixin:
     def _object(self, name: str, robot_name: str) -> SeenObject:
         known = {each.name: each for each in self.objects(robot_name)}
         if name not in known:
-            raise ValidationError(f"object must be one of {', '.join(known) or 'none'}, not {shown(name)}.")
+            known_names = ", ".join(known) or "those in getObjects, which sees none"
+            raise ValidationError(f"object must be one of {known_names}, not {shown(name)}.")
         return known[name]
 
     def _move(
