@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 from pathlib import Path
 from typing import Any
 
+import device_connect_agent_tools
 import pytest
 from fixtures.certificates import Authority
 from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import free_port
 
-from strands_robots.device_connect import init_device_connect_sync
+from strands_robots.device_connect import connect_agent, init_device_connect_sync
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.utils import ValidationError
@@ -150,3 +152,14 @@ def test_password_of_a_broker_that_does_not_answer_is_not_in_the_error(caplog: p
             ToyRobot(), peer_id="arm-1", messaging_url=url, allow_insecure=True, bringup_timeout=1.0
         )
     assert "secret" not in f"{failed.value} {caplog.text}"
+
+
+def test_agent_disconnects_at_the_end_of_its_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_exit: list[object] = []
+    monkeypatch.setattr(atexit, "register", at_exit.append)
+    monkeypatch.setattr(atexit, "unregister", lambda _: at_exit.clear())
+    monkeypatch.setattr(device_connect_agent_tools, "connect", lambda: None)
+    monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:1")
+    for _ in range(2):
+        connect_agent()
+    assert at_exit == [device_connect_agent_tools.disconnect]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import signal
 import subprocess
 import sys
@@ -57,21 +56,6 @@ def test_the_served_arm_is_driven_by_an_agents_tools(environment: dict[str, str]
         driven = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
         assert driven.returncode == 0, driven.stderr
         assert "Driving so100-lab-1." in driven.stdout
-
-
-def test_block_of_the_readme_drives_the_arm_and_disconnects_at_its_end(tmp_path: Path) -> None:
-    readme = (EXAMPLES.parent / "README.md").read_text(encoding="utf-8")
-    block = next(each for each in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "connect_agent()" in each)
-    # What is registered first runs last: a thread of the framework's that is left there can abort the process.
-    last = "import atexit, threading\natexit.register(lambda: print([t.name for t in threading.enumerate()]))\n"
-    machine = Machine(tmp_path)
-    with machine.serving("arm-1"):
-        line = [*PYTHON, "-c", last + block]
-        done = subprocess.run(line, env=machine.environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "'device_id': 'arm-1'" in done.stdout
-    assert "MainThread" in (left := done.stdout.splitlines()[-1])
-    assert "agent-tools" not in left
 
 
 def test_without_a_robot_the_agent_says_so(environment: dict[str, str]) -> None:
