@@ -25,9 +25,9 @@ def test_arm_is_recorded_at_rest_in_motion_and_after_its_cable_was_out(
         assert robot.start_task("wave", duration=20)["status"] == "success"
         eventually(lambda: recorder.counts["/arm-1/streamStep"] >= 20)
         assert robot.halt("test").stopped
-        eventually(lambda: recorder.counts["/arm-1/halted"] == 1)
+        eventually(lambda: recorder.counts["/arm-1/halted"] >= 1)
         bus.unplug()
-        eventually(lambda: recorder.counts["/arm-1/notRecorded"] == 1)
+        eventually(lambda: recorder.counts["/arm-1/notRecorded"] >= 1)
         bus.plug()
         robot.connect()
         before = recorder.counts["/arm-1/joint_states"]
