@@ -1,7 +1,7 @@
 """Many devices in one process, for :mod:`benchmarks.fleet`: ``python -m benchmarks.fleet_children KIND ...``.
 
 ``KIND FIRST COUNT TRANSPORT ENDPOINT`` joins ``COUNT`` devices, reports, and then obeys lines on its standard input:
-``idle SECONDS``, ``halts`` and ``end``. They are ``ours``, ``settled`` (idle after each group) or ``bare``, the
+``idle SECONDS``, ``halts`` and ``end``. They are ``ours``, ``settled`` (idle at each mark) or ``bare``, the
 framework's runtimes on one loop. ``agent`` finds ``COUNT`` devices with the framework's agent tools and calls each of
 them; ``rounds`` joins and leaves.
 """
@@ -84,14 +84,15 @@ def link_to(transport: str, endpoint: str) -> LinkConfig:
 
 
 def ours(first: int, count: int, link: LinkConfig, *, settled: bool = False) -> None:
-    """Join devices; ``settled`` waits after each group until they are idle."""
+    """Join devices; ``settled`` waits until they are idle after the first two groups and the last two."""
     gc.callbacks.append(on_collection)
     marks, runtimes = [snapshot()], []
     for number in range(first, first + count):
         name = f"arm-{number}"
         runtimes.append(init_device_connect_sync(Idle(name), peer_id=name, link=link, allow_insecure=True))
         if len(runtimes) % GROUP == 0:
-            time.sleep(IDLE_S if settled else 0.0)
+            compared = len(runtimes) // GROUP in (1, 2, count // GROUP - 1, count // GROUP)
+            time.sleep(IDLE_S if settled and compared else 0.0)
             marks.append(snapshot())
     report(marks=marks, collected=FULL_PASSES["cpu"])
     obey()

@@ -23,7 +23,8 @@ logger = logging.getLogger(__name__)
 OPEN_S = 5.0
 RESCUE_EVERY_S = 0.1
 STEADY_LOOKS = 10
-PUBLISHERS_MAX = 256
+PUBLISHERS_MAX = 4096
+"""Keys with a declared publisher: several for each robot of the process, and one for each peer that is asked."""
 
 
 class ZenohTransport(Transport):
@@ -216,8 +217,8 @@ class ZenohTransport(Transport):
         declared = (publisher, publisher.id)
         with self._lock:
             while len(self._publishers) >= PUBLISHERS_MAX:
-                oldest, _ = self._publishers.pop(next(iter(self._publishers)))
-                oldest.undeclare()
+                # Zenoh undeclares it with the last reference: another thread may publish with it at this moment.
+                del self._publishers[next(iter(self._publishers))]
             self._publishers[key] = declared
         return declared
 
