@@ -4,6 +4,8 @@
 # after another, while the number lasts; each takes one off it. Each is named, because it is a fault to be mended. One
 # that fails again, one too many, or a unit test of safety is a failure at once.
 set -uo pipefail
+# Some hundred processes are started; where the shell forbids bytecode, each would compile the package anew.
+unset PYTHONDONTWRITEBYTECODE
 python=$1
 shift
 [ -f "${SECOND_RUN:-}" ] || exec "$python" -m pytest "$@"
