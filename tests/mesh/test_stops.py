@@ -12,7 +12,7 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope, success
-from strands_robots.mesh import teleop
+from strands_robots.mesh import rpc, teleop
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.stop_requests import CALLER_MAX
@@ -146,15 +146,18 @@ def test_no_stop_of_a_flood_is_refused_and_an_honest_one_gets_its_verdict(peers:
     assert world.halts <= 4
 
 
-def test_a_stop_of_an_unknown_robot_is_answered_at_once_and_halts_nothing(peers: Fleet) -> None:
+def test_a_stop_of_an_unknown_robot_is_answered_at_once_and_halts_nothing(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rpc, "REPEAT_S", 60.0)
     world, arm = Slow("left", "right"), Arm()
     for robot, name in ((world, "sim-1"), (arm, "arm-1")):
         peers.join(robot, name, "sim")
     console, flood = peers.join(None, "console"), peers.stranger()
     said: list[dict[str, Any]] = []
     flood.declare_subscriber("strands/flood/response/sim-1/*", lambda each: said.append(json.loads(each.payload)))
-    # Not the console's own send, which asks again while the halt lasts.
-    flood.put("strands/sim-1/cmd", {"sender_id": "other", "turn_id": "t", "command": {"action": "stop"}})
+    asking = threading.Thread(target=lambda: console.send("sim-1", {"action": "stop"}, timeout=20))
+    asking.start()
     assert world.halting.acquire(timeout=20)
     for turn in range(500):
         command = {"action": "stop", "robot_name": f"robot-{turn}"}
@@ -165,7 +168,7 @@ def test_a_stop_of_an_unknown_robot_is_answered_at_once_and_halts_nothing(peers:
     assert "the robots here are left, right" in said[0]["result"]["error"]
     assert peers.meshes[0].stops_waiting == 1
     world.let_go.set()
-    eventually(lambda: peers.meshes[0].stops_waiting == 0)
+    asking.join(20)
     assert world.halts == 1
     assert console.send("arm-1", {"action": "stop", "robot_name": "whatever"}, timeout=20)["result"]["ok"] is True
 
