@@ -96,6 +96,11 @@ def shown(value: object) -> str:
     return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
 
 
+def field_values(instance: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass by name, without a copy of their values."""
+    return {name: getattr(instance, name) for name in instance.__dataclass_fields__}
+
+
 def redacted(text: str) -> str:
     """Return ``text`` without the credentials of URLs in it."""
     return _CREDENTIALS.sub("//***@", text)

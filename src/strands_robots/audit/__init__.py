@@ -251,7 +251,10 @@ class _Writer:
         with contextlib.suppress(queue.Empty):  # everything was taken, or it is time to try again
             key, item = self._queue.get(timeout=RETRY_S if unwritten else None)
             while True:
-                pending = self._pending.setdefault(key, _Pending(key))
+                pending = self._pending.get(key)
+                if pending is None:
+                    # Made once: it reads the head from the disk.
+                    pending = self._pending[key] = _Pending(key)
                 if isinstance(item, AuditEntry):
                     pending.entries.append(item)
                 else:

@@ -14,12 +14,13 @@ import json
 import os
 import socket
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from strands_robots.safety.ed25519 import canonical
 from strands_robots.safety.state_files import make_private
+from strands_robots.utils import field_values
 
 GENESIS = "0" * 64
 BREAKS_KEPT = 20
@@ -89,6 +90,10 @@ class Head:
     pending: str = ""
     breaks: list[dict[str, Any]] = field(default_factory=list)
 
+    def copy(self) -> Head:
+        """Return a head that goes on by itself."""
+        return replace(self, origins=list(self.origins), seqs=dict(self.seqs), breaks=list(self.breaks))
+
     def advance(self, line: bytes, record: Mapping[str, Any]) -> None:
         """Go on by one record, ``line`` without its end."""
         self.count += 1
@@ -139,7 +144,7 @@ def write_head(path: Path, seal: Seal, head: Head, *, durable: bool) -> None:
     """Replace the head in ``path``; with ``durable``, return when it is on the disk."""
     draft = path.with_suffix(".draft")
     with opened(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as descriptor:
-        write_all(descriptor, canonical(seal.sign(asdict(head))))
+        write_all(descriptor, canonical(seal.sign(field_values(head))))
         if durable:
             os.fsync(descriptor)
     draft.replace(path)
@@ -160,7 +165,7 @@ def read_anchor(path: Path, seal: Seal, log: str) -> Anchor | None:
 def write_anchor(path: Path, seal: Seal, anchor: Anchor) -> None:
     """Write the anchor in place, within one sector, and wait for the disk."""
     make_private(path.parent)
-    data = canonical(seal.sign(asdict(anchor)))
+    data = canonical(seal.sign(field_values(anchor)))
     with opened(path, os.O_WRONLY | os.O_CREAT) as descriptor:
         fresh = os.fstat(descriptor).st_size == 0
         write_all(descriptor, data)

@@ -17,7 +17,6 @@ import os
 import stat
 import time
 from collections.abc import Iterator, Sequence
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -182,7 +181,7 @@ class Journal:
         self._note(head, mismatches)
         if self._kept and head.size >= self._max_bytes:
             mismatches += self._rotate(head)
-        after = deepcopy(head)
+        after = head.copy()
         alarms = [AuditEntry(time.time(), BROKEN, AUDIT_PEER, {"why": why}) for why in mismatches]
         lines = [self._line(each, after) for each in alarms]
         done = length = 0
@@ -260,7 +259,7 @@ class Journal:
         return begun.count == 0 if begun is not None else not self._anchor_path.exists()
 
     def _believed(self, found: Head | None, anchor: Anchor | None, log: str) -> tuple[Head, list[str]]:
-        own = deepcopy(self._head)
+        own = None if self._head is None else self._head.copy()
         if found is None:
             missing = ["its head is missing, changed or not signed with this secret"] if self._seal.keyed else []
             return own or self._scan(log, anchor), missing

@@ -10,12 +10,12 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from strands_robots.audit.head import Anchor, log_id
 from strands_robots.audit.journal import Journal, parse
+from strands_robots.utils import field_values
 
 WITNESS = "audit_witness"
 
@@ -24,7 +24,7 @@ _LOG, _DIGEST = re.compile(r"[0-9a-f]{32}\Z"), re.compile(r"[0-9a-f]{64}\Z")
 
 def stated_head(head: Anchor | None) -> dict[str, Any] | None:
     """Return a head as a verdict carries it."""
-    return None if head is None else asdict(head)
+    return None if head is None else field_values(head)
 
 
 def witnessed(value: object) -> Anchor | None:

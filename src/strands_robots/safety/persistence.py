@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.state_files import StateFileError, adopt, make_private, read_private, require_private
+from strands_robots.utils import field_values
 
 logger = logging.getLogger(__name__)
 
@@ -125,12 +126,16 @@ class LockoutStore:
         self._put_aside()
         with ExitStack() as files:
             # All are written before the first is waited for: the disk takes them together.
-            drafts = {self.file(key): files.enter_context(_draft(self.file(key))) for key in kept}
-            for (key, each), descriptor in zip(kept.items(), drafts.values(), strict=True):
+            drafts = []
+            for key, each in kept.items():
+                path = self.file(key)
+                draft = _draft_of(path)
+                descriptor = files.enter_context(_opened(draft))
                 _write(descriptor, {"v": VERSION, "key": key, **_record(each)})
-            for path, descriptor in drafts.items():
+                drafts.append((descriptor, draft, path))
+            for descriptor, draft, path in drafts:
                 os.fsync(descriptor)
-                _draft_of(path).replace(path)
+                draft.replace(path)
         _sync(directory)
 
     def _found(self, key: str) -> StoredLockout:
@@ -195,8 +200,8 @@ class LockoutStore:
 def _record(kept: StoredLockout) -> dict[str, Any]:
     return {
         "name": kept.name,
-        "holds": [asdict(each) for each in kept.state.lockouts],
-        "overflow": asdict(kept.state.overflow) if kept.state.overflow else None,
+        "holds": [field_values(each) for each in kept.state.lockouts],
+        "overflow": field_values(kept.state.overflow) if kept.state.overflow else None,
         "seen": list(kept.seen),
     }
 
@@ -225,15 +230,15 @@ def _lockout(data: Mapping[str, Any]) -> Lockout:
 
 
 @contextlib.contextmanager
-def _draft(path: Path) -> Iterator[int]:
-    """Open the draft of ``path``, and remove it unless it was renamed."""
+def _opened(draft: Path) -> Iterator[int]:
+    """Open a draft, and remove it unless it was renamed."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
-    descriptor = os.open(_draft_of(path), flags, 0o600)
+    descriptor = os.open(draft, flags, 0o600)
     try:
         yield descriptor
     finally:
         os.close(descriptor)
-        _draft_of(path).unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
 
 
 def _draft_of(path: Path) -> Path:
