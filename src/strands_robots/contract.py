@@ -374,9 +374,12 @@ class AdaptedRobot:
         """Return the answer to a stop, or what the status after it says against it."""
         if grade(answer).stopped is False or not callable(getattr(self.wrapped, "get_task_status", None)):
             return answer
-        deadline = time.monotonic() + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
-        while (status := self._status()) in RUNNING and time.monotonic() < deadline:
-            time.sleep(STATUS_EVERY_S)
+        asked, status = time.monotonic(), self._status()
+        if status in RUNNING:
+            deadline = asked + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+            while status in RUNNING and time.monotonic() < deadline:
+                time.sleep(STATUS_EVERY_S)
+                status = self._status()
         if status in RUNNING:
             return error(f"its get_task_status says {status} after the stop, which answered {shown(answer)}")
         if status not in AT_REST:

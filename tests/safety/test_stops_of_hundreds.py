@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import threading
@@ -15,7 +16,7 @@ from fixtures.recording_robot import RecordingRobot
 from fixtures.waiting import eventually
 
 from strands_robots.safety import controller as controller_module
-from strands_robots.safety import estop_listener
+from strands_robots.safety import estop_listener, reporting
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.estop_listener import VERDICT, EstopListener, notification
 from strands_robots.safety.orders import (
@@ -230,6 +231,64 @@ def test_a_large_process_writes_its_lockouts_though_a_halt_has_not_answered(pace
     paced.answer("arm-0", halted=("task",))
     eventually(lambda: paced.run.kept is True)
     assert paced.events == ["file"]
+
+
+def test_lockouts_of_a_large_process_wait_until_other_processes_have_halted_theirs(paced: PacedRun) -> None:
+    paced.run.keep_at = math.inf
+    for name in paced.run.robot_ids:
+        paced.answer(name, halted=("task",))
+    eventually(lambda: len(paced.run.answers) == 4)
+    assert paced.events == []
+    paced.run.keep_at = 0.0
+    eventually(lambda: paced.run.kept is True)
+
+
+def test_lockouts_of_a_large_process_are_written_at_once_where_a_robot_did_not_stop(paced: PacedRun) -> None:
+    paced.run.keep_at = math.inf
+    for name in paced.run.robot_ids:
+        paced.answer(name, not_stopped={"bus": "no answer in 1 s"})
+    eventually(lambda: paced.run.kept is True)
+
+
+def test_the_collector_waits_for_the_halts_of_a_stop_and_no_longer(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "GRACE_S", 60.0)
+    during = list[bool]()
+    add("arm-1", before_halt=lambda: during.append(gc.isenabled()))
+    eventually(gc.isenabled)
+    assert plane.emergency_stop(order())["arm-1"].stopped is True
+    assert during == [False]
+    eventually(gc.isenabled)
+
+
+def test_the_collector_goes_on_while_a_halt_blocks(plane: SafetyPlane, add: Add) -> None:
+    release = threading.Event()
+    add("arm-1", before_halt=lambda: release.wait(60))
+    run = plane.begin(order())
+    try:
+        assert run is not None
+        eventually(gc.isenabled)
+        assert not run.done.is_set()
+    finally:
+        release.set()
+
+
+def test_a_repetition_while_the_halts_are_under_way_is_not_read_robot_by_robot(plane: SafetyPlane, add: Add) -> None:
+    release, first = threading.Event(), order()
+    robot = add("arm-1", before_halt=lambda: release.wait(60))
+    assert plane.begin(first) is not None
+    try:
+        assert plane.under_way(first.epoch)
+        assert not plane.under_way(new_epoch())
+        assert plane.begin(order((), first.epoch)) is None
+        late = add("arm-2")
+        assert not plane.under_way(first.epoch)
+        assert plane.begin(order((), first.epoch)) is not None
+        assert late.refuses() and robot.refuses()
+    finally:
+        release.set()
+    eventually(lambda: not plane.under_way(first.epoch))
 
 
 @pytest.mark.parametrize("verdict", [{"not_stopped": {"bus": "no answer in 1 s"}}, {"unknown": {"arm-2": "unknown"}}])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Collection, Iterator
 
@@ -10,7 +11,7 @@ import pytest
 from strands_robots.safety import controller as controller_module
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.estop_listener import OnEvent, OnState
-from strands_robots.safety.turns import SWITCH_S, ShortTurns
+from strands_robots.safety.turns import SWITCH_S, LongTurns, PausedCollector, ShortTurns
 
 
 @pytest.fixture(autouse=True)
@@ -60,3 +61,37 @@ def test_open_safety_controller_has_short_turns(monkeypatch: pytest.MonkeyPatch)
     controller.close()
     controller.close()
     assert sys.getswitchinterval() == pytest.approx(0.005)
+
+
+def test_turns_have_their_own_length_during_a_stop_of_many_and_are_short_again_after_it() -> None:
+    short = ShortTurns()
+    end_short, end_long = short.begin(), LongTurns(short).begin()
+    assert sys.getswitchinterval() == pytest.approx(0.005)
+    end_long()
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+    end_short()
+    assert sys.getswitchinterval() == pytest.approx(0.005)
+
+
+def test_turns_whose_last_user_left_during_a_stop_of_many_stay_as_they_were() -> None:
+    short = ShortTurns()
+    end_short, end_long = short.begin(), LongTurns(short).begin()
+    end_short()
+    end_long()
+    assert sys.getswitchinterval() == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_collector_is_paused_until_the_last_of_its_users_has_ended(enabled: bool) -> None:
+    before = gc.isenabled()
+    try:
+        (gc.enable if enabled else gc.disable)()
+        collector = PausedCollector()
+        first, second = collector.begin(), collector.begin()
+        first()
+        first()
+        assert not gc.isenabled()
+        second()
+        assert gc.isenabled() is enabled
+    finally:
+        (gc.enable if before else gc.disable)()

@@ -421,6 +421,8 @@ class EstopListener:
         A source whose signatures keep failing is not checked again here for up to a second: its stops arrive at the
         listener's own link as well.
         """
+        if self._plane.under_way(params.get("estop_id")):
+            return
         if self._rules.signed and not self._budget.allows(source, time.monotonic()):
             return
         order = self._rules.order(source, params, path)
@@ -473,7 +475,10 @@ class EstopListener:
                     if self._check_in(received) and self._rules.signed:
                         events.vouch(received.source)
                     continue
-                order = self._rules.order_of(received.source, received.payload, received.at)
+                params = params_of(received.payload)
+                if self._plane.under_way(params.get("estop_id")):
+                    continue
+                order = self._rules.order_of(received.source, received.payload, received.at, params)
                 if isinstance(order, StopRefused):
                     self._refusals.record(order, received.event)
                     if not events.vouched_for(received.source):

@@ -74,12 +74,16 @@ class LockoutState:
         """The epochs that a signed resume can clear."""
         return tuple(each.epoch for each in self.lockouts)
 
+    def can_resume(self, epoch: str) -> bool:
+        """Return True when a signed resume can clear ``epoch``."""
+        return any(each.epoch == epoch for each in reversed(self.lockouts))
+
     def engage(self, lockout: Lockout) -> LockoutState:
         """Return the state after an emergency stop; a known epoch changes nothing."""
-        if lockout.epoch in self.resumable:
+        if self.can_resume(lockout.epoch):
             return self
         if lockout.epoch != OVERFLOW and len(self.lockouts) < MAX_EPOCHS:
-            return replace(self, lockouts=(*self.lockouts, lockout))
+            return LockoutState((*self.lockouts, lockout), self.overflow)
         return self if self.overflow is not None else replace(self, overflow=replace(lockout, epoch=OVERFLOW))
 
     def resume(self, epoch: str) -> LockoutState:

@@ -42,6 +42,9 @@ ANSWERED = "answered"
 ANSWERED_MAX_BYTES = 8 * 2**10
 """Encoded length of :data:`ANSWERED`; a name that exceeds it is left out, and answers again."""
 
+LISTENER = "lane"
+"""``path`` of a stop that the e-stop listener received."""
+
 REQUIRE_SIGNED = "STRANDS_ESTOP_REQUIRE_SIGNED"
 ALLOW = "DEVICE_CONNECT_ESTOP_ALLOW"
 
@@ -260,9 +263,15 @@ class StopRules:
     def _may_stop(self, source: str) -> bool:
         return caller_name(source) is not None and (not self._allow or self._fits(source) is not None)
 
-    def order_of(self, source: str, payload: bytes, received: float | None = None) -> StopOrder | StopRefused:
-        """Decide on the bytes of an ``emergencyStop`` event."""
-        return self.order(source, params_of(payload), "lane", payload, received)
+    def order_of(
+        self,
+        source: str,
+        payload: bytes,
+        received: float | None = None,
+        params: Mapping[str, Any] | None = None,
+    ) -> StopOrder | StopRefused:
+        """Decide on the bytes of an ``emergencyStop``; ``params`` if read already."""
+        return self.order(source, params_of(payload) if params is None else params, LISTENER, payload, received)
 
     def order(
         self,

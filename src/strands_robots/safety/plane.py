@@ -20,13 +20,14 @@ from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceInbox
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.lockout import Lockout, LockoutLatch, LockoutState
-from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
+from strands_robots.safety.orders import LISTENER, RobotReport, StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
-from strands_robots.safety.reporting import OnReport, Reporter, StopRun
+from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
 from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, note_motion, stop_executor
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.turns import undisturbed
 from strands_robots.utils import ValidationError, identifier, shown
 
 logger = logging.getLogger(__name__)
@@ -150,7 +151,7 @@ class Registered:
     def report_again(self, order: StopOrder) -> RobotReport | None:
         """Return the report on a stop that is not carried out, None while it is due."""
         state = self.latch.state
-        known, held = self.reports.get(order.epoch), order.epoch in state.resumable
+        known, held = self.reports.get(order.epoch), state.can_resume(order.epoch)
         if known is not None and (held or self.crowded):
             return replace(known, epochs=state.epochs, repeated=True, late=False)
         if held:
@@ -209,6 +210,7 @@ class SafetyPlane:
         self._keep_at = 0.0
         self._robots: dict[str, Registered] = {}
         self._reporter: Reporter | None = None
+        self._begun: tuple[str, dict[str, Registered]] | None = None
         self._issued: dict[str, int] = {}
         self._counted = StopCount(TOLD_EVERY_S)
         self._clearance = ClearanceInbox(self.robot_ids, self._clear_one)
@@ -313,51 +315,87 @@ class SafetyPlane:
         A robot that has seen this stop is not halted again; ``on_report`` gets at once its report of then while this
         stop still holds it, and ``stopped`` None once it was resumed. None when no robot had anything to do.
         """
-        robots = list(self._robots.values())
+        if self.under_way(order.epoch):
+            return None
+        followed = False
+        halted = undisturbed(many=len(self._robots) > UNPACED)
+        try:
+            by_name = self._robots
+            robots = list(by_name.values())
+            fresh = self._engage(order, by_name)
+            reporter = self._reporter
+            if reporter is None:
+                # The last robot is leaving; its halt is not reported any more, and it is halted all the same.
+                for entry in fresh:
+                    self.executor.submit(entry.robot, entry.robot_id, order.reason)
+            if not fresh or reporter is None:
+                self._repeat(order, robots, on_report)
+                return None
+            by_id = {entry.robot_id: entry for entry in fresh}
+
+            def reported(report: RobotReport) -> None:
+                self._begun = None
+                by_id[report.robot_id].remember(report)
+                on_report(report)
+
+            run = StopRun(
+                order,
+                tuple(by_id),
+                frozenset(name for name, entry in by_id.items() if entry.key),
+                settings.number("STRANDS_HALT_DEADLINE_S") if self._deadline_s is None else self._deadline_s,
+                lambda name: by_id[name].epochs,
+                reported,
+                self._record,
+                lambda: self._keep(fresh),
+                halted,
+            )
+            if len(fresh) == len(robots):
+                # An answer takes it back, and none is in before the first halt is submitted.
+                self._begun = (order.epoch, by_name)
+            executor = self.executor
+            for entry in fresh:
+                executor.submit(
+                    entry.robot,
+                    entry.robot_id,
+                    order.reason,
+                    within=run.deadline_s,
+                    since=order.received,
+                    answered=functools.partial(reporter.answer, run, entry.robot_id),
+                )
+            reporter.begin(run)
+            followed = True
+            if self._reporter is not reporter:
+                halted()  # it may have ended before it took the run
+            self._repeat(order, [each for each in robots if each.robot_id not in by_id], on_report)
+            return run
+        finally:
+            if not followed:
+                self._begun = None
+                halted()
+
+    def under_way(self, epoch: object) -> bool:
+        """Return True while every robot carries out this stop and none is reported.
+
+        A repetition changes nothing then, and the halts need the time that reading it takes.
+        """
+        begun = self._begun
+        return begun is not None and begun[0] == epoch and begun[1] is self._robots
+
+    def _engage(self, order: StopOrder, by_name: dict[str, Registered]) -> list[Registered]:
+        """Lock the robots; return those that have to be halted."""
         fresh: list[Registered] = []
-        for entry in robots:
+        listener = order.path == LISTENER
+        if listener:
+            self._begun = (order.epoch, by_name)
+        for entry in by_name.values():
+            if not listener and self.under_way(order.epoch):
+                break  # it came over another path meanwhile, and the e-stop listener's thread halts the rest
             if entry.engage(order):
                 note_motion(entry.robot)
                 for gate in entry.gates:
                     gate.revoke()
                 fresh.append(entry)
-        reporter = self._reporter
-        if reporter is None:
-            # The last robot is leaving; its halt is not reported any more, and it is halted all the same.
-            for entry in fresh:
-                self.executor.submit(entry.robot, entry.robot_id, order.reason)
-        if not fresh or reporter is None:
-            self._repeat(order, robots, on_report)
-            return None
-        by_id = {entry.robot_id: entry for entry in fresh}
-
-        def reported(report: RobotReport) -> None:
-            by_id[report.robot_id].remember(report)
-            on_report(report)
-
-        run = StopRun(
-            order,
-            tuple(by_id),
-            frozenset(name for name, entry in by_id.items() if entry.key),
-            settings.number("STRANDS_HALT_DEADLINE_S") if self._deadline_s is None else self._deadline_s,
-            lambda name: by_id[name].epochs,
-            reported,
-            self._record,
-            lambda: self._keep(fresh),
-        )
-        executor = self.executor
-        for entry in fresh:
-            executor.submit(
-                entry.robot,
-                entry.robot_id,
-                order.reason,
-                within=run.deadline_s,
-                since=order.received,
-                answered=functools.partial(reporter.answer, run, entry.robot_id),
-            )
-        reporter.begin(run)
-        self._repeat(order, [each for each in robots if each.robot_id not in by_id], on_report)
-        return run
+        return fresh
 
     def emergency_stop(self, order: StopOrder, on_report: OnReport = lambda report: None) -> dict[str, RobotReport]:
         """Lock and halt every robot; return their answers by robot id.

@@ -27,14 +27,15 @@ UNPACED = 32
 """Robots of a process that answer as soon as they have halted."""
 
 PACE_S = 0.001
-"""Seconds for each robot of a larger process until they answer *stopped*, and as much again by chance.
+"""Seconds for each robot of a larger process until its lockouts are written.
 
-Other processes of the machine still halt theirs in this time. Lockouts are written and bad news is sent meanwhile."""
+Its robots answer *stopped* after that time, and as much again by chance. Other processes of the machine still halt
+theirs meanwhile. Bad news waits for neither."""
 
 PACE_MAX_S = 0.1
 """The longest of these times; with the chance, an answer is held back for twice as long at most."""
 
-GATHER_S = 0.005
+GATHER_S = 0.02
 """Seconds between two looks at the answers that come in before any of them goes out."""
 
 KEEP_S = 0.7
@@ -58,17 +59,20 @@ class StopRun:
     on_report: OnReport
     on_done: OnDone
     keep: Callable[[], None]
+    on_halted: Callable[[], None] = lambda: None
     reports: dict[str, RobotReport] = field(default_factory=dict)
     done: threading.Event = field(default_factory=threading.Event)
     started: float = field(default_factory=time.monotonic)
     answers: dict[str, tuple[StopVerdict, float]] = field(default_factory=dict)
     keeping_since: float | None = None
     kept: bool | None = None
+    keep_at: float = 0.0
     answer_at: float = 0.0
 
     def __post_init__(self) -> None:
         count = len(self.robot_ids)
         pace_s = min(PACE_S * count, PACE_MAX_S) if count > UNPACED else 0.0
+        self.keep_at = self.started + pace_s
         self.answer_at = self.started + pace_s * random.uniform(1.0, 2.0)
 
     def wait(self, timeout: float) -> bool:
@@ -188,9 +192,9 @@ class Reporter:
                 self._report(run, robot_id, late=True)
 
     def _advance(self, run: StopRun, now: float) -> None:
-        waiting = [each for each in run.robot_ids if each not in run.answers]
-        if run.keeping_since is None and (not waiting or now - run.started >= GRACE_S):
+        if run.keeping_since is None and self._halted(run, now):
             run.keeping_since = now
+            run.on_halted()
             self._files.put(run)
         if run.keeping_since is not None and run.kept is None and now - run.keeping_since > KEEP_S:
             run.kept = False
@@ -201,12 +205,19 @@ class Reporter:
         if len(run.reports) == len(run.robot_ids):
             self._finish(run)
 
+    def _halted(self, run: StopRun, now: float) -> bool:
+        """Return True when what follows delays no halt, here or in another process."""
+        if now < run.keep_at and all(verdict.stopped for verdict, _ in run.answers.values()):
+            return False
+        return now - run.started >= GRACE_S or all(each in run.answers for each in run.robot_ids)
+
     def _due(self, run: StopRun, robot_id: str, now: float) -> bool:
         """Return False for good news before its moment."""
         return now >= run.answer_at or run.answers[robot_id][0].stopped is not True
 
     def _time_out(self, run: StopRun) -> None:
         """Report the rest as unanswered: the reporter ends before the executor answers."""
+        run.on_halted()
         for robot_id in run.robot_ids:
             if robot_id not in run.reports:
                 why = {robot_id: f"no answer in {run.deadline_s:g} s"}
