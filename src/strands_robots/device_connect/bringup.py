@@ -143,6 +143,8 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         await asyncio.shield(registration)
 
     try:
+        # Before the link: a worker and the loop that take the interpreter from one another would both take longer.
+        await asyncio.wait({registration})
         if isinstance(driver, RobotDriver):
             # The runtime reads the status when it is made, on the loop, where a robot that blocks holds all others.
             await driver.read_activity()

@@ -6,6 +6,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
@@ -16,7 +17,7 @@ from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.identity import local_name, robot_identity
+from strands_robots.safety.identity import SigningIdentity, local_name, robot_identity
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
@@ -61,12 +62,12 @@ class SafetyRegistration:
         self.device_id = device_id
         # Two tenants may each have a device of this id in one process.
         name = local_name(link.tenant, device_id)
-        self.identity = robot_identity(name)
+        self._name = name
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
         self._held: Registered | None = self.entry
         try:
             self._listener: ListenerRegistration = estop_listener().register(
-                name, ("device-connect", link), lambda: stop_link(link), self.identity, opened=False
+                name, ("device-connect", link), lambda: stop_link(link), lambda: self.identity, opened=False
             )
         except BaseException:
             self.entry.close()
@@ -78,11 +79,18 @@ class SafetyRegistration:
                 device_id,
             )
 
+    @cached_property
+    def identity(self) -> SigningIdentity | None:
+        """The robot's key, read or made at the first use: a new one is written through to the disk."""
+        return robot_identity(self._name)
+
     def open(self) -> None:
         """Open the e-stop link, unless it is open; return before it is up.
 
         Until then the runtime's handler and every RPC ``stop`` stop the robot.
         """
+        # No answer that this link sends waits for the key.
+        self.identity  # noqa: B018
         self._listener.open()
 
     @property

@@ -309,7 +309,12 @@ class ListenerRegistration:
     """Registration of a device with the listener; the last one closes the link."""
 
     def __init__(
-        self, listener: EstopListener, robot_id: str, key: Hashable, link: StopLink, identity: SigningIdentity | None
+        self,
+        listener: EstopListener,
+        robot_id: str,
+        key: Hashable,
+        link: StopLink,
+        identity: Callable[[], SigningIdentity | None],
     ) -> None:
         self.robot_id = robot_id
         self.identity = identity
@@ -363,14 +368,14 @@ class EstopListener:
         robot_id: str,
         key: Hashable,
         make: Callable[[], StopLink],
-        identity: SigningIdentity | None = None,
+        identity: Callable[[], SigningIdentity | None] = lambda: None,
         *,
         opened: bool = True,
     ) -> ListenerRegistration:
         """Serve a robot over the link of ``key``; ``make`` the link if it is new.
 
         Args:
-            identity: signs the robot's verdicts; without one they are not signed.
+            identity: returns what signs the robot's verdicts; None leaves them unsigned.
             opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
         with self._registering:
@@ -502,7 +507,7 @@ class EstopListener:
         self._rules.compare_clock(source, params, received.at)
         for first in self._registrations[:1]:  # the robots of a process share one audit
             name = self._wire_id(first.robot_id)
-            answer = self._check_in_answers.answer(name, params.get("estop_id"), first.identity)
+            answer = self._check_in_answers.answer(name, params.get("estop_id"), first.identity())
             if answer is not None:
                 first.link.publish(name, CHECK_IN_ANSWER, notification(CHECK_IN_ANSWER, answer))
         return True
@@ -529,7 +534,7 @@ class EstopListener:
         for each in self._registrations:
             if each.robot_id == report.robot_id:
                 device_id = self._wire_id(report.robot_id)
-                each.link.publish(device_id, VERDICT, self._verdict(report, device_id, each.identity))
+                each.link.publish(device_id, VERDICT, self._verdict(report, device_id, each.identity()))
 
     def _verdict(self, report: RobotReport, device_id: str, identity: SigningIdentity | None) -> bytes:
         """Encode a verdict and sign it.
