@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar
@@ -228,11 +229,12 @@ def _rounds(network: Network, size: Size) -> Iterator[Row]:
         marks = child.facts()["marks"]
     # The first rounds fill pools and the allocator's arenas; a leak goes on after them.
     first, last = marks
+    new = list((Counter(last.pop("names")) - Counter(first.pop("names"))).elements())
     more = {key: last[key] - first[key] for key in last}
     rounds = size.rounds - size.rounds // 3
     yield network.row(
         f"left by the last {rounds} of {size.rounds} rounds of 50 joins and leaves",
-        f"{more['mb']:+.1f} MB, {more['threads']:+.0f} threads, {more['fds']:+.0f} descriptors, "
+        f"{more['mb']:+.1f} MB, {more['threads']:+.0f} threads{new or ''}, {more['fds']:+.0f} descriptors, "
         f"{more['objects']:+.0f} objects",
         "≤ 5 MB, 0 threads, 0 descriptors, not an object a device",
         more["mb"] <= 5 and more["threads"] <= 0 and more["fds"] <= 0 and more["objects"] < 50 * rounds,

@@ -17,6 +17,7 @@ import os
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -32,6 +33,8 @@ FULL_PASSES = {"began": 0.0, "cpu": 0.0}
 """Seconds of CPU of Python's full collections: by the size of the process, one for each quarter that it grows by."""
 IDLE_S = 3.0
 """Seconds after which the workers of the last joins have ended."""
+POOLS_S = 12.0
+"""The same for the threads that a network's own pools start on demand; those end after 10 s without work."""
 
 
 class Idle:
@@ -62,6 +65,13 @@ def snapshot() -> dict[str, float]:
         "threads": me.num_threads(),
         "fds": me.num_fds(),
     }
+
+
+def thread_names() -> list[str]:
+    """Return the names of all threads, Python's and others'."""
+    own = {each.native_id: each.name for each in threading.enumerate()}
+    tasks = Path("/proc/self/task").iterdir()
+    return sorted(own.get(int(each.name)) or (each / "comm").read_text().strip() for each in tasks)
 
 
 def on_collection(phase: str, info: dict[str, int]) -> None:
@@ -103,7 +113,7 @@ def ours(first: int, count: int, link: LinkConfig, *, settled: bool = False) -> 
 
 def rounds(turns: int, count: int, link: LinkConfig) -> None:
     """Join and leave, again and again, under other names each time."""
-    marks = []
+    marks: list[dict[str, Any]] = []
     for turn in range(turns):
         names = [f"arm-{turn}-{each}" for each in range(count)]
         runtimes = [
@@ -113,11 +123,11 @@ def rounds(turns: int, count: int, link: LinkConfig) -> None:
             stop_device_connect(each)
         if turn + 1 in (turns // 3, turns):
             runtimes.clear()
-            time.sleep(IDLE_S)
+            time.sleep(POOLS_S)
             gc.collect()
             # What the allocator keeps between two uses says nothing of who uses it.
             ctypes.CDLL(None).malloc_trim(0)
-            marks.append({**snapshot(), "objects": len(gc.get_objects())})
+            marks.append({**snapshot(), "objects": len(gc.get_objects()), "names": thread_names()})
     report(marks=marks)
 
 
