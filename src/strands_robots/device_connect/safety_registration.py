@@ -81,7 +81,7 @@ class SafetyRegistration:
 
     @cached_property
     def identity(self) -> SigningIdentity | None:
-        """The robot's key, read or made at the first use: a new one is written through to the disk."""
+        """The robot's key, read or made at the first use."""
         return robot_identity(self._name)
 
     def open(self) -> None:
