@@ -9,7 +9,14 @@ import pytest
 from tests.mesh.peers import Fleet, fleet
 
 from strands_robots.mesh import input as input_module
-from strands_robots.mesh import safety
+from strands_robots.mesh import input_receiver, safety
+
+
+@pytest.fixture(autouse=True)
+def patient_followers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A leader that a busy machine keeps from its beat is not silent; a test of silence sets its own windows."""
+    monkeypatch.setattr(input_receiver, "HOLD_S", 600.0)
+    monkeypatch.setattr(input_receiver, "LOST_S", 600.0)
 
 
 @pytest.fixture

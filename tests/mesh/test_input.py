@@ -70,13 +70,6 @@ def stream(peers: Fleet) -> Iterator[Stream]:
     made.receiver.stop()
 
 
-@pytest.fixture(autouse=True)
-def patient_follower(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A leader that a busy machine keeps from its beat is not silent: half a second halts a follower without a body."""
-    monkeypatch.setattr(input_receiver, "HOLD_S", 600.0)
-    monkeypatch.setattr(input_receiver, "LOST_S", 600.0)
-
-
 def first_frame(peers: Fleet, teleoperator: Any) -> dict[str, Any]:
     """The first frame that a leader's publisher puts on the mesh."""
     frames: list[Any] = []

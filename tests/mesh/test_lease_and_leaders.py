@@ -61,6 +61,12 @@ class Cell:
         self.world.cleanup()
 
 
+def real_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a leader be silent after half a second and lost after two, as in the field."""
+    monkeypatch.setattr(input_receiver, "HOLD_S", HOLD_S)
+    monkeypatch.setattr(input_receiver, "LOST_S", LOST_S)
+
+
 @pytest.fixture
 def cell(peers: Fleet) -> Iterator[Cell]:
     made = Cell(peers)
@@ -76,12 +82,15 @@ def test_teleoperator_is_refused_while_an_agent_holds_the_robot(cell: Cell) -> N
     cell.begin()
 
 
-def test_agent_is_refused_while_a_teleoperator_leads_and_free_after_it_fell_silent(cell: Cell) -> None:
+def test_agent_is_refused_while_a_teleoperator_leads_and_free_after_it_fell_silent(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cell.begin()
     assert "lead (human) holds control" in str(cell.ask(cell.agent, "moveJoints", joints={"shoulder_pan": 5.0}))
     assert "lead (human) holds control" in str(cell.ask(cell.agent, "acquireControl"))
     # As a leader that crashed: no frame follows, and nobody closes the stream.
     cell.publisher.stop()
+    real_windows(monkeypatch)
     acquired = {"action": "acquireControl", "ttl_s": 0.5}
     eventually(lambda: cell.ask(cell.agent, **acquired).get("status") == "success", what="a free robot")
     assert cell.ask(cell.agent, "status")["status"] == "success"
@@ -117,6 +126,7 @@ def test_follower_of_a_silent_leader_holds_after_half_a_second_and_is_let_go_aft
     monkeypatch.setenv("STRANDS_MESH_INPUT_MAX_HZ", "0")
     cell.begin()
     last, before = watch.stop(), cell.stream()["frames_received"]
+    real_windows(monkeypatch)
     eventually(lambda: cell.stream()["frames_received"] > before + 1, what="frames at the time that stands still")
     sent = cell.publisher.stop()["frames"]
 
@@ -139,9 +149,10 @@ def test_follower_of_a_silent_leader_holds_after_half_a_second_and_is_let_go_aft
     assert cell.world.gate.refusal("motion") is None
 
 
-def test_leader_that_pauses_for_less_than_two_seconds_leads_on(cell: Cell) -> None:
+def test_leader_that_pauses_for_less_than_two_seconds_leads_on(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     cell.begin()
     cell.publisher.stop()
+    monkeypatch.setattr(input_receiver, "HOLD_S", HOLD_S)
     eventually(lambda: cell.stream()["holding"], what="the hold")
     again = InputPublisher(cell.lead, Leader(), hz=50)
     again.start()
@@ -193,6 +204,7 @@ def test_follower_of_a_silent_leader_holds_and_is_let_go_without_a_thread_for_th
     without_threads(monkeypatch, "mesh-hold")
     cell.begin()
     cell.publisher.stop()
+    real_windows(monkeypatch)
     eventually(lambda: not cell.stream()["running"], within=20.0, what="the end of the stream")
     eventually(lambda: len(held) == 1, within=20.0, what="the hold on the watching thread")
 
@@ -204,7 +216,6 @@ def test_stream_that_nothing_would_watch_is_refused(cell: Cell, monkeypatch: pyt
 
 
 def test_no_second_hold_begins_while_one_waits_for_the_bus(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(input_receiver, "LOST_S", 600.0)
     bus, holds = threading.Event(), []
     receivers: set[input_receiver.InputReceiver] = set()
 
@@ -216,6 +227,7 @@ def test_no_second_hold_begins_while_one_waits_for_the_bus(cell: Cell, monkeypat
     monkeypatch.setattr(input_receiver.InputReceiver, "_hold", hold)
     cell.begin()
     cell.publisher.stop()
+    monkeypatch.setattr(input_receiver, "HOLD_S", HOLD_S)
     eventually(lambda: len(holds) == 1, within=20.0, what="the first hold")
     [receiver] = receivers
     watch = Watch()
