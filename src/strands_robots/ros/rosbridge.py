@@ -38,7 +38,7 @@ ROSAPI_S = 5.0
 """Seconds within which the server's own services answer."""
 
 LOOKS = 3
-"""Times that the server is asked for our publisher; a graph may need a second or two to show a new one."""
+"""Answers without our publisher that make a refusal; a graph may need a second or two to show a new one."""
 
 
 _INQUIRIES = {"/rosapi/topic_type": "rosapi/TopicType", "/rosapi/publishers": "rosapi/Publishers"}
@@ -80,6 +80,7 @@ class _Inquiry:
 
     kind: str
     looks: int = 0
+    missed: int = 0
     typed: bool = False
     listed: bool = False
 
@@ -318,14 +319,15 @@ class RosbridgeLink:
     def _ask_again(self) -> None:
         """Ask for our publishers, and subscribe again to what was not there yet."""
         for topic, inquiry in list(self._inquiries.items()):
+            # Asked often enough, it stays for the answers that are still to come.
             if inquiry.looks > LOOKS:
-                self._inquiries.pop(topic, None)
                 continue
-            inquiry.looks += 1
+            sent = True
             for service, kind in _INQUIRIES.items():
                 key = f"{service}:{topic}:{next(self._numbers)}"
                 frame = encoded("call_service", id=key, service=service, type=kind, args={"topic": topic})
-                self._session.send_if_free(frame)
+                sent = self._session.send_if_free(frame) and sent
+            inquiry.looks += sent
         with self._lock:
             waiting = [(t, s) for t, s in self._subscriptions.items() if s.silent and s.kind is None]
         for topic, subscription in waiting:
@@ -345,9 +347,10 @@ class RosbridgeLink:
         other = known.get("type")
         inquiry.typed |= bool(other)
         inquiry.listed |= bool(known.get("publishers"))
+        inquiry.missed += known.get("publishers") == []
         if isinstance(other, str) and other and bare_kind(other) != bare_kind(inquiry.kind):
             self._refuse(topic, f"rosbridge does not publish {inquiry.kind} on {topic}, which carries {other}")
-        elif known.get("publishers") == [] and inquiry.looks >= LOOKS:
+        elif inquiry.missed >= LOOKS:
             self._refuse(topic, f"rosbridge has no publisher on {topic}: it refused ours")
         elif not known or (inquiry.typed and inquiry.listed):
             # Without rosapi the refusal of a command cannot be found.

@@ -276,14 +276,16 @@ class RosbridgeSession:
         """
         self._send(self._current(), frame)
 
-    def send_if_free(self, frame: str) -> None:
+    def send_if_free(self, frame: str) -> bool:
         """Send one frame unless another is being sent: a question can wait, and must not."""
         socket = self._socket
-        if socket is not None and self._writing.acquire(blocking=False):
-            try:
-                socket.send(frame)
-            finally:
-                self._writing.release()
+        if socket is None or not self._writing.acquire(blocking=False):
+            return False
+        try:
+            socket.send(frame)
+        finally:
+            self._writing.release()
+        return True
 
     def confirm(self, within_s: float) -> None:
         """Wait until the server has received all that was sent, by a WebSocket ping.

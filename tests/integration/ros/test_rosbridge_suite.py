@@ -48,17 +48,18 @@ def link(server: RosbridgeSuite) -> Iterator[RosbridgeLink]:
     made.close()
 
 
-def refusal(link: RosbridgeLink, topic: str, kind: str) -> str:
-    """Publish until the link says why that is no use."""
+def refused(link: RosbridgeLink, topic: str, kind: str, why: str) -> None:
+    """Publish until the link says why that is no use; on a busy machine its connection may break meanwhile."""
+    said = list[str]()
 
-    def reason() -> str:
+    def told() -> bool:
         try:
             link.publish(topic, kind, {})
         except RosError as exc:
-            return str(exc)
-        return ""
+            said.append(str(exc))
+        return any(why in each for each in said)
 
-    return eventually(reason)
+    eventually(told, 60.0, what=f"{why!r}")
 
 
 @pytest.mark.parametrize("why", ["No action server available", "Action goal was rejected"])
@@ -89,16 +90,16 @@ def test_stop_after_a_goal_that_was_not_taken_is_a_stop(server: RosbridgeSuite, 
 
 
 def test_silently_refused_publisher_is_found_by_asking(link: RosbridgeLink) -> None:
-    assert "has no publisher on /hidden" in refusal(link, "/hidden", TWIST)
+    refused(link, "/hidden", TWIST, "has no publisher on /hidden")
 
 
 def test_publisher_of_another_type_is_found_by_asking(link: RosbridgeLink) -> None:
-    assert "carries nav_msgs/msg/Odometry" in refusal(link, "/odom", TWIST)
+    refused(link, "/odom", TWIST, "carries nav_msgs/msg/Odometry")
 
 
 def test_accepted_publisher_is_asked_about_until_it_is_there(server: RosbridgeSuite, link: RosbridgeLink) -> None:
     link.publish("/cmd_vel", TWIST, {})
-    eventually(lambda: len(server.seen("call_service")) == 2)
+    eventually(lambda: len(server.seen("call_service")) >= 2)
     link.publish("/cmd_vel", TWIST, {"again": 1})
     eventually(lambda: ("/cmd_vel", {"again": 1}) in server.published)
 
@@ -152,7 +153,7 @@ def test_server_with_tls_and_rosauth_takes_the_right_secret_alone(authority: Aut
         assert links["only we know"].url.startswith("wss://")
         links["only we know"].publish("/cmd_vel", TWIST, {"right": 1})
         eventually(lambda: server.published == [("/cmd_vel", {"right": 1})])
-        refusal(links["a guess"], "/cmd_vel", TWIST)
+        refused(links["a guess"], "/cmd_vel", TWIST, "onnection")
         assert server.published == [("/cmd_vel", {"right": 1})]
     finally:
         for each in links.values():
