@@ -159,6 +159,46 @@ def test_slow_type_lookup_does_not_delay_the_zeros(made: Made, monkeypatch: pyte
     assert link.watchers == 0, "a watch that came late does not outlive the base"
 
 
+class OpeningLink(MemoryLink):
+    """Opens at its first use, as a link of DDS does, and has a base at rest behind it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_open = False
+        self.watchers = 0
+
+    def publish(self, topic: str, kind: str, fields: Mapping[str, Any]) -> None:
+        self.is_open = True
+        super().publish(topic, kind, fields)
+        super().publish("/odom", "nav_msgs/msg/Odometry", {"twist": {"twist": fields}})
+
+    def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
+        self.is_open, unwatch = True, super().watch(topic, kind, on_message)
+        self.watchers += 1
+
+        def done() -> None:
+            unwatch()
+            self.watchers -= 1
+
+        return done
+
+    def close(self) -> None:
+        self.is_open = False
+
+
+def test_stop_of_a_base_that_left_the_graph_sends_its_zeros_and_leaves_it_again(made: Made) -> None:
+    link = OpeningLink()
+    robot = made(link, odom_topic="/odom", publish_rate=100.0)
+    robot.disconnect()
+    assert robot.halt("the lease of control is over").stopped is True
+    assert set(velocities(link)) == {(0.0, 0.0)}
+    eventually(lambda: not robot.holding and not link.is_open and not link.watchers, what="the end of the link")
+    assert robot.drive(0.3, duration=0.05)["status"] == "success"
+    assert robot.halt("while it is in the graph").stopped is True
+    eventually(lambda: not robot.holding)
+    assert link.is_open and link.watchers == 1
+
+
 def test_halt_on_a_blocked_link_answers_not_stopped_in_time(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
     link = FaultyLink()

@@ -105,8 +105,10 @@ class MobileBaseRobot:
         self._odometry = OdometryMonitor(link, *self._odom)
         self._publisher = VelocityPublisher(link, self._topic, self._kind, self.command_message(0.0, 0.0))
         self._hold = CurrentHold(
-            lambda: ZeroVelocityHold(self._publisher, self.publish_rate, self._still_now, self.node_name)
+            lambda ended: ZeroVelocityHold(self._publisher, self.publish_rate, self._still_now, self.node_name, ended),
+            self._leave_again,
         )
+        self._left = False
         self._observers = RolloutObservers()
         self._slot = threading.Lock()
         self._motion: BaseMotion | None = None
@@ -310,11 +312,20 @@ class MobileBaseRobot:
         """Leave the graph without a stop; :meth:`cleanup` stops the base first."""
         self.gate.revoke()
         self._hold.close()
+        self._left = True
+        self._leave()
+
+    def _leave(self) -> None:
         try:
             self._odometry.close()
         except LINK_ERRORS as exc:
             logger.info("%s: %s", self.tool_name_str, exc)
         self.link.close()
+
+    def _leave_again(self) -> None:
+        """Leave the graph after the zeros of a stop that came when the base had left it."""
+        if self._left:
+            self._leave()
 
     # One motion at a time, for this class and its subclasses.
 
@@ -340,6 +351,7 @@ class MobileBaseRobot:
                 refusal = refusal or self.handshake(tool_context)
             if refusal is not None:
                 return refusal
+            self._left = False
             self._odometry.start()
             self._hold.end_for(permit)
             motion = self._motion = make(permit)

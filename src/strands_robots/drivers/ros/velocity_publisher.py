@@ -148,13 +148,19 @@ class ZeroVelocityHold:
     ``still`` answers True, False or, where odometry is silent, None, and returns at once. None ends the hold after
     :data:`BLIND_HOLD_S`, counted from the first zero that was accepted, the last one that was not, or the last
     sample of odometry, whichever was latest. A hold whose zeros fail goes on until they are accepted, because the
-    link may come back to a base that still moves; :meth:`cancel` ends every hold.
+    link may come back to a base that still moves; :meth:`cancel` ends every hold. ``ended`` is called on its thread.
     """
 
     def __init__(
-        self, publisher: VelocityPublisher, rate_hz: float, still: Callable[[], bool | None], name: str
+        self,
+        publisher: VelocityPublisher,
+        rate_hz: float,
+        still: Callable[[], bool | None],
+        name: str,
+        ended: Callable[[ZeroVelocityHold], None],
     ) -> None:
         self._publisher = publisher
+        self._ended = ended
         # However low the publish rate, a zero goes out at least once a second.
         self._period_s = min(1.0, 1 / rate_hz)
         self._still = still
@@ -183,6 +189,12 @@ class ZeroVelocityHold:
             self._thread.join(within_s)
 
     def _run(self) -> None:
+        try:
+            self._send_zeros()
+        finally:
+            self._ended(self)
+
+    def _send_zeros(self) -> None:
         blind_since: float | None = None
         while True:
             problem = self.problem = self._send()
@@ -213,13 +225,32 @@ class ZeroVelocityHold:
 
 
 class CurrentHold:
-    """The one hold of a base, begun by every stop and ended by the next motion."""
+    """The one hold of a base, begun by every stop and ended by the next motion.
 
-    def __init__(self, start: Callable[[], ZeroVelocityHold]) -> None:
-        self._start = start
+    Args:
+        start: starts a hold, which calls what it is given at its end.
+        idle: called when a hold has ended and no other one took its place.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[Callable[[ZeroVelocityHold], None]], ZeroVelocityHold],
+        idle: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._start_one = start
+        self._idle = idle
         self._lock = threading.Lock()
         self._current: ZeroVelocityHold | None = None
         self._ended_for: Permit | None = None
+
+    def _start(self) -> ZeroVelocityHold:
+        return self._start_one(self._on_end)
+
+    def _on_end(self, hold: ZeroVelocityHold) -> None:
+        with self._lock:
+            idle = self._current in (hold, None)
+        if idle:
+            self._idle()
 
     @property
     def running(self) -> bool:
