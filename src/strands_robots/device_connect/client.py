@@ -12,7 +12,7 @@ import queue
 import threading
 import time
 import uuid
-from collections.abc import Callable, Coroutine, Generator, Mapping
+from collections.abc import Callable, Collection, Coroutine, Generator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, Self, TypeVar
@@ -248,12 +248,21 @@ class FleetClient:
 
             def found(peer: Peer) -> None:
                 if peer.stop_verb:
-                    stops[peer.id] = asyncio.create_task(self._stop(peer.id, timeout))
+                    stops[peer.id] = asyncio.create_task(self._stop_named(peer.id, timeout))
 
             await self._found.collect(2.0, found, thorough=True)
             return {name: await stops[name] for name in sorted(stops)}
 
         return self.run(all_of_them(), HEARTBEATS_S + COLLECT_MARGIN_S + 2 * timeout)
+
+    def stop_each(self, devices: Collection[str], timeout: float = 5.0) -> dict[str, Envelope]:
+        """Stop these devices at once; return the answers by id, silent ones included."""
+
+        async def all_of_them() -> dict[str, Envelope]:
+            answers = await asyncio.gather(*(self._stop_named(each, timeout) for each in devices))
+            return dict(zip(devices, answers, strict=True))
+
+        return self.run(all_of_them(), 2 * timeout + 4.0)
 
     def run(self, work: Coroutine[Any, Any, T], within: float) -> T:
         """Run a coroutine on the client's loop and wait for it."""
@@ -301,6 +310,13 @@ class FleetClient:
         if isinstance(exc, RequestTimeoutError):
             return DeviceTimeoutError(f"{device} is on the network and did not answer within {within:g} s ({exc}).")
         return exc
+
+    async def _stop_named(self, device: str, within: float) -> Envelope:
+        """Stop one of several; what the network named and no call can reach is an answer too."""
+        try:
+            return await self._stop(device, within)
+        except ValidationError as exc:
+            return error(str(exc), stopped=None)
 
     async def _stop(self, device: str, within: float, robot_name: str = "") -> Envelope:
         params = {"robot_name": robot_name} if robot_name else {}

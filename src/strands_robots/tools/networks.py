@@ -351,7 +351,7 @@ def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
         return envelope(report)
     answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
     answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
-    answers |= {name: fleet.stop(name, STOP_S) for name in rest}
+    answers |= fleet.stop_each(rest, STOP_S)
     return {**combined_verdict(answers), "not_locked": rest}
 
 
