@@ -256,7 +256,7 @@ class FleetClient:
         return self.run(all_of_them(), HEARTBEATS_S + COLLECT_MARGIN_S + 2 * timeout)
 
     def stop_each(self, devices: Collection[str], timeout: float = 5.0) -> dict[str, Envelope]:
-        """Stop these devices at once; return the answers by id, silent ones included."""
+        """Stop these devices at once; return the answers by id."""
 
         async def all_of_them() -> dict[str, Envelope]:
             answers = await asyncio.gather(*(self._stop_named(each, timeout) for each in devices))
@@ -312,7 +312,7 @@ class FleetClient:
         return exc
 
     async def _stop_named(self, device: str, within: float) -> Envelope:
-        """Stop one of several; what the network named and no call can reach is an answer too."""
+        """Stop one of several; a bad id is an answer, too."""
         try:
             return await self._stop(device, within)
         except ValidationError as exc:
