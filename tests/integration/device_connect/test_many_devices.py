@@ -250,6 +250,7 @@ def test_device_that_leaves_disturbs_no_call_of_the_others(link: LinkConfig, ser
         slow.held.set()
 
 
+@pytest.mark.timeout(600)
 def test_rounds_of_joins_and_leaves_leave_nothing(link: LinkConfig) -> None:
     def turn() -> None:
         runtimes = [
@@ -269,11 +270,19 @@ def test_rounds_of_joins_and_leaves_leave_nothing(link: LinkConfig) -> None:
     eventually(lambda: device_threads() == 0 and me.num_threads() <= threads + 2 and me.num_fds() <= files + 2)
 
 
-def test_rounds_of_joins_and_leaves_leave_no_object(link: LinkConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def no_records() -> Iterator[None]:
+    """Make no log records: the test's own log would keep them. Loggers remember their levels until this is called."""
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("no_records")
+def test_rounds_of_joins_and_leaves_leave_no_object(link: LinkConfig) -> None:
     """Every round has devices of other ids, so that what is kept for each id ever seen counts as well."""
     left: list[weakref.ref[Idle]] = []
-    # The test's own log would keep its records.
-    monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)
 
     def turn(number: int) -> None:
         names = [f"arm-{number}-{each}" for each in range(10)]
@@ -292,7 +301,7 @@ def test_rounds_of_joins_and_leaves_leave_no_object(link: LinkConfig, monkeypatc
 
     def objects() -> Counter[str]:
         # Workers of the last round may still stand in a call of it.
-        eventually(lambda: POOL.idle == 0 and none_left(), what="the end of the robots of a round")
+        eventually(lambda: POOL.idle == 0 and none_left(), 60.0, what="the end of the robots of a round")
         return Counter(type(each).__module__ + "." + type(each).__qualname__ for each in gc.get_objects())
 
     turn(0)
