@@ -129,7 +129,7 @@ class Mesh(SensorLoopsMixin):
         self._hardware = hardware
         self._handles: list[Declaration] = []
         self._inputs: dict[str, dict[str, Any]] = {}
-        self._scheduler = Scheduler(f"mesh-{peer}")
+        self._scheduler = Scheduler(peer)
         self._sensors = SensorPublisher(context, self._scheduler)
         self._requester = Requester(context)
         self._teleop = TeleopReceivers(lambda source, device: InputReceiver(self, body_of(robot), source, device))
@@ -269,7 +269,8 @@ class Mesh(SensorLoopsMixin):
         every("tokens", TOKENS_HZ, self._presence.judge_tokens, quick=True)
         every("prune", PRUNE_HZ, self._prune, quick=True)
         every("hearing", HEARING_HZ, self._hearing.look, quick=True)
-        every("late peers", LATE_HZ, self._safety.late.look, quick=True)
+        # A stop that is published again may wait for its turn, and behind no robot.
+        every("late peers", LATE_HZ, self._safety.late.look, lane="late peers")
         frames = frames_of(self.robot)
         if frames is not None:
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), CameraPublisher(context, frames).publish)
@@ -291,7 +292,7 @@ class Mesh(SensorLoopsMixin):
             return max(0.0, deadline - time.monotonic())
 
         streams = self._teleop.close()
-        alive = self._scheduler.stop(left()) + self._sensors.stop(left()) + self._steps.stop(left())
+        alive = self._scheduler.stop(left()) + self._steps.stop(left())
         self._safety.close(left())
         self._requester.close()
         dropped = self._subscriptions.clear()

@@ -1,144 +1,266 @@
-"""Scheduler of the periodic jobs of a peer.
+"""Periodic jobs of the peers of a process.
 
-It has two threads, whatever the number of jobs: a timer that runs the quick ones itself (presence must not wait for a
-motor bus), and a sampler for those that read hardware. A job that is late or still running skips its missed
-deadlines; it never catches up in a burst.
+One timer thread runs the quick jobs of all peers: a heartbeat waits for no motor bus. What may block, such as a read
+of hardware, runs on workers. One is enough while nothing blocks; where work waits another one relieves it, and ends
+when the work is done. A job that is late or still running skips its missed deadlines; it never catches up in a burst.
 """
 
 from __future__ import annotations
 
+import heapq
 import logging
-import queue
+import math
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from itertools import count
 
 logger = logging.getLogger(__name__)
 
 MIN_PERIOD_S = 0.001
+TICK_S = 0.01
+"""Jobs at least ten times as slow are due on whole ones, so that those of many peers share a wake-up."""
+
+RELIEF_S = 0.02
+"""Work that waits this long for a worker gets another one."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
+class Lane:
+    """Jobs of one peer that run one after another; ``busy`` while a worker has them."""
+
+    waiting: deque[Job] = field(default_factory=deque)
+    busy: bool = False
+
+
+@dataclass(slots=True, eq=False)
 class Job:
-    """A callable due every ``period`` seconds; ``busy`` while queued or running."""
+    """A callable due every ``period`` seconds; ``busy`` while queued or running.
+
+    Attributes:
+        lane: None for a quick job, which runs on the timer.
+        over: it begins no more.
+        runner: the thread that runs it now.
+    """
 
     name: str
     period: float
     run: Callable[[], None]
-    quick: bool
-    due: float
+    lane: Lane | None = None
+    due: float = 0.0
     busy: bool = False
+    over: bool = True
+    runner: threading.Thread | None = None
     failures: int = 0
 
+    def skip_to(self, now: float) -> None:
+        """Be due at the first deadline after ``now``."""
+        self.due += (int((now - self.due) / self.period) + 1) * self.period
+        if self.period >= 10 * TICK_S:
+            self.due = math.ceil(self.due / TICK_S - 1e-6) * TICK_S
 
-class Scheduler:
-    """Runs jobs at their rates between :meth:`start` and :meth:`stop`.
+
+class Timer:
+    """Runs jobs at their times: one thread, and workers for those that may block.
+
+    The threads begin with the first job and end with the last.
 
     Args:
         name: of the threads.
-        clock: monotonic seconds.
     """
 
-    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, name: str = "mesh") -> None:
         self._name = name
-        self._clock = clock
-        self._wake = threading.Condition()
-        self._jobs: dict[str, Job] = {}
-        self._threads: list[threading.Thread] = []
-        self._work: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._running = False
+        self._lock = threading.Lock()
+        self._changed, self._work, self._finished = (threading.Condition(self._lock) for _ in range(3))
+        self._heap: list[tuple[float, int, Job]] = []
+        self._numbers = count()
+        self._jobs = 0
+        self._ready: deque[tuple[float, Lane]] = deque()
+        self._idle = self._workers = 0
+        self._thread: threading.Thread | None = None
 
-    def every(self, name: str, hz: float, run: Callable[[], None], *, quick: bool = False) -> None:
-        """Run ``run`` ``hz`` times a second under ``name``; 0 or less is off."""
-        with self._wake:
-            if hz <= 0:
-                self._jobs.pop(name, None)
-            else:
-                period = max(MIN_PERIOD_S, 1.0 / hz)
-                self._jobs[name] = Job(name, period, run, quick, self._clock())
-            self._wake.notify_all()
+    def add(self, jobs: Iterable[Job]) -> None:
+        """Run these jobs, each for the first time now."""
+        with self._lock:
+            for job in jobs:
+                job.due, job.over = time.monotonic(), False
+                self._push(job)
+                self._jobs += 1
+            if self._thread is None and self._jobs:
+                self._thread = self._begun(self._time, "timer")
+            self._changed.notify()
 
-    def start(self) -> None:
-        with self._wake:
-            if self._running:
-                return
-            self._running = True
-            self._work = queue.SimpleQueue()
-            now = self._clock()
-            for job in self._jobs.values():
-                job.due, job.busy = now, False
-        self._threads = [
-            threading.Thread(target=self._time, name=f"{self._name}-timer", daemon=True),
-            threading.Thread(target=self._sample, args=(self._work,), name=f"{self._name}-sampler", daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
+    def remove(self, jobs: Iterable[Job]) -> None:
+        """Begin these jobs no more; those that run are not waited for."""
+        with self._lock:
+            for job in jobs:
+                self._jobs -= not job.over
+                job.over = True
+            if not self._jobs:
+                self._heap.clear()
+                self._changed.notify()
+                self._work.notify_all()
 
-    def stop(self, timeout: float) -> list[str]:
-        """End both threads within ``timeout`` s; return names of those still running."""
-        with self._wake:
-            self._running = False
-            self._wake.notify_all()
-        self._work.put(None)
-        deadline = time.monotonic() + timeout
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(max(0.0, deadline - time.monotonic()))
-        alive = [thread.name for thread in self._threads if thread.is_alive()]
-        self._threads = []
-        with self._wake:
-            self._jobs.clear()
-        return alive
+    def wait(self, jobs: Iterable[Job], timeout: float) -> list[str]:
+        """Wait until none runs on another thread; names of those that do after ``timeout`` s."""
+        own, jobs = threading.current_thread(), list(jobs)
 
-    def run_due(self, now: float) -> None:
-        """Run the jobs due at ``now`` in the calling thread; for tests with a clock."""
-        for job in self._take_due(now):
-            self._run(job)
+        def running() -> list[str]:
+            return [job.name for job in jobs if job.runner is not None and job.runner is not own]
 
-    def _take_due(self, now: float) -> list[Job]:
-        due: list[Job] = []
-        for job in self._jobs.values():
-            if job.due > now:
-                continue
-            missed = int((now - job.due) / job.period)
-            job.due += (missed + 1) * job.period
-            if not job.busy:
-                job.busy = True
-                due.append(job)
-        return due
+        with self._finished:
+            self._finished.wait_for(lambda: not running(), timeout)
+            return running()
+
+    def _begun(self, target: Callable[[], None], kind: str) -> threading.Thread:
+        thread = threading.Thread(target=target, name=f"{self._name}-{kind}", daemon=True)
+        thread.start()
+        return thread
+
+    def _push(self, job: Job) -> None:
+        heapq.heappush(self._heap, (job.due, next(self._numbers), job))
 
     def _time(self) -> None:
         while True:
-            with self._wake:
-                if not self._running:
+            with self._lock:
+                if not self._jobs:
+                    self._thread = None
                     return
-                now = self._clock()
-                due = self._take_due(now)
-                if not due:
-                    soonest = min((job.due for job in self._jobs.values()), default=now + 1.0)
-                    self._wake.wait(max(0.0, soonest - now))
+                now = time.monotonic()
+                quick = self._take_due(now)
+                if not quick:
+                    soonest = min(self._heap[0][0] if self._heap else math.inf, self._relieve(now))
+                    self._changed.wait(None if soonest == math.inf else max(0.0, soonest - now))
                     continue
-            for job in due:
-                if job.quick:
-                    self._run(job)
-                else:
-                    self._work.put(job)
-
-    def _sample(self, work: queue.SimpleQueue[Job | None]) -> None:
-        while (job := work.get()) is not None:
-            if self._running:
+            for job in quick:
                 self._run(job)
 
+    def _take_due(self, now: float) -> list[Job]:
+        """Return the quick jobs that are due, and hand the others to the workers."""
+        quick: list[Job] = []
+        while self._heap and self._heap[0][0] <= now:
+            job = heapq.heappop(self._heap)[2]
+            if job.over:
+                continue
+            job.skip_to(now)
+            self._push(job)
+            if job.busy:
+                continue
+            job.busy = True
+            if job.lane is None:
+                quick.append(job)
+                continue
+            job.lane.waiting.append(job)
+            if not job.lane.busy:
+                job.lane.busy = True
+                self._hand_over(job.lane, now)
+        return quick
+
+    def _hand_over(self, lane: Lane, now: float) -> None:
+        self._ready.append((now, lane))
+        self._work.notify()
+
+    def _relieve(self, now: float) -> float:
+        """Add a worker where work waits too long; return when to look again."""
+        if not self._ready:
+            return math.inf
+        waits_until = self._ready[0][0] + RELIEF_S
+        if self._workers and (self._idle or now < waits_until):
+            return max(waits_until, now + RELIEF_S / 2)
+        self._workers += 1
+        self._begun(self._serve, "worker")
+        return now + RELIEF_S
+
+    def _serve(self) -> None:
+        while (lane := self._next_lane()) is not None:
+            self._run(lane.waiting.popleft())
+            with self._lock:
+                lane.busy = bool(lane.waiting)
+                if lane.busy:
+                    self._hand_over(lane, time.monotonic())
+
+    def _next_lane(self) -> Lane | None:
+        """Wait for a lane with work; None where another worker waits already."""
+        with self._lock:
+            while not self._ready:
+                if self._idle or not self._jobs:
+                    self._workers -= 1
+                    return None
+                self._idle += 1
+                self._work.wait()
+                self._idle -= 1
+            return self._ready.popleft()[1]
+
     def _run(self, job: Job) -> None:
+        with self._lock:
+            if job.over:
+                return
+            job.runner = threading.current_thread()
         try:
             job.run()
         except Exception:
             job.failures += 1
             # A sensor that fails at 50 Hz must not fill the log.
             if job.failures & (job.failures - 1) == 0:
-                logger.exception("%s: %s failed (%d times).", self._name, job.name, job.failures)
+                logger.exception("%s failed (%d times).", job.name, job.failures)
         else:
             job.failures = 0
         finally:
-            job.busy = False
+            with self._lock:
+                job.busy, job.runner = False, None
+                self._finished.notify_all()
+
+
+_timer = Timer()
+
+
+class Scheduler:
+    """The jobs of one peer, run at their rates between :meth:`start` and :meth:`stop`.
+
+    Args:
+        name: of the peer.
+        timer: runs the jobs; the process's own by default.
+    """
+
+    def __init__(self, name: str, timer: Timer = _timer) -> None:
+        self._name = name
+        self._timer = timer
+        self._lock = threading.Lock()
+        self._jobs: dict[str, Job] = {}
+        self._lanes: dict[str, Lane] = {}
+        self._running = False
+
+    def every(self, name: str, hz: float, run: Callable[[], None], *, quick: bool = False, lane: str = "") -> None:
+        """Run ``run`` ``hz`` times a second under ``name``; 0 or less is off.
+
+        Args:
+            quick: it never blocks, and runs on the timer.
+            lane: jobs of the same lane run one after another, and delay no other lane.
+        """
+        with self._lock:
+            former = self._jobs.pop(name, None)
+            if former is not None:
+                self._timer.remove([former])
+            if hz > 0:
+                own = None if quick else self._lanes.setdefault(lane, Lane())
+                job = self._jobs[name] = Job(f"{self._name} {name}", max(MIN_PERIOD_S, 1.0 / hz), run, own)
+                if self._running:
+                    self._timer.add([job])
+
+    def start(self) -> None:
+        with self._lock:
+            if not self._running:
+                self._running = True
+                self._timer.add(self._jobs.values())
+
+    def stop(self, timeout: float) -> list[str]:
+        """End the jobs within ``timeout`` s; return names of those still running."""
+        with self._lock:
+            self._running = False
+            jobs = list(self._jobs.values())
+            self._jobs.clear()
+            self._timer.remove(jobs)
+        return self._timer.wait(jobs, timeout)

@@ -27,7 +27,6 @@ from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
-from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.throttle import TroubleLog
 from strands_robots.recording.cameras import Frames, jpeg
@@ -38,11 +37,6 @@ logger = logging.getLogger(__name__)
 Provider = Callable[[], Mapping[str, Any] | None]
 
 STARTED = time.monotonic()
-READERS = 2
-"""Threads that read at most; more than one, so that a sensor that waits delays no other."""
-
-WAITING = 32
-
 CAMERA_SPACING_S = 1.5 / (topics.BY_NAME["camera"].ceiling_hz or math.inf)
 """Between the frames of two cameras: the transport drops what comes closer on any of them."""
 
@@ -77,21 +71,19 @@ class _Sensor:
 
     suffix: str
     provider: Provider
-    busy: bool = False
     published: bool = False
 
 
 class SensorPublisher:
     """Reads the sensors of one peer at their rates and publishes the readings.
 
-    A robot may take seconds to answer, so sensors are read on threads of this publisher's own; one that is late skips
-    its turns. A sensor that refuses or fails is logged once for each reason, and nothing is published for it.
+    A robot may take seconds to answer, so a sensor that is late skips its turns and delays no other. One that refuses
+    or fails is logged once for each reason, and nothing is published for it.
     """
 
     def __init__(self, context: Context, scheduler: Scheduler) -> None:
         self._context = context
         self._scheduler = scheduler
-        self._executor = BoundedExecutor(f"{context.peer_id}-sensors", READERS, WAITING)
         self._sensors: dict[str, _Sensor] = {}
         self._troubles = TroubleLog(logger)
 
@@ -102,21 +94,11 @@ class SensorPublisher:
             self._sensors[suffix] = sensor
         else:
             self._sensors.pop(suffix, None)
-        self._scheduler.every(name, hz, lambda: self._due(sensor), quick=True)
+        self._scheduler.every(name, hz, lambda: self._sample(sensor), lane=name)
 
     def topics(self) -> list[str]:
         """The suffixes on which something is published."""
         return sorted(sensor.suffix for sensor in list(self._sensors.values()) if sensor.published)
-
-    def stop(self, timeout: float) -> list[str]:
-        """Read no more; names of threads that still read after ``timeout`` seconds."""
-        return self._executor.stop(timeout)
-
-    def _due(self, sensor: _Sensor) -> None:
-        if not sensor.busy:
-            sensor.busy = True
-            if not self._executor.submit(lambda: self._sample(sensor)):
-                sensor.busy = False
 
     def _sample(self, sensor: _Sensor) -> None:
         context, suffix = self._context, sensor.suffix
@@ -134,8 +116,6 @@ class SensorPublisher:
             trouble, level = f"{exc}", logging.INFO  # no reading is no fault
         except Exception as exc:  # noqa: BLE001 - whatever a provider raises costs its own turn alone
             trouble = f"{type(exc).__name__}: {exc}"
-        finally:
-            sensor.busy = False
         # Compared without digits: an age in the text makes no new reason.
         kind = "".join(letter for letter in trouble if not letter.isdigit())
         self._troubles.note(suffix, kind, "%s: no %s is published: %s", context.peer_id, suffix, trouble, level=level)
