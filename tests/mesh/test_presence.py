@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from tests.mesh.peers import Clock, Fleet
 from strands_robots.mesh import presence, topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
-from strands_robots.mesh.presence import PresencePublisher
+from strands_robots.mesh.presence import PresenceListener, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import TransportError
@@ -179,15 +180,14 @@ class Linked(MemoryTransport):
         return self.up
 
 
-def watched(bus: MemoryBus) -> tuple[Linked, PresencePublisher, PeerRegistry]:
+def watched(bus: MemoryBus) -> tuple[Linked, PresenceListener, Callable[[], None], PeerRegistry]:
     """A watcher on such a session that knows arm-1 of session ``aa``."""
     transport, registry = Linked(bus), PeerRegistry()
     transport.connect()
     registry.update("arm-1", "robot", "host", {}, session="aa")
     context = Context("console", registry, AuditThrottle("console"), Identity(), transport=transport)
-    publisher = PresencePublisher(context, "robot", dict)
-    publisher.start()
-    return transport, publisher, registry
+    listener = PresenceListener.joined_by(context)
+    return transport, listener, lambda: listener.left_by(context), registry
 
 
 def reachable(registry: PeerRegistry) -> bool:
@@ -199,34 +199,34 @@ def test_token_lost_with_our_own_link_is_not_judged_until_the_link_is_back(
 ) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.2)
     monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
-    transport, publisher, registry = watched(MemoryBus())
+    transport, listener, leave, registry = watched(MemoryBus())
     key = topics.token("arm-1", "aa")
     transport.up, transport.lost_at = False, time.monotonic()
-    publisher.on_token(key, alive=False)
-    publisher.judge_tokens()
+    listener.on_token(key, alive=False)
+    listener.judge_tokens()
     transport.up = True
-    publisher.judge_tokens()
+    listener.judge_tokens()
     assert reachable(registry)
-    publisher.on_token(key, alive=True)
+    listener.on_token(key, alive=True)
     time.sleep(0.25)
-    publisher.judge_tokens()
+    listener.judge_tokens()
     assert reachable(registry)
-    publisher.stop()
+    leave()
 
 
 def test_peer_whose_token_does_not_return_with_the_link_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(presence, "RETURN_S", 0.05)
     monkeypatch.setattr(presence, "SAME_LOSS_S", 20.0)
-    transport, publisher, registry = watched(MemoryBus())
+    transport, listener, leave, registry = watched(MemoryBus())
     transport.lost_at = time.monotonic()
-    publisher.on_token(topics.token("arm-1", "aa"), alive=False)
-    publisher.judge_tokens()
+    listener.on_token(topics.token("arm-1", "aa"), alive=False)
+    listener.judge_tokens()
     assert reachable(registry)
     time.sleep(0.06)
-    publisher.judge_tokens()
+    listener.judge_tokens()
     assert not reachable(registry)
     assert registry.conflicts("arm-1", "bb") is None
-    publisher.stop()
+    leave()
 
 
 class Late(MemoryTransport):
@@ -254,14 +254,15 @@ def test_bridge_declares_and_watches_tokens_when_its_local_leg_comes_up_late(
     context = Context("console", registry, AuditThrottle("console"), Identity(), transport=both)
     publisher = PresencePublisher(context, "robot", dict)
     publisher.start()
-    publisher.judge_tokens()
+    publisher.look()
     late.up = True
     eventually(lambda: both.session_id)
     for _ in range(2):
-        publisher.judge_tokens()
+        publisher.look()
     assert shown == [(topics.token("console", str(both.session_id)), True)]
     other.declare_token(topics.token("arm-1", "aa")).undeclare()
-    publisher.judge_tokens(0.0)
+    assert publisher.listener is not None
+    publisher.listener.judge_tokens(0.0)
     assert not reachable(registry)
     shown.clear()
     publisher.stop()

@@ -94,7 +94,8 @@ def test_stopped_mesh_leaves_no_thread(peers: Fleet) -> None:
     console.send("leaver", {"action": "status"}, timeout=20)
 
     def ours() -> list[str]:
-        return [each.name for each in set(threading.enumerate()) - before if "halt" not in each.name]
+        new = [each.name for each in set(threading.enumerate()) - before if "halt" not in each.name]
+        return [name for name in new if name.startswith("mesh-") or "leaver" in name]
 
     assert ours()
     mesh.stop()

@@ -51,7 +51,6 @@ logger = logging.getLogger(__name__)
 LOOP_JOIN_TIMEOUT_S = 2.0
 """Seconds that :meth:`Mesh.stop` waits, in all, for what it started."""
 
-PRUNE_HZ = 1.0
 LATE_HZ = 2.0
 HEARING_HZ = 2.0
 TOKENS_HZ = 5.0
@@ -266,8 +265,7 @@ class Mesh(SensorLoopsMixin):
         if self.children is not None:
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
-        every("tokens", TOKENS_HZ, self._presence.judge_tokens, quick=True)
-        every("prune", PRUNE_HZ, self._prune, quick=True)
+        every("tokens", TOKENS_HZ, self._presence.look, quick=True)
         every("hearing", HEARING_HZ, self._hearing.look, quick=True)
         # A stop that is published again may wait for its turn, and behind no robot.
         every("late peers", LATE_HZ, self._safety.late.look, lane="late peers")
@@ -316,9 +314,6 @@ class Mesh(SensorLoopsMixin):
         body = self._state.read()
         if body is not None:
             self._context.put(topics.state(self.peer_id), body | self._safety_facts())
-
-    def _prune(self) -> None:
-        self._context.registry.prune()
 
     def close(self) -> None:
         """Leave the mesh for good, and the safety plane with it."""

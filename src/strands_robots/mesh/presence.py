@@ -7,12 +7,13 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
+from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.throttle import TroubleLog
-from strands_robots.mesh.transport import Declaration, Sample, TransportError, undeclare
+from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.mesh.wire_identity import IdentityError
 
 logger = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ SKEWED_MAX = 64
 
 
 class PresencePublisher:
-    """Announces one peer and registers the others.
+    """Announces one peer.
 
     Args:
         describe: returns the fields of a heartbeat besides id, type, host and time. It may read the robot slowly, so
@@ -49,39 +50,36 @@ class PresencePublisher:
         self._type = peer_type
         self._describe = describe
         self._safety = safety
-        self._skewed: set[str] = set()
         self._facts: dict[str, Any] = {}
         self._troubles = TroubleLog(logger)
         self.described = threading.Event()
-        self._leaving: dict[tuple[str, str], float] = {}
-        self._tokens: dict[tuple[str, str], None] = {}
-        self._judged_later = self._token_declared = False
-        self._anchored_at: float | None = None
-        self._declared: list[Declaration] = []
+        self.listener: PresenceListener | None = None
+        self._token: Declaration | None = None
         self._host = socket.gethostname()
 
     def start(self) -> None:
-        """Subscribe to presence, and declare our token as soon as there is a session."""
-        transport = self._context.transport
-        if transport is None:
-            raise TransportError("the mesh is not running.")
-        self._declared.append(transport.declare_subscriber(topics.presence("*"), self.on_presence))
+        """Listen to the others, and declare our token as soon as there is a session."""
+        self.listener = PresenceListener.joined_by(self._context)
         self._declare_token()
 
     def _declare_token(self) -> None:
-        """Declare our token and watch the others, once there is a session."""
         transport, session = self._context.transport, self._context.session_id()
-        if self._token_declared or session is None or transport is None:
-            return
-        self._token_declared = True
-        self._declared.append(transport.declare_token(topics.token(self._context.peer_id, session)))
-        # Where a link can be lost, its loss and that of the tokens come in any order.
-        self._judged_later = transport.lost_link_at() is not None
-        self._declared.append(transport.watch_tokens(topics.token("*", "*"), self.on_token))
+        if self._token is None and session is not None and transport is not None:
+            self._token = transport.declare_token(topics.token(self._context.peer_id, session))
 
     def stop(self) -> None:
-        declared, self._declared = self._declared, []
-        undeclare(declared)
+        token, self._token = self._token, None
+        listener, self.listener = self.listener, None
+        if token is not None:
+            undeclare([token])
+        if listener is not None:
+            listener.left_by(self._context)
+
+    def look(self) -> None:
+        """Declare our token once there is a session, and judge the others' tokens."""
+        self._declare_token()
+        if self.listener is not None:
+            self.listener.look(self._context)
 
     def refresh(self) -> None:
         """Read the description anew; a robot that fails is announced by name alone."""
@@ -108,18 +106,85 @@ class PresencePublisher:
         except (TransportError, wire.WireError) as exc:
             logger.warning("%s: presence was not published: %s", context.peer_id, exc)
 
+
+class PresenceListener:
+    """Registers the peers that are heard: one for all peers of a process on one session, with one registry.
+
+    A heartbeat is parsed, and its signature verified, once for all of them.
+    """
+
+    _all: ClassVar[dict[tuple[Transport, PeerRegistry], PresenceListener]] = {}
+    _joining: ClassVar[threading.Lock] = threading.Lock()
+
+    def __init__(self, transport: Transport, registry: PeerRegistry) -> None:
+        self._transport = transport
+        self._registry = registry
+        self._members: dict[str, Context] = {}
+        self._skewed: set[str] = set()
+        self._leaving: dict[tuple[str, str], float] = {}
+        self._tokens: dict[tuple[str, str], None] = {}
+        self._watches = False
+        # Where a link can be lost, its loss and that of the tokens come in any order.
+        self._judged_later = transport.lost_link_at() is not None
+        self._anchored_at: float | None = None
+        self._declared: list[Declaration] = []
+
+    @classmethod
+    def joined_by(cls, context: Context) -> PresenceListener:
+        """Return the listener of a peer's session and registry, which hears for it now.
+
+        Raises:
+            TransportError: the peer is not on the mesh.
+        """
+        transport = context.transport
+        if transport is None:
+            raise TransportError("the mesh is not running.")
+        key = (transport, context.registry)
+        with cls._joining:
+            listener = cls._all.get(key) or cls(*key)
+            listener._members = {**listener._members, context.peer_id: context}
+            if key not in cls._all:
+                listener._declared.append(transport.declare_subscriber(topics.presence("*"), listener.on_presence))
+                cls._all[key] = listener
+                listener._watch_tokens()
+        return listener
+
+    def left_by(self, context: Context) -> None:
+        """Hear no more for a peer; the last one ends the subscription."""
+        with self._joining:
+            self._members = {peer: each for peer, each in self._members.items() if each is not context}
+            if not self._members:
+                del self._all[self._transport, self._registry]
+                undeclare(self._declared)
+
+    def look(self, context: Context) -> None:
+        """Judge tokens and drop silent peers, for the first of our peers alone."""
+        if context is next(iter(self._members.values()), None):
+            self.judge_tokens()
+            self._registry.prune()
+
+    def _watch_tokens(self) -> None:
+        if not self._watches and self._transport.session_id is not None:
+            self._watches = True
+            self._declared.append(self._transport.watch_tokens(topics.token("*", "*"), self.on_token))
+
     def on_presence(self, sample: Sample) -> None:
         """Register the sender of a heartbeat, or drop the heartbeat and audit the reason."""
-        context = self._context
+        members = list(self._members.values())
+        if not members:
+            return
+        context = members[0]
         try:
             presence = wire.Presence.of(wire.decode(sample.payload, topics.BY_NAME["presence"].max_bytes))
         except wire.WireError as exc:
             context.audit("presence_rejected", reason=str(exc))
             return
         peer = presence.robot_id
-        if peer == context.peer_id:
-            self._audit_impostor(sample)
-            return
+        own = self._members.get(peer)
+        if own is not None:
+            _audit_impostor(own, sample)
+            if len(members) == 1:
+                return
         ahead = presence.timestamp - context.clock()
         if not wire.fresh(presence.timestamp, context.clock()):
             context.audit("presence_rejected", peer, reason="the timestamp is not fresh")
@@ -174,7 +239,7 @@ class PresencePublisher:
     def on_token(self, key: str, alive: bool) -> None:
         """Note a token that came or went, for :meth:`judge_tokens`."""
         parts = key.split("/")
-        if len(parts) != 4 or parts[1] == self._context.peer_id:
+        if len(parts) != 4:
             return
         mark = (parts[1], parts[3])
         if alive:
@@ -195,9 +260,9 @@ class PresencePublisher:
         token again on the next hub; a token that is not back :data:`RETURN_S` after our own link belongs to a peer
         that is gone.
         """
-        self._declare_token()
-        now, transport = time.monotonic(), self._context.transport
-        if transport is None or not transport.anchored():
+        self._watch_tokens()
+        now, transport = time.monotonic(), self._transport
+        if not transport.anchored():
             self._anchored_at = None
             return
         lost_link = transport.lost_link_at()
@@ -208,13 +273,14 @@ class PresencePublisher:
             if now - since < (RETURN_S if ours else patience):
                 continue
             self._leaving.pop(mark, None)
-            if self._context.registry.lost(*mark):
+            if self._registry.lost(*mark):
                 logger.info("%s left.", mark[0])
 
-    def _audit_impostor(self, sample: Sample) -> None:
-        ours = self._context.session_id()
-        if sample.session is not None and ours is not None and sample.session != ours:
-            self._context.audit("presence_identity_conflict", self._context.peer_id, held=ours, offered=sample.session)
+
+def _audit_impostor(context: Context, sample: Sample) -> None:
+    ours = context.session_id()
+    if sample.session is not None and ours is not None and sample.session != ours:
+        context.audit("presence_identity_conflict", context.peer_id, held=ours, offered=sample.session)
 
 
 def _owns_topic(key: str, peer: str) -> bool:
