@@ -94,7 +94,7 @@ def run(quick: bool = False) -> list[Row]:
         rows += stops(console, shared, state, 10 if quick else 100)
         rows += losses(state)
         rows.append(presence(5 if quick else 20))
-        rows += idle(shared, state)
+        rows += [*idle(shared, state), fleet_idle(state, 3 if quick else 20)]
     return rows
 
 
@@ -304,6 +304,23 @@ def idle(shared: dict[str, str], state: str) -> list[Row]:
         Row("threads of an idle peer, ours", str(len(threads)), "", None, "at most 6", len(threads) <= 6),
         Row("import strands_robots.mesh over an interpreter", f"{load:.1f} ms", "", None, "at most 20 ms", load <= 20),
     ]
+
+
+def fleet_idle(state: str, seconds: int) -> Row:
+    """CPU of a hundred idle robots of one process, and the threads that the last ninety added."""
+    threads: list[int] = []
+    for count in (10, 100):
+        shared = {"STRANDS_MESH_PORT": str(free_port()), "STRANDS_STATE_DIR": _folder(state, f"idle-{count}")}
+        fleet = Child("fleet", "idle", str(count), **shared)
+        time.sleep(3)  # their start is no part of it
+        began, (before, _) = time.monotonic(), fleet.ask("cost")
+        time.sleep(seconds)
+        (after, alive), passed = fleet.ask("cost"), time.monotonic() - began
+        fleet.close()
+        threads.append(alive)
+    each, share = (threads[1] - threads[0]) / 90, 100 * (after - before) / passed
+    what = f"100 idle robots of a process, share of a core ({each:.2f} threads for each further one)"
+    return Row(what, f"{share:.1f} %", "", None, "no thread each", each < 0.05)
 
 
 def _import_ms(module: str) -> float:

@@ -60,6 +60,8 @@ def fleet(prefix: str, count: str) -> None:
     for line in sys.stdin:
         if line.strip() == "halted":
             print(json.dumps([arm.halted_at for arm in arms]), flush=True)
+        elif line.strip() == "cost":
+            print(json.dumps([time.process_time(), threading.active_count()]), flush=True)
         elif line.strip() == "clear":
             # A benchmark stops the same robots many times; an operator at the machine would clear them so.
             from strands_robots.safety.plane import plane  # noqa: PLC0415 - likewise

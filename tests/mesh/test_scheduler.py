@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
+from itertools import pairwise
 
 import pytest
-from fixtures.mesh_robots import World
+from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh.core import Mesh
-from strands_robots.mesh.scheduler import Job, Scheduler, Timer
+from strands_robots.envelope import Envelope
+from strands_robots.mesh.core import Mesh, init_mesh
+from strands_robots.mesh.scheduler import Job, Lane, Scheduler, Timer
+from strands_robots.mesh.topics import BY_NAME, presence
+from strands_robots.mesh.transport.memory import MemoryTransport
 
 
 def test_missed_deadlines_are_dropped_not_caught_up() -> None:
@@ -19,6 +24,15 @@ def test_missed_deadlines_are_dropped_not_caught_up() -> None:
     assert job.due == pytest.approx(100.1)
     job.skip_to(101.25)
     assert job.due == pytest.approx(101.3)
+
+
+def test_peers_that_start_at_once_do_not_read_at_once() -> None:
+    jobs = [Job("state", 0.1, list, Lane(), Scheduler(f"peer-{n}").phase, 100.0) for n in range(20)]
+    for _ in range(2):
+        for job in jobs:
+            job.skip_to(max(job.due, 100.0))
+        due = sorted(job.due for job in jobs)
+        assert min(later - earlier for earlier, later in pairwise(due)) > 1 / (BY_NAME["state"].ceiling_hz or 1)
 
 
 def test_wedged_robot_delays_no_other_and_its_stop_names_what_still_runs() -> None:
@@ -39,6 +53,27 @@ def test_wedged_robot_delays_no_other_and_its_stop_names_what_still_runs() -> No
     finally:
         release.set()
         assert sound.stop(20) == []
+
+
+def test_beats_go_on_where_the_system_has_no_thread_for_the_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, scarce = threading.Thread.start, threading.Event()
+    scarce.set()
+
+    def begin(thread: threading.Thread) -> None:
+        if scarce.is_set() and thread.name == "scarce-worker":
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", begin)
+    beats, read, scheduler = list[int](), list[int](), Scheduler("arm", Timer("scarce"))
+    scheduler.every("presence", 100, lambda: beats.append(1), quick=True)
+    scheduler.every("bus", 100, lambda: read.append(1))
+    scheduler.start()
+    eventually(lambda: len(beats) > 20)
+    assert not read
+    scarce.clear()
+    eventually(lambda: read)
+    assert scheduler.stop(20) == []
 
 
 def test_jobs_of_one_lane_never_run_at_once() -> None:
@@ -101,3 +136,65 @@ def test_stopped_mesh_leaves_no_thread(peers: Fleet) -> None:
     mesh.stop()
     console.stop()
     eventually(lambda: not ours())
+
+
+class Reads(Arm):
+    """An arm whose reads wait for ``release``."""
+
+    def __init__(self, name: str, release: threading.Event) -> None:
+        super().__init__(name)
+        self.release = release
+        self.asked = threading.Event()
+
+    def get_state(self) -> Envelope:
+        self.asked.set()
+        self.release.wait(20)
+        return super().get_state()
+
+    get_task_status = get_state
+
+
+def test_further_robots_of_a_process_share_its_threads_and_a_blocked_one_delays_no_beat(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
+    free, release = threading.Event(), threading.Event()
+    free.set()
+    beats, watcher = Counter[str](), MemoryTransport()
+    watcher.connect()
+    watcher.declare_subscriber(presence("*"), lambda sample: beats.update([sample.key.split("/")[1]]))
+
+    def ours() -> int:
+        return sum(each.name.startswith("mesh-") for each in threading.enumerate())
+
+    def all_beat(*names: str) -> bool:
+        return all(beats[name] >= 3 for name in names)
+
+    robots = [init_mesh(Reads(f"arm-{n}", free), f"arm-{n}") for n in range(10)]
+    names = [f"arm-{n}" for n in range(10)]
+    blocked = Reads("blocked", release)
+    wedged = None
+    try:
+        eventually(lambda: all_beat(*names))
+        eventually(lambda: ours() <= 2)
+        assert all(mesh is not None and len(mesh.peers) == 9 for mesh in robots)
+        wedged = init_mesh(blocked, "blocked")
+        assert blocked.asked.wait(20)
+        beats.clear()
+        eventually(lambda: all_beat("blocked", *names))
+        first = robots.pop(0)
+        assert first is not None
+        first.close()
+        assert not release.is_set()
+        beats.clear()
+        eventually(lambda: all_beat("blocked", *names[1:]))
+        eventually(lambda: all(mesh is not None and len(mesh.peers) >= 9 for mesh in robots))
+        assert all(not row["reachable"] for mesh in robots for row in mesh.peers if row["peer_id"] == "arm-0")  # type: ignore[union-attr]
+        assert beats["arm-0"] == 0
+    finally:
+        release.set()
+        for mesh in [*robots, wedged]:
+            if mesh is not None:
+                mesh.close()
+        watcher.close()
+    eventually(lambda: ours() == 0)

@@ -17,11 +17,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import count
 
+from strands_robots.mesh.throttle import TroubleLog
+
 logger = logging.getLogger(__name__)
 
 MIN_PERIOD_S = 0.001
 TICK_S = 0.01
-"""Jobs at least ten times as slow are due on whole ones, so that those of many peers share a wake-up."""
+"""Quick jobs at least ten times as slow are due on whole ones, so that those of many peers share a wake-up."""
+
+SPREAD = (math.sqrt(5) - 1) / 2
+"""Each further peer reads by this share of a period later: Zenoh drops readings that come close together on a link."""
 
 RELIEF_S = 0.02
 """Work that waits this long for a worker gets another one."""
@@ -41,6 +46,7 @@ class Job:
 
     Attributes:
         lane: None for a quick job, which runs on the timer.
+        phase: share of a period by which its second turn is moved, from -0.5 to 0.5; 0 from then on.
         over: it begins no more.
         runner: the thread that runs it now.
     """
@@ -49,6 +55,7 @@ class Job:
     period: float
     run: Callable[[], None]
     lane: Lane | None = None
+    phase: float = 0.0
     due: float = 0.0
     busy: bool = False
     over: bool = True
@@ -58,7 +65,9 @@ class Job:
     def skip_to(self, now: float) -> None:
         """Be due at the first deadline after ``now``."""
         self.due += (int((now - self.due) / self.period) + 1) * self.period
-        if self.period >= 10 * TICK_S:
+        if self.lane is not None:
+            self.due, self.phase = self.due + self.phase * self.period, 0.0
+        elif self.period >= 10 * TICK_S:
             self.due = math.ceil(self.due / TICK_S - 1e-6) * TICK_S
 
 
@@ -81,6 +90,7 @@ class Timer:
         self._ready: deque[tuple[float, Lane]] = deque()
         self._idle = self._workers = 0
         self._thread: threading.Thread | None = None
+        self._refusals = TroubleLog(logger)
 
     def add(self, jobs: Iterable[Job]) -> None:
         """Run these jobs, each for the first time now."""
@@ -170,8 +180,14 @@ class Timer:
         waits_until = self._ready[0][0] + RELIEF_S
         if self._workers and (self._idle or now < waits_until):
             return max(waits_until, now + RELIEF_S / 2)
-        self._workers += 1
-        self._begun(self._serve, "worker")
+        try:
+            self._begun(self._serve, "worker")
+        except RuntimeError as exc:
+            # The heartbeats go on; the system may have a thread later.
+            self._refusals.note("", str(exc), "The reads of this process wait for a thread: %s", exc)
+        else:
+            self._workers += 1
+            self._refusals.note("", "", "")
         return now + RELIEF_S
 
     def _serve(self) -> None:
@@ -215,6 +231,7 @@ class Timer:
 
 
 _timer = Timer()
+_peers = count()
 
 
 class Scheduler:
@@ -228,6 +245,7 @@ class Scheduler:
     def __init__(self, name: str, timer: Timer = _timer) -> None:
         self._name = name
         self._timer = timer
+        self.phase = next(_peers) * SPREAD % 1 - 0.5
         self._lock = threading.Lock()
         self._jobs: dict[str, Job] = {}
         self._lanes: dict[str, Lane] = {}
@@ -246,7 +264,8 @@ class Scheduler:
                 self._timer.remove([former])
             if hz > 0:
                 own = None if quick else self._lanes.setdefault(lane, Lane())
-                job = self._jobs[name] = Job(f"{self._name} {name}", max(MIN_PERIOD_S, 1.0 / hz), run, own)
+                period = max(MIN_PERIOD_S, 1.0 / hz)
+                job = self._jobs[name] = Job(f"{self._name} {name}", period, run, own, self.phase)
                 if self._running:
                     self._timer.add([job])
 
