@@ -307,7 +307,7 @@ def idle(shared: dict[str, str], state: str) -> list[Row]:
 
 
 def fleet_idle(state: str, seconds: int) -> Row:
-    """CPU of a hundred idle robots of one process, and the threads that the last ninety added."""
+    """CPU of 100 idle robots of a process; threads of the last 90."""
     threads: list[int] = []
     for count in (10, 100):
         shared = {"STRANDS_MESH_PORT": str(free_port()), "STRANDS_STATE_DIR": _folder(state, f"idle-{count}")}

@@ -76,7 +76,7 @@ class PresencePublisher:
             listener.left_by(self._context)
 
     def look(self) -> None:
-        """Declare our token once there is a session, and judge the others' tokens."""
+        """Declare our token once there is a session; judge others."""
         self._declare_token()
         if self.listener is not None:
             self.listener.look(self._context)
@@ -108,9 +108,9 @@ class PresencePublisher:
 
 
 class PresenceListener:
-    """Registers the peers that are heard: one for all peers of a process on one session, with one registry.
+    """Registers the peers that are heard.
 
-    A heartbeat is parsed, and its signature verified, once for all of them.
+    All peers of a process on one session share one. A heartbeat is parsed, and its signature verified, once for all of them.
     """
 
     _all: ClassVar[dict[tuple[Transport, PeerRegistry], PresenceListener]] = {}
@@ -131,7 +131,7 @@ class PresenceListener:
 
     @classmethod
     def joined_by(cls, context: Context) -> PresenceListener:
-        """Return the listener of a peer's session and registry, which hears for it now.
+        """Return the listener of a peer's session and registry.
 
         Raises:
             TransportError: the peer is not on the mesh.
@@ -150,7 +150,7 @@ class PresenceListener:
         return listener
 
     def left_by(self, context: Context) -> None:
-        """Hear no more for a peer; the last one ends the subscription."""
+        """Hear no more for a peer; the last ends the subscription."""
         with self._joining:
             self._members = {peer: each for peer, each in self._members.items() if each is not context}
             if not self._members:
@@ -158,7 +158,7 @@ class PresenceListener:
                 undeclare(self._declared)
 
     def look(self, context: Context) -> None:
-        """Judge tokens and drop silent peers, for the first of our peers alone."""
+        """Judge tokens and drop silent peers, for our first peer."""
         if context is next(iter(self._members.values()), None):
             self.judge_tokens()
             self._registry.prune()

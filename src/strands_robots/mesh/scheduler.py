@@ -104,7 +104,7 @@ class Timer:
             self._changed.notify()
 
     def remove(self, jobs: Iterable[Job]) -> None:
-        """Begin these jobs no more; those that run are not waited for."""
+        """Begin these jobs no more, without waiting for them."""
         with self._lock:
             for job in jobs:
                 self._jobs -= not job.over
@@ -115,7 +115,7 @@ class Timer:
                 self._work.notify_all()
 
     def wait(self, jobs: Iterable[Job], timeout: float) -> list[str]:
-        """Wait until none runs on another thread; names of those that do after ``timeout`` s."""
+        """Wait until none runs on another thread; names of those that do."""
         own, jobs = threading.current_thread(), list(jobs)
 
         def running() -> list[str]:
@@ -149,7 +149,7 @@ class Timer:
                 self._run(job)
 
     def _take_due(self, now: float) -> list[Job]:
-        """Return the quick jobs that are due, and hand the others to the workers."""
+        """Return the quick jobs due; hand the others to workers."""
         quick: list[Job] = []
         while self._heap and self._heap[0][0] <= now:
             job = heapq.heappop(self._heap)[2]
@@ -174,7 +174,7 @@ class Timer:
         self._work.notify()
 
     def _relieve(self, now: float) -> float:
-        """Add a worker where work waits too long; return when to look again."""
+        """Add a worker where work waits; return when to look again."""
         if not self._ready:
             return math.inf
         waits_until = self._ready[0][0] + RELIEF_S
@@ -199,7 +199,7 @@ class Timer:
                     self._hand_over(lane, time.monotonic())
 
     def _next_lane(self) -> Lane | None:
-        """Wait for a lane with work; None where another worker waits already."""
+        """Wait for a lane with work; None where enough wait."""
         with self._lock:
             while not self._ready:
                 if self._idle or not self._jobs:
@@ -235,7 +235,7 @@ _peers = count()
 
 
 class Scheduler:
-    """The jobs of one peer, run at their rates between :meth:`start` and :meth:`stop`.
+    """Jobs of one peer, at their rates from :meth:`start` to :meth:`stop`.
 
     Args:
         name: of the peer.
