@@ -13,7 +13,7 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope
 from strands_robots.mesh.core import Mesh, init_mesh
-from strands_robots.mesh.scheduler import Job, Lane, Scheduler, Timer
+from strands_robots.mesh.scheduler import Job, JobQueue, Scheduler, Timer
 from strands_robots.mesh.topics import BY_NAME, presence
 from strands_robots.mesh.transport.memory import MemoryTransport
 
@@ -27,7 +27,7 @@ def test_missed_deadlines_are_dropped_not_caught_up() -> None:
 
 
 def test_peers_that_start_at_once_do_not_read_at_once() -> None:
-    jobs = [Job("state", 0.1, list, Lane(), Scheduler(f"peer-{n}").phase, 100.0) for n in range(20)]
+    jobs = [Job("state", 0.1, list, JobQueue(), Scheduler(f"peer-{n}").phase, 100.0) for n in range(20)]
     for _ in range(2):
         for job in jobs:
             job.skip_to(max(job.due, 100.0))
@@ -39,7 +39,7 @@ def test_wedged_robot_delays_no_other_and_its_stop_names_what_still_runs() -> No
     release, beats, read = threading.Event(), list[int](), list[int]()
     wedged, sound = Scheduler("wedged"), Scheduler("sound")
     for name in ("bus", "imu", "odom"):
-        wedged.every(name, 100, lambda: release.wait(20) and None, lane=name)
+        wedged.every(name, 100, lambda: release.wait(20) and None, queue=name)
     wedged.every("presence", 100, lambda: beats.append(1), quick=True)
     sound.every("bus", 100, lambda: read.append(1))
     wedged.start()
@@ -76,8 +76,8 @@ def test_beats_go_on_where_the_system_has_no_thread_for_the_reads(monkeypatch: p
     assert scheduler.stop(20) == []
 
 
-def test_jobs_of_one_lane_never_run_at_once() -> None:
-    scheduler, alone, runs = Scheduler("lane"), threading.Lock(), list[bool]()
+def test_jobs_of_one_queue_never_run_at_once() -> None:
+    scheduler, alone, runs = Scheduler("queue"), threading.Lock(), list[bool]()
 
     def run() -> None:
         runs.append(alone.acquire(blocking=False))

@@ -268,7 +268,7 @@ class Mesh(SensorLoopsMixin):
         every("tokens", TOKENS_HZ, self._presence.look, quick=True)
         every("hearing", HEARING_HZ, self._hearing.look, quick=True)
         # A stop that is published again may wait for its turn, and behind no robot.
-        every("late peers", LATE_HZ, self._safety.late.look, lane="late peers")
+        every("late peers", LATE_HZ, self._safety.late.look, queue="late peers")
         frames = frames_of(self.robot)
         if frames is not None:
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), CameraPublisher(context, frames).publish)

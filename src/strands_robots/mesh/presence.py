@@ -110,7 +110,8 @@ class PresencePublisher:
 class PresenceListener:
     """Registers the peers that are heard.
 
-    All peers of a process on one session share one. A heartbeat is parsed, and its signature verified, once for all of them.
+    All peers of a process on one session share one. A heartbeat is parsed and verified once for
+    all of them.
     """
 
     _all: ClassVar[dict[tuple[Transport, PeerRegistry], PresenceListener]] = {}

@@ -33,7 +33,7 @@ RELIEF_S = 0.02
 
 
 @dataclass(slots=True, eq=False)
-class Lane:
+class JobQueue:
     """Jobs of one peer that run one after another; ``busy`` while a worker has them."""
 
     waiting: deque[Job] = field(default_factory=deque)
@@ -45,7 +45,7 @@ class Job:
     """A callable due every ``period`` seconds; ``busy`` while queued or running.
 
     Attributes:
-        lane: None for a quick job, which runs on the timer.
+        queue: None for a quick job, which runs on the timer.
         phase: share of a period by which its second turn is moved, from -0.5 to 0.5; 0 from then on.
         over: it begins no more.
         runner: the thread that runs it now.
@@ -54,7 +54,7 @@ class Job:
     name: str
     period: float
     run: Callable[[], None]
-    lane: Lane | None = None
+    queue: JobQueue | None = None
     phase: float = 0.0
     due: float = 0.0
     busy: bool = False
@@ -65,7 +65,7 @@ class Job:
     def skip_to(self, now: float) -> None:
         """Be due at the first deadline after ``now``."""
         self.due += (int((now - self.due) / self.period) + 1) * self.period
-        if self.lane is not None:
+        if self.queue is not None:
             self.due, self.phase = self.due + self.phase * self.period, 0.0
         elif self.period >= 10 * TICK_S:
             self.due = math.ceil(self.due / TICK_S - 1e-6) * TICK_S
@@ -87,7 +87,7 @@ class Timer:
         self._heap: list[tuple[float, int, Job]] = []
         self._numbers = count()
         self._jobs = 0
-        self._ready: deque[tuple[float, Lane]] = deque()
+        self._ready: deque[tuple[float, JobQueue]] = deque()
         self._idle = self._workers = 0
         self._thread: threading.Thread | None = None
         self._refusals = TroubleLog(logger)
@@ -160,17 +160,17 @@ class Timer:
             if job.busy:
                 continue
             job.busy = True
-            if job.lane is None:
+            if job.queue is None:
                 quick.append(job)
                 continue
-            job.lane.waiting.append(job)
-            if not job.lane.busy:
-                job.lane.busy = True
-                self._hand_over(job.lane, now)
+            job.queue.waiting.append(job)
+            if not job.queue.busy:
+                job.queue.busy = True
+                self._hand_over(job.queue, now)
         return quick
 
-    def _hand_over(self, lane: Lane, now: float) -> None:
-        self._ready.append((now, lane))
+    def _hand_over(self, queue: JobQueue, now: float) -> None:
+        self._ready.append((now, queue))
         self._work.notify()
 
     def _relieve(self, now: float) -> float:
@@ -191,15 +191,15 @@ class Timer:
         return now + RELIEF_S
 
     def _serve(self) -> None:
-        while (lane := self._next_lane()) is not None:
-            self._run(lane.waiting.popleft())
+        while (queue := self._next_queue()) is not None:
+            self._run(queue.waiting.popleft())
             with self._lock:
-                lane.busy = bool(lane.waiting)
-                if lane.busy:
-                    self._hand_over(lane, time.monotonic())
+                queue.busy = bool(queue.waiting)
+                if queue.busy:
+                    self._hand_over(queue, time.monotonic())
 
-    def _next_lane(self) -> Lane | None:
-        """Wait for a lane with work; None where enough wait."""
+    def _next_queue(self) -> JobQueue | None:
+        """Wait for a queue with work; None where enough wait."""
         with self._lock:
             while not self._ready:
                 if self._idle or not self._jobs:
@@ -248,22 +248,22 @@ class Scheduler:
         self.phase = next(_peers) * SPREAD % 1 - 0.5
         self._lock = threading.Lock()
         self._jobs: dict[str, Job] = {}
-        self._lanes: dict[str, Lane] = {}
+        self._queues: dict[str, JobQueue] = {}
         self._running = False
 
-    def every(self, name: str, hz: float, run: Callable[[], None], *, quick: bool = False, lane: str = "") -> None:
+    def every(self, name: str, hz: float, run: Callable[[], None], *, quick: bool = False, queue: str = "") -> None:
         """Run ``run`` ``hz`` times a second under ``name``; 0 or less is off.
 
         Args:
             quick: it never blocks, and runs on the timer.
-            lane: jobs of the same lane run one after another, and delay no other lane.
+            queue: jobs of the same queue run one after another, and delay no other queue.
         """
         with self._lock:
             former = self._jobs.pop(name, None)
             if former is not None:
                 self._timer.remove([former])
             if hz > 0:
-                own = None if quick else self._lanes.setdefault(lane, Lane())
+                own = None if quick else self._queues.setdefault(queue, JobQueue())
                 period = max(MIN_PERIOD_S, 1.0 / hz)
                 job = self._jobs[name] = Job(f"{self._name} {name}", period, run, own, self.phase)
                 if self._running:

@@ -94,7 +94,7 @@ class SensorPublisher:
             self._sensors[suffix] = sensor
         else:
             self._sensors.pop(suffix, None)
-        self._scheduler.every(name, hz, lambda: self._sample(sensor), lane=name)
+        self._scheduler.every(name, hz, lambda: self._sample(sensor), queue=name)
 
     def topics(self) -> list[str]:
         """The suffixes on which something is published."""
