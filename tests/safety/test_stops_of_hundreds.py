@@ -7,7 +7,7 @@ import json
 import math
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -22,13 +22,14 @@ from strands_robots.safety.estop_listener import VERDICT, EstopListener, notific
 from strands_robots.safety.orders import (
     ANSWERED,
     ANSWERED_MAX_BYTES,
+    LISTENER,
     RobotReport,
     StopOrder,
     StopRules,
     answered_field,
     new_epoch,
 )
-from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.plane import Registered, SafetyPlane
 from strands_robots.safety.reporting import Reporter, StopRun
 from strands_robots.safety.stopping import StopVerdict
 
@@ -262,6 +263,23 @@ def test_the_collector_waits_for_the_halts_of_a_stop_and_no_longer(
     eventually(gc.isenabled)
 
 
+def test_the_collector_goes_on_while_answers_to_another_stop_are_sent(plane: SafetyPlane, add: Add) -> None:
+    sending, release = threading.Event(), threading.Event()
+
+    def slow(report: RobotReport) -> None:
+        sending.set()
+        release.wait(60)
+
+    add("arm-1")
+    assert plane.begin(order(), slow) is not None
+    try:
+        assert sending.wait(20)
+        assert plane.begin(order()) is not None
+        eventually(gc.isenabled)
+    finally:
+        release.set()
+
+
 def test_the_collector_goes_on_while_a_halt_blocks(plane: SafetyPlane, add: Add) -> None:
     release = threading.Event()
     add("arm-1", before_halt=lambda: release.wait(60))
@@ -289,6 +307,41 @@ def test_a_repetition_while_the_halts_are_under_way_is_not_read_robot_by_robot(p
     finally:
         release.set()
     eventually(lambda: not plane.under_way(first.epoch))
+
+
+def test_a_stop_over_a_second_path_asks_no_robot_that_the_first_one_has_still_to_lock(
+    plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robots = [add(f"arm-{number}") for number in range(3)]
+    first, asked = order(), list[str]()
+    locking, ended = threading.Event(), threading.Event()
+    runs, reports = list[StopRun | None](), list[RobotReport]()
+    listener = threading.Thread(
+        target=lambda: runs.append(plane.begin(replace(first, path=LISTENER), reports.append)), name="listener"
+    )
+
+    def let_the_listener_in() -> None:
+        if not listener.is_alive():
+            listener.start()
+            assert locking.wait(20)
+
+    def wait_for_the_other_path() -> None:
+        locking.set()
+        assert ended.wait(20)
+
+    def note(entry: Registered, again: StopOrder) -> None:
+        if threading.current_thread() is not listener:
+            asked.append(entry.robot_id)
+
+    robots[0].halt_ordered = let_the_listener_in
+    robots[1].halt_ordered = wait_for_the_other_path
+    monkeypatch.setattr(Registered, "report_again", note)
+    runs.append(plane.begin(first, reports.append))
+    ended.set()
+    listener.join(20)
+    assert all(run is not None and run.wait(20) for run in runs)
+    assert asked == []
+    assert sorted((each.robot_id, each.stopped) for each in reports) == [(f"arm-{each}", True) for each in range(3)]
 
 
 @pytest.mark.parametrize("verdict", [{"not_stopped": {"bus": "no answer in 1 s"}}, {"unknown": {"arm-2": "unknown"}}])

@@ -313,7 +313,8 @@ class SafetyPlane:
         """Lock every robot and start every halt; return before their answers.
 
         A robot that has seen this stop is not halted again; ``on_report`` gets at once its report of then while this
-        stop still holds it, and ``stopped`` None once it was resumed. None when no robot had anything to do.
+        stop still holds it, and ``stopped`` None once it was resumed. None when no robot had anything to do, and while
+        this stop is :meth:`under_way`: what began it reports every robot.
         """
         if self.under_way(order.epoch):
             return None
@@ -321,15 +322,14 @@ class SafetyPlane:
         halted = undisturbed(many=len(self._robots) > UNPACED)
         try:
             by_name = self._robots
-            robots = list(by_name.values())
-            fresh = self._engage(order, by_name)
+            fresh, known = self._engage(order, by_name)
             reporter = self._reporter
             if reporter is None:
                 # The last robot is leaving; its halt is not reported any more, and it is halted all the same.
                 for entry in fresh:
                     self.executor.submit(entry.robot, entry.robot_id, order.reason)
             if not fresh or reporter is None:
-                self._repeat(order, robots, on_report)
+                self._repeat(order, known, on_report)
                 return None
             by_id = {entry.robot_id: entry for entry in fresh}
 
@@ -349,7 +349,7 @@ class SafetyPlane:
                 lambda: self._keep(fresh),
                 halted,
             )
-            if len(fresh) == len(robots):
+            if len(fresh) == len(by_name):
                 # An answer takes it back, and none is in before the first halt is submitted.
                 self._begun = (order.epoch, by_name)
             executor = self.executor
@@ -365,8 +365,10 @@ class SafetyPlane:
             reporter.begin(run)
             followed = True
             if self._reporter is not reporter:
-                halted()  # it may have ended before it took the run
-            self._repeat(order, [each for each in robots if each.robot_id not in by_id], on_report)
+                # It may have ended before it took the run.
+                self._begun = None
+                halted()
+            self._repeat(order, known, on_report)
             return run
         finally:
             if not followed:
@@ -381,27 +383,31 @@ class SafetyPlane:
         begun = self._begun
         return begun is not None and begun[0] == epoch and begun[1] is self._robots
 
-    def _engage(self, order: StopOrder, by_name: dict[str, Registered]) -> list[Registered]:
-        """Lock the robots; return those that have to be halted."""
+    def _engage(self, order: StopOrder, by_name: dict[str, Registered]) -> tuple[list[Registered], list[Registered]]:
+        """Lock the robots; return those to halt, and those that know the stop."""
         fresh: list[Registered] = []
+        known: list[Registered] = []
         listener = order.path == LISTENER
         if listener:
             self._begun = (order.epoch, by_name)
         for entry in by_name.values():
             if not listener and self.under_way(order.epoch):
-                break  # it came over another path meanwhile, and the e-stop listener's thread halts the rest
+                # It came over another path meanwhile: the e-stop listener's thread halts and reports the others.
+                return fresh, []
             if entry.engage(order):
                 note_motion(entry.robot)
                 for gate in entry.gates:
                     gate.revoke()
                 fresh.append(entry)
-        return fresh
+            else:
+                known.append(entry)
+        return fresh, known
 
     def emergency_stop(self, order: StopOrder, on_report: OnReport = lambda report: None) -> dict[str, RobotReport]:
         """Lock and halt every robot; return their answers by robot id.
 
         Returns within the halt deadline and the time the lockout file takes, whatever the robots do. A robot that
-        has seen this stop before answers as in :meth:`begin`.
+        has seen this stop before answers as in :meth:`begin`; of a stop that is under way there are no answers here.
         """
         answers: dict[str, RobotReport] = {}
 

@@ -30,7 +30,7 @@ PACE_S = 0.001
 """Seconds for each robot of a larger process until its lockouts are written.
 
 Its robots answer *stopped* after that time, and as much again by chance. Other processes of the machine still halt
-theirs meanwhile. Bad news waits for neither."""
+theirs meanwhile. Bad news waits for neither, but for the lockout file as any answer."""
 
 PACE_MAX_S = 0.1
 """The longest of these times; with the chance, an answer is held back for twice as long at most."""
@@ -64,12 +64,14 @@ class StopRun:
     done: threading.Event = field(default_factory=threading.Event)
     started: float = field(default_factory=time.monotonic)
     answers: dict[str, tuple[StopVerdict, float]] = field(default_factory=dict)
+    halting: set[str] = field(default_factory=set)
     keeping_since: float | None = None
     kept: bool | None = None
     keep_at: float = 0.0
     answer_at: float = 0.0
 
     def __post_init__(self) -> None:
+        self.halting.update(self.robot_ids)
         count = len(self.robot_ids)
         pace_s = min(PACE_S * count, PACE_MAX_S) if count > UNPACED else 0.0
         self.keep_at = self.started + pace_s
@@ -129,6 +131,10 @@ class Reporter:
 
     def answer(self, run: StopRun, robot_id: str, verdict: StopVerdict) -> None:
         """Record the verdict of a halt."""
+        run.halting.discard(robot_id)
+        if not run.halting:
+            # Here, because the reporting thread may be sending the answers to another stop.
+            run.on_halted()
         self._inbox.put(_Answer(run, robot_id, verdict, time.monotonic()))
 
     def close(self) -> None:
