@@ -6,6 +6,7 @@ import importlib.metadata
 import inspect
 import json
 import logging
+import threading
 
 import pytest
 from device_connect_edge import DeviceRuntime
@@ -225,6 +226,28 @@ def test_methods_collected_once_are_those_that_the_framework_finds():
     assert collected(Marked()) == collected(Plain())
     assert collected(Marked())[1:] == (["tick"], {"done": ["first"]}, ["_on_lost"])
     assert "invoke" in dir(Marked())
+
+
+class Meeting(Marked):
+    """A driver whose methods are looked for by another thread while they are looked for."""
+
+    met = False
+
+    def __getattribute__(self, name):
+        if name == "first" and not self.met:
+            self.met = True
+            other = threading.Thread(target=self._collect_routines)
+            other.start()
+            other.join(20)
+        return super().__getattribute__(name)
+
+
+def test_two_threads_look_for_the_methods_of_a_driver_at_once():
+    driver = Meeting()
+    driver._collect_internal_handlers()
+    assert driver.met
+    assert [each.__name__ for each in driver._internal_handlers["done"]] == ["first"]
+    assert sorted(driver._routines) == ["tick"]
 
 
 # Members that _compat.py calls, replaces, or whose way of working it relies upon.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import contextvars
 import functools
 import inspect
 import logging
@@ -73,25 +74,28 @@ def _marked(driver: Any, mark: str) -> tuple[str, ...]:
     return tuple(found)
 
 
+_MARK = contextvars.ContextVar("_MARK", default="")
+"""The mark that is looked for on this thread: a device's own stop and its runtime look at the same time."""
+
+
 class CollectedOnce(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
     """A driver whose decorated methods are found once for its class.
 
     The framework looks through all attributes of each device, once for each kind of method.
     """
 
-    _mark = ""
-
     def __dir__(self) -> Iterable[str]:
         kind: Any = type(self)
-        return _marked(kind, self._mark) if self._mark else super().__dir__()
+        mark = _MARK.get()
+        return _marked(kind, mark) if mark else super().__dir__()
 
     @contextlib.contextmanager
     def _only(self, mark: str) -> Iterator[None]:
-        self._mark = mark
+        before = _MARK.set(mark)
         try:
             yield
         finally:
-            del self._mark
+            _MARK.reset(before)
 
     def _collect_internal_handlers(self) -> None:
         with self._only("_is_internal_handler"):
