@@ -9,9 +9,11 @@ from enum import Enum
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from fixtures.devices import RANGES, BlindDevice, RecordingDevice
 
-from strands_robots.bus_access import action_ranges, bus_lock, joint_read_source, read_joints
+from strands_robots.bus_access import action_ranges, bus_lock, joint_read_source, read_joints, write_joints
+from strands_robots.hardware import DeviceBody
 
 
 class Wrapper:
@@ -136,3 +138,55 @@ def test_several_buses_of_one_device_are_each_read() -> None:
     assert read_joints(device) == {"pan.pos": 1.0, "wheel.pos": 2.0}
     device.observation_features = {**features, "speed": float}
     assert read_joints(device) == {"pan.pos": 5.0, "wheel.pos": 5.0, "speed": 7.0}, "the buses do not know the speed"
+
+
+def test_each_bus_that_has_a_target_is_written_to_also_after_one_that_fails() -> None:
+    written: list[dict[str, float]] = []
+
+    def failing(register: str, goals: dict[str, float]) -> None:
+        raise ConnectionError(f"no port for {goals}")
+
+    def taking(register: str, goals: dict[str, float]) -> None:
+        written.append(goals)
+
+    pair = Pair()
+    pair.left_arm.bus.sync_write, pair.right_arm.bus.sync_write = failing, taking
+    with pytest.raises(ConnectionError, match="no port"):
+        write_joints(pair, {"left_pan.pos": 1.0, "right_pan.pos": 2.0})
+    write_joints(pair, {"right_pan.pos": 3.0})
+    assert written == [{"pan": 2.0}, {"pan": 3.0}], "a bus without a target is not written to"
+
+
+def test_pair_of_which_one_arm_is_limp_freezes_the_other() -> None:
+    class Paired(Pair):
+        name, is_connected = "pair", True
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.written: list[dict[str, float]] = []
+            for arm in (self.left_arm, self.right_arm):
+                arm.bus.disable_torque = lambda motor: None
+                arm.bus.sync_write = self._write
+
+        def _write(self, register: str, goals: dict[str, float]) -> None:
+            next(iter(goals))  # as LeRobot does, which an empty one fails
+            self.written.append(goals)
+
+        @property
+        def action_features(self) -> dict[str, Any]:
+            return {key: kind for key, kind in self.observation_features.items() if kind is float}
+
+        def connect(self) -> None: ...
+
+        def disconnect(self) -> None: ...
+
+        def send_action(self, action: dict[str, float]) -> dict[str, float]:
+            for side in ("left_", "right_"):
+                goals = {key.removeprefix(side): goal for key, goal in action.items() if key.startswith(side)}
+                self._write("Goal_Position", goals)
+            return action
+
+    pair = Paired()
+    body = DeviceBody("pair", pair)
+    body.release(["left_pan", "left_lift", "left_grip"])
+    assert pair.written == [{"pan": 10.0, "lift": 10.0, "grip": 10.0}]

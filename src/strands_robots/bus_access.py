@@ -85,15 +85,25 @@ def write_joints(device: Any, targets: Mapping[str, float]) -> None:
     """Write joint targets without a read, by the motor buses of a LeRobot device.
 
     LeRobot's drivers read every joint before they write a bounded step (``max_relative_target``), and one silent motor
-    fails that for all. Other devices are sent an action. Raises what the device raises.
+    fails that for all. Other devices are sent an action. Raises what the device raises, of several buses once each of
+    them was written to.
     """
     buses = motor_buses(device)
     if not buses or not all(callable(getattr(bus, "sync_write", None)) for _, bus in buses):
         device.send_action(dict(targets))
         return
+    failed: Exception | None = None
     for prefix, bus in buses:
         names = {name: f"{prefix}{name}.pos" for name in bus.motors}
-        bus.sync_write("Goal_Position", {name: targets[key] for name, key in names.items() if key in targets})
+        goals = {name: targets[key] for name, key in names.items() if key in targets}
+        try:
+            # LeRobot cannot write to no motor.
+            if goals:
+                bus.sync_write("Goal_Position", goals)
+        except Exception as exc:  # noqa: BLE001 - a bus may raise anything; the others are written to first
+            failed = failed or exc
+    if failed is not None:
+        raise failed
 
 
 def action_ranges(device: Any) -> dict[str, tuple[float, float]]:

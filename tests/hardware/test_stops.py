@@ -357,3 +357,70 @@ def test_missed_observation_is_not_read_again_while_a_stop_waits() -> None:
         with pytest.raises(ConnectionError):
             body.get_observation()
         assert device.missed == 1
+
+
+class MobileArm:
+    """A base with an arm; like LeRobot's LeKiwi it reads the arm before it writes the wheels."""
+
+    is_connected = True
+    action_features = observation_features = dict.fromkeys(("pan.pos", "x.vel"), float)
+
+    def __init__(self) -> None:
+        self.silent = False
+        self.wheels = 0.0
+
+    def connect(self) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+    def get_observation(self) -> dict[str, float]:
+        if self.silent:
+            raise ConnectionError("no status packet")
+        return {"pan.pos": 1.0, "x.vel": self.wheels}
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        if "pan.pos" in action:
+            self.get_observation()
+        self.wheels = action.get("x.vel", self.wheels)
+        return action
+
+
+class Kiwi(MobileArm):
+    """One that cannot be sent an action for its wheels alone."""
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        self.get_observation()
+        return super().send_action({"pan.pos": action["pan.pos"], "x.vel": action["x.vel"]})
+
+    def stop_base(self) -> None:
+        self.wheels = 0.0
+
+
+@pytest.mark.parametrize("device", [MobileArm(), Kiwi()], ids=["sent zeros", "stop_base"])
+def test_silent_motor_of_an_arm_does_not_keep_its_base_rolling(device: MobileArm) -> None:
+    robot = HardwareRobot(device, "kiwi")
+    assert robot.send_action({"pan.pos": 1.0, "x.vel": 0.2})["status"] == "success"
+    assert device.wheels == 0.2
+    device.silent = True
+    assert robot.halt("test").stopped is not True
+    assert device.wheels == 0.0
+    device.silent = False
+    assert robot.halt("again").stopped is True
+    robot.cleanup()
+
+
+class SteppingDevice(RecordingDevice):
+    """Takes steps, and loses the answer to each."""
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        super().send_action({key: self.positions[key] + step for key, step in action.items()})
+        raise ConnectionError("no answer")
+
+
+def test_action_of_a_device_of_its_own_kind_is_sent_once() -> None:
+    device = SteppingDevice()
+    robot = HardwareRobot(device, "stepper")
+    robot.connect()
+    assert robot.send_action({"pan.pos": 5.0})["status"] == "error"
+    assert [write.action["pan.pos"] for write in device.writes] == [15.0]
+    robot.cleanup()

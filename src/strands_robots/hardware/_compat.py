@@ -93,6 +93,23 @@ def forget_input(device: Any) -> None:
         serial.reset_input_buffer()
 
 
+def stop_base(device: Any, still: Mapping[str, float]) -> None:
+    """Stop the wheels of a device that has joints as well, without a read.
+
+    LeRobot's LeKiwi reads its arm before it writes a bounded step (``max_relative_target``), and cannot write to the
+    wheels alone with ``send_action``.
+
+    Args:
+        device: the device; one without LeRobot's ``stop_base()`` is sent ``still``.
+        still: zero for every velocity.
+    """
+    own = getattr(device, "stop_base", None)
+    if callable(own):
+        own()
+    else:
+        device.send_action(dict(still))
+
+
 def drop(device: Any) -> None:
     """Close the port of a LeRobot device that is gone or silent, for another try.
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import inspect
+import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from typing import Any, TypeVar
 
 from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_joints, write_joints
-from strands_robots.hardware._compat import drop, forget_input, unplugged
+from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
 from strands_robots.hardware.calibration import answer_lost, write_to_servos
 from strands_robots.hardware.device_facts import require_port
 from strands_robots.hardware.speed import default_speeds
@@ -18,6 +20,8 @@ from strands_robots.policies.base import Action, checked_speeds, is_velocity, nu
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.stopping import StopLevel
 from strands_robots.utils import ValidationError, number, shown
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -65,6 +69,8 @@ class DeviceBody:
         if missing:
             raise ValidationError(f"device must have LeRobot's robot interface; {shown(device)} lacks {missing}.")
         self._torque = _torque_buses(device)
+        # Motors take targets, which may be sent again; of a device of its own kind an action may be a step.
+        self._send_tries = READ_TRIES if motor_buses(device) else 1
         if stop_level != "hold" and not self._torque:
             raise ValidationError(
                 f"stop_level (or STRANDS_ESTOP_TORQUE) must be hold: {shown(device)} has no bus.disable_torque()."
@@ -170,7 +176,7 @@ class DeviceBody:
             return self.device.send_action(dict(action))
 
         with self.lock:
-            sent = self._exchange(send)
+            sent = self._exchange(send, self._send_tries)
             told = sent if isinstance(sent, Mapping) else dict(action)
             self.targets |= numbers(told)
             return told
@@ -290,6 +296,8 @@ class DeviceBody:
         if len(still) == len(self.bounds):
             self.device.send_action(still)
             return
+        if still:
+            self._stop_base(still)
         age, known = self.latest_joints or (math.inf, {})
         try:
             present = self._joints(1)
@@ -300,9 +308,19 @@ class DeviceBody:
             present = self._joints(READ_TRIES, urgent=urgent)
         targets = still | self._targets(present)
         if targets:
-            self._exchange(lambda: self.device.send_action(targets), urgent=urgent)
+            # LeRobot cannot send an action to an arm of which no motor is in it.
+            write = partial(write_joints, self.device) if self._limp else self.device.send_action
+            self._exchange(lambda: write(targets), urgent=urgent)
         # A bus does not confirm targets; what it answers after them shows that it took them.
         self._joints(READ_TRIES, urgent=urgent)
+
+    def _stop_base(self, still: Mapping[str, float]) -> None:
+        """Stop the wheels before the arm is read, which one silent motor fails."""
+        try:
+            stop_base(self.device, still)
+        except Exception:
+            # The targets of the arm, which follow, stop the wheels too, or fail the hold.
+            logger.warning("%s did not stop its base alone.", self.name, exc_info=True)
 
     def _targets(self, present: Mapping[str, float]) -> dict[str, float]:
         """Return what freezes the robot; a motor without torque gets no target."""
