@@ -12,7 +12,7 @@ import pytest
 from fixtures.waiting import until
 
 from strands_robots.device_connect.backends import dispatch, jsonrpc
-from strands_robots.device_connect.backends.dispatch import EagerTasks
+from strands_robots.device_connect.backends.dispatch import start_now
 
 
 def command(method="move", rpc_id=1):
@@ -292,12 +292,8 @@ def at_once(work):
     started = asyncio.get_running_loop().create_future()
 
     def start():
-        try:
-            task = EagerTasks().start(work)
-        except ValueError as error:
-            started.set_exception(error)
-        else:
-            started.set_result((task, seen_at_start()))
+        task = start_now(work)
+        started.set_result((task, seen_at_start()))
 
     seen = []
 
@@ -315,58 +311,8 @@ async def test_work_that_does_not_wait_is_done_when_start_returns():
     started, seen = at_once(coroutine := work())
     task, at_start = await started
     assert at_start == ["done"]
-    assert task is None
+    assert await task is None
     assert coroutine.cr_frame is None
-
-
-async def test_work_that_does_not_wait_leaves_the_spare_task_to_the_next():
-    loop, tasks, gate, seen = asyncio.get_running_loop(), EagerTasks(), asyncio.Event(), []
-
-    async def work(name, *, waits):
-        assert asyncio.current_task() is not None
-        token = VARIABLE_OF_A_TASK.set(name)
-        if waits:
-            await gate.wait()
-        seen.append(VARIABLE_OF_A_TASK.get())
-        VARIABLE_OF_A_TASK.reset(token)
-
-    def start():
-        for number, waits in enumerate((False, True, False, True, False)):
-            started.append(tasks.start(work(f"{number}", waits=waits)))
-
-    started = []
-    loop.call_soon(start)
-    await until(lambda: len(started) == 5)
-    assert seen == ["0", "2", "4"]
-    assert [task is not None for task in started] == [False, True, False, True, False]
-    gate.set()
-    await asyncio.gather(started[1], started[3])
-    assert seen == ["0", "2", "4", "1", "3"]
-    for spare in tasks.close():
-        spare.cancel()
-
-
-async def test_work_that_cancels_its_task_in_its_first_step_harms_no_other():
-    loop, tasks, gate, seen = asyncio.get_running_loop(), EagerTasks(), asyncio.Event(), []
-
-    async def cancels_itself():
-        asyncio.current_task().cancel()
-
-    async def work():
-        await gate.wait()
-        seen.append("done")
-
-    def start():
-        with contextlib.suppress(asyncio.CancelledError):
-            tasks.start(cancels_itself())
-        started.append(tasks.start(work()))
-
-    started = []
-    loop.call_soon(start)
-    await until(lambda: started)
-    gate.set()
-    await started[0]
-    assert seen == ["done"]
 
 
 async def test_work_that_waits_continues_later():
@@ -420,8 +366,9 @@ async def test_exception_is_the_tasks_outcome(wait_first):
         raise ValueError("broken")
 
     started, _ = at_once(work())
+    task, _ = await started
     with pytest.raises(ValueError, match="broken"):
-        await (await started)[0]
+        await task
 
 
 @pytest.mark.parametrize("let_it_run", [False, True])
@@ -436,7 +383,7 @@ async def test_cancelled_task_cleans_up_and_cancels_its_future(let_it_run):
             seen.append("cleaned up")
 
     def start():
-        task = EagerTasks().start(work())
+        task = start_now(work())
         if let_it_run:
             loop.call_soon(loop.call_soon, task.cancel)
         else:
@@ -449,6 +396,40 @@ async def test_cancelled_task_cleans_up_and_cancels_its_future(let_it_run):
     await asyncio.wait({task})
     assert task.cancelled()
     assert inner.cancelled()
+
+
+async def test_command_that_cancels_itself_in_its_first_step_is_ended_by_close():
+    loop, seen = asyncio.get_running_loop(), []
+
+    async def serve(arrived, answer):
+        if arrived.method == "first":
+            seen.append("first")
+            return
+        asyncio.current_task().cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await loop.create_future()
+        seen.append("goes on")
+        try:
+            await loop.create_future()
+        finally:
+            seen.append("ended")
+
+    server = dispatch.CommandServer("arm-1.cmd", serve, lambda data: (data, None), print, call_soon)
+    server.receive(command("first"))
+    await until(lambda: seen == ["first"])
+    server.receive(command("second"))
+    await until(lambda: seen[1:] == ["goes on"])
+    await server.close()
+    assert seen == ["first", "goes on", "ended"]
+
+
+async def test_done_callback_runs_when_work_ends_in_its_first_step():
+    async def work():
+        asyncio.current_task().add_done_callback(lambda _: seen.append("called"))
+
+    started, seen = at_once(work())
+    await started
+    await until(lambda: seen == ["called"])
 
 
 async def test_context_variable_set_inside_stays_inside_and_lasts():
@@ -470,7 +451,7 @@ async def test_work_started_inside_a_task_begins_in_the_next_turn():
     async def work():
         seen.append(asyncio.current_task())
 
-    task = EagerTasks().start(work())
+    task = start_now(work())
     assert not seen
     await task
     assert seen == [task]

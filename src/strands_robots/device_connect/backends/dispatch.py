@@ -162,7 +162,6 @@ class CommandServer:
         self._answer = answer
         self._wake = partial(call_soon, self._drain)
         self._backlog = Backlog(self._wake, MAX_ARRIVED, MAX_WAITING_BYTES)
-        self._tasks = EagerTasks()
         self._running: set[asyncio.Future[None]] = set()
         self._sending: set[asyncio.Future[None]] = set()
         self._log = Throttled(logger)
@@ -189,7 +188,9 @@ class CommandServer:
                     if reply is not None:
                         self._send(reply, command.encoded())
                     continue
-                self._start(command, reply)
+                task = start_now(self._serve(command, None if reply is None else partial(self._answer, reply)))
+                self._running.add(task)
+                task.add_done_callback(partial(self._finished, command, reply))
             except Exception:
                 # The commands behind this one must still be served.
                 logger.exception("a message on %s was lost", self._subject)
@@ -198,8 +199,7 @@ class CommandServer:
     async def close(self) -> None:
         """Cancel what runs and wait for it; commands that still wait are dropped."""
         self._closed = True
-        running = {*self._running, *self._sending, *self._tasks.close()}
-        tasks = [task for task in running if task is not asyncio.current_task()]
+        tasks = [task for task in self._running | self._sending if task is not asyncio.current_task()]
         for task in tasks:
             task.cancel()
         if tasks:
@@ -214,29 +214,14 @@ class CommandServer:
             return command
         return jsonrpc.Refusal(jsonrpc.BUSY, f"busy: {running} commands are running", command.id)
 
-    def _start(self, command: jsonrpc.RpcRequest, reply: Any) -> None:
-        try:
-            task = self._tasks.start(self._serve(command, None if reply is None else partial(self._answer, reply)))
-        except asyncio.CancelledError:
-            return
-        except Exception as problem:  # noqa: BLE001 - reported, and answered
-            self._failed(command, reply, problem)
-            return
-        if task is not None:
-            self._running.add(task)
-            task.add_done_callback(partial(self._finished, command, reply))
-
     def _finished(self, command: jsonrpc.RpcRequest, reply: Any, task: asyncio.Future[None]) -> None:
         self._running.discard(task)
         problem = None if task.cancelled() else task.exception()
         if problem is not None:
-            self._failed(command, reply, problem)
-
-    def _failed(self, command: jsonrpc.RpcRequest, reply: Any, problem: BaseException) -> None:
-        # ``serve`` answers its own failures; any other one must still not leave a caller waiting.
-        logger.error("the handler of %s failed", self._subject, exc_info=problem)
-        if reply is not None:
-            self._send(reply, _failure(command, problem))
+            # ``serve`` answers its own failures; any other one must still not leave a caller waiting.
+            logger.error("the handler of %s failed", self._subject, exc_info=problem)
+            if reply is not None:
+                self._send(reply, _failure(command, problem))
 
     def _send(self, reply: Any, data: bytes) -> None:
         sending = self._answer(reply, data)
@@ -400,91 +385,59 @@ async def on_a_thread(function: Callable[[], Any], undo: Callable[[Any], None] |
     return await future
 
 
-class EagerTasks:
-    """Starts tasks whose first step runs at once.
+def start_now(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    """Start a task whose first step runs at once instead of in the loop's next turn.
 
-    Any other task begins in the loop's next turn. Work that is done in its first step needs no task of its own. Python
-    3.12 has this built in; below, a spare task waits to take over the first work that is not done.
+    Inside another task it begins in the next turn, as any task does.
     """
-
-    def __init__(self) -> None:
-        self._spare: tuple[asyncio.Task[None], _TakenOver] | None = None
-
-    def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
-        """Return the task of ``work``, None where it is done.
-
-        Inside another task it begins in the next turn, as any task does.
-
-        Raises:
-            BaseException: what the first step raised.
-        """
-        loop = asyncio.get_running_loop()
-        if asyncio.current_task(loop) is not None:
-            return loop.create_task(work)
-        if sys.version_info >= (3, 12):
-            task = asyncio.Task(work, loop=loop, eager_start=True)
-            return task.result() if task.done() else task
-        task, taken_over = self._spare_task(loop)
-        context = contextvars.copy_context()
-        _enter_task(loop, task)
-        try:
-            waits_for = context.run(work.send, None)
-        except StopIteration:
-            return None
-        finally:
-            _leave_task(loop, task)
-        self._spare = None
-        taken_over.take(work, context, waits_for)
-        return task
-
-    def close(self) -> list[asyncio.Task[None]]:
-        """Return the spare task, to be cancelled, if there is one."""
-        spare, self._spare = self._spare, None
-        return [] if spare is None else [spare[0]]
-
-    def _spare_task(self, loop: asyncio.AbstractEventLoop) -> tuple[asyncio.Task[None], _TakenOver]:
-        # Work may have cancelled the task that it ran in.
-        if self._spare is None or self._spare[0].done() or self._spare[0].cancelling():
-            taken_over = _TakenOver(loop)
-            self._spare = loop.create_task(taken_over), taken_over
-        return self._spare
+    loop = asyncio.get_running_loop()
+    if asyncio.current_task(loop) is not None:
+        return loop.create_task(work)
+    if sys.version_info >= (3, 12):
+        return asyncio.Task(work, loop=loop, eager_start=True)
+    context = contextvars.copy_context()
+    started = _Started(work)
+    task = loop.create_task(started, context=context)
+    _enter_task(loop, task)
+    try:
+        started.first = context.run(work.send, None), None
+    except BaseException as end:  # noqa: BLE001 - raised again where the task takes this step
+        started.first = None, end
+    finally:
+        _leave_task(loop, task)
+    return task
 
 
-class _TakenOver(Coroutine[Any, Any, None]):
-    """Coroutine of a spare task; goes on with work that took its first step."""
+class _Started(Coroutine[Any, Any, None]):
+    """A coroutine that took its first step, and replays its outcome to the task."""
 
-    __slots__ = ("_context", "_first", "_taken", "_work")
+    __slots__ = ("_work", "first")
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._taken: asyncio.Future[None] = loop.create_future()
-        self._work: Coroutine[Any, Any, None] | None = None
-        self._context = contextvars.Context()
-        self._first: list[Any] = []
-
-    def take(self, work: Coroutine[Any, Any, None], context: contextvars.Context, waits_for: Any) -> None:
-        """Go on with ``work``, which runs in ``context`` and waits for ``waits_for``."""
-        self._work, self._context, self._first = work, context, [waits_for]
-        self._taken.set_result(None)
+    def __init__(self, work: Coroutine[Any, Any, None]) -> None:
+        self._work = work
+        self.first: tuple[Any, BaseException | None] | None = None
 
     def send(self, value: Any, /) -> Any:
-        """Wait for work, give what its first step waits for, then go on."""
-        if self._work is None:
-            return next(self._taken.__await__())
-        return self._first.pop() if self._first else self._context.run(self._work.send, value)
+        """Give the outcome of the first step, then take the next ones."""
+        if self.first is None:
+            return self._work.send(value)
+        (waits_for, end), self.first = self.first, None
+        if end is not None:
+            raise end
+        return waits_for
 
     def throw(self, *error: Any) -> Any:
-        """Raise inside the work, and cancel the future that it waits for."""
-        if self._work is None:
-            raise error[0]
-        waits_for = self._first.pop() if self._first else None
+        """Raise inside the coroutine, and cancel the future that it waits for."""
+        (waits_for, end), self.first = self.first or (None, None), None
+        if end is not None:
+            raise end
         if isinstance(waits_for, asyncio.Future):
             waits_for.cancel()
-        return self._context.run(self._work.throw, *error)
+        return self._work.throw(*error)
 
     def close(self) -> None:
-        """End the work at its present step."""
-        if self._work is not None:
-            self._work.close()
+        """End the coroutine at its present step."""
+        self._work.close()
 
     def __await__(self) -> Generator[Any, Any, None]:
         raise TypeError("only a task drives this")
