@@ -12,6 +12,7 @@ import secrets
 import sys
 import threading
 import time
+from collections import Counter
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
@@ -87,6 +88,10 @@ class Host:
 
 _hosts: dict[Runtime, Host] = {}
 _REGISTRATIONS = Share(running=1000)
+
+# Devices of this process by id, from before their bring-up until they have left; two tenants may use one id.
+_named: Counter[str] = Counter()
+_naming = threading.Lock()
 
 
 async def init_device_connect(  # noqa: PLR0917 - the documented signature
@@ -450,24 +455,31 @@ class _LastWarning(logging.Handler):
 
 def _framework_warnings(name: str) -> _LastWarning:
     """Attach a handler to the runtime's logger, which would else write to stderr."""
-    framework = logging.getLogger(RUNTIME_LOGGER + name)
-    for handler in framework.handlers:
-        if isinstance(handler, _LastWarning):
-            return handler
-    last = _LastWarning()
-    framework.addHandler(last)
-    return last
+    with _naming:
+        _named[name] += 1
+        framework = logging.getLogger(RUNTIME_LOGGER + name)
+        for handler in framework.handlers:
+            if isinstance(handler, _LastWarning):
+                return handler
+        last = _LastWarning()
+        framework.addHandler(last)
+        return last
 
 
 def _forget_warnings(name: str) -> None:
     """Drop the runtime's logger, which Python keeps for every id that there ever was.
 
-    One that the application has set up stays.
+    It stays while another device of this process has the id, and where the application has set it up.
     """
-    framework = logging.getLogger(RUNTIME_LOGGER + name)
-    ours = all(isinstance(each, _LastWarning) for each in framework.handlers)
-    if ours and not framework.filters and framework.level == logging.NOTSET:
-        framework.manager.loggerDict.pop(framework.name, None)
+    with _naming:
+        _named[name] -= 1
+        if _named[name]:
+            return
+        del _named[name]
+        framework = logging.getLogger(RUNTIME_LOGGER + name)
+        ours = all(isinstance(each, _LastWarning) for each in framework.handlers)
+        if ours and not framework.filters and framework.level == logging.NOTSET:
+            framework.manager.loggerDict.pop(framework.name, None)
 
 
 def _depart_at_exit() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import queue
 import signal
 import socket
 import subprocess
@@ -12,6 +14,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from enum import Enum
+from logging.handlers import QueueHandler
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,6 +39,7 @@ from strands_robots.device_connect import (
     loopback_config,
     stop_device_connect,
 )
+from strands_robots.device_connect.client import CallRefusedError
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
@@ -176,6 +180,32 @@ def test_second_device_of_an_id_refuses_to_go_live(link: LinkConfig, world: ToyW
         assert fleet.call("arm-1", "getStatus")["status"] == "success"
     stop_device_connect(runtime)
     stop_device_connect(init_device_connect_sync(world, peer_id="arm-1", link=link))
+
+
+def test_warnings_of_a_device_reach_its_logger_after_others_of_its_id_have_left(link: LinkConfig) -> None:
+    class Lamp(DeviceDriver):  # type: ignore[misc]
+        device_type = "lamp"
+
+        @rpc()
+        async def shine(self) -> dict[str, Any]:
+            """Shine."""
+            raise OSError("burnt out")
+
+    name, warnings = f"{bringup.RUNTIME_LOGGER}arm-1", queue.SimpleQueue[logging.LogRecord]()
+    runtime = init_device_connect_sync(Lamp(), peer_id="arm-1", link=link)
+    with pytest.raises(DuplicateDeviceError, match="arm-1"):
+        init_device_connect_sync(Lamp(), peer_id="arm-1", link=link)
+    stop_device_connect(init_device_connect_sync(Lamp(), peer_id="arm-1", link=replace(link, tenant="b")))
+    handler = QueueHandler(warnings)
+    logging.getLogger(name).addHandler(handler)
+    try:
+        with FleetClient(link) as fleet, pytest.raises(CallRefusedError, match="burnt out"):
+            fleet.call("arm-1", "shine")
+        assert "burnt out" in warnings.get(timeout=20).getMessage()
+    finally:
+        logging.getLogger(name).removeHandler(handler)
+        stop_device_connect(runtime)
+    assert name not in logging.root.manager.loggerDict
 
 
 def test_second_device_of_an_id_refuses_on_nats_and_in_another_process(nats: NatsServer, world: ToyWorld) -> None:
