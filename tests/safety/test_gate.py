@@ -181,6 +181,23 @@ def test_a_motion_is_not_renewed_over_a_halt_or_a_lock() -> None:
         gate.renew(permit)
 
 
+def test_a_refused_renewal_builds_its_answer_after_it_has_let_go_of_the_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gate, held = MotionGate(), []
+    permit = gate.permit("reset")
+    gate.revoke()
+
+    def answer(reason: str) -> Envelope:
+        held.append(gate._counting.locked())
+        return error(reason)
+
+    monkeypatch.setattr(module, "error", answer)
+    with pytest.raises(MotionRefused, match="halted after it was asked for"):
+        gate.renew(permit)
+    assert held == [False]
+
+
 def revoked(gate: MotionGate, permit: Permit) -> Permit:
     """Revoke, as a halt does; return the permit of that halt's settling."""
     return gate.settling(gate.revoke())

@@ -3,7 +3,8 @@
 Every motion source (a rollout, a teleoperation session, a single ``send_action``) asks :meth:`MotionGate.permit`
 before it moves and looks at :attr:`Permit.valid` under the same lock as each write to the device. A halt calls
 :meth:`MotionGate.revoke` first and then waits for the write that may be in flight, so that after its verdict no
-action reaches the device. Revoking counts up by one, under a lock that nothing else is done under.
+action reaches the device. Revoking counts up by one; a renewal compares before it counts. Their lock is held for
+nothing else.
 """
 
 from __future__ import annotations
@@ -255,10 +256,11 @@ class MotionGate:
         Raises :class:`MotionRefused` where another caller has halted or locked the robot since ``permit`` was given.
         """
         with self._counting:
-            permit.check()
-            self._generation += 1
+            valid = permit.valid
+            if valid:
+                self._generation += 1
             asked = Asked(self._generation)
-        refusal = self._refusal(permit.verb, asked)
+        refusal = self._refusal(permit.verb, asked) if valid else error(_LATE.format(permit.verb))
         if refusal is not None:
             raise MotionRefused(refusal)
         return Permit(self, asked, permit.verb)
