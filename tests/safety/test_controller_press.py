@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.estop_orders import order_of
 
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import PRESSES_MAX, SafetyController
@@ -55,7 +56,7 @@ def test_every_sending_has_the_id_and_the_press_of_the_first_and_a_time_of_its_o
     assert times == sorted(set(times))
     assert len({each["nonce"] for each in link.params}) == 4
     for payload in link.sent:
-        order = rules.order_of("safety-1", payload)
+        order = order_of(rules, "safety-1", payload)
         assert isinstance(order, StopOrder)
         assert order.pressed == link.params[0]["pressed_at"]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.estop_orders import order_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -29,7 +30,7 @@ def counted(answer: StopOrder | StopRefused) -> StopOrder:
 
 def test_a_stop_brings_its_epoch_reason_and_time() -> None:
     epoch = new_epoch()
-    order = counted(OPEN.order_of("safety-1", event(estop_id=epoch, reason="smoke", t=12.5)))
+    order = counted(order_of(OPEN, "safety-1", event(estop_id=epoch, reason="smoke", t=12.5)))
     assert (order.epoch, order.source, order.reason, order.issued) == (epoch, "safety-1", "smoke", 12.5)
     assert order.remote
     assert order.path == "lane"
@@ -37,10 +38,10 @@ def test_a_stop_brings_its_epoch_reason_and_time() -> None:
 
 def test_one_stop_by_two_paths_has_one_epoch() -> None:
     params = {"reason": "smoke", "event_id": "e-1"}
-    listener, runtime = OPEN.order_of("s", event(**params)), OPEN.order("s", params, "runtime")
+    listener, runtime = order_of(OPEN, "s", event(**params)), OPEN.order("s", params, "runtime")
     assert counted(listener).epoch == counted(runtime).epoch
     bare = {"reason": "smoke"}
-    listener, runtime = OPEN.order_of("s", event(**bare)), OPEN.order("s", bare, "runtime")
+    listener, runtime = order_of(OPEN, "s", event(**bare)), OPEN.order("s", bare, "runtime")
     assert counted(listener).epoch == counted(runtime).epoch
 
 
@@ -61,14 +62,14 @@ def test_one_stop_by_two_paths_has_one_epoch() -> None:
     ],
 )
 def test_no_shape_and_no_size_keeps_a_stop_from_counting(payload: bytes) -> None:
-    order = counted(OPEN.order_of("safety-1", payload))
+    order = counted(order_of(OPEN, "safety-1", payload))
     assert len(order.epoch) == 32
-    assert order == counted(OPEN.order_of("safety-1", payload, received=order.received))
+    assert order == counted(order_of(OPEN, "safety-1", payload, received=order.received))
 
 
 @given(st.binary(max_size=300))
 def test_whatever_the_bytes_a_source_that_may_stop_stops(payload: bytes) -> None:
-    assert isinstance(OPEN.order_of("safety-1", payload), StopOrder)
+    assert isinstance(order_of(OPEN, "safety-1", payload), StopOrder)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +85,7 @@ def test_whatever_the_bytes_a_source_that_may_stop_stops(payload: bytes) -> None
     ],
 )
 def test_the_allowlist_decides_by_name(allow: tuple[str, ...], source: str, may: bool) -> None:
-    assert isinstance(StopRules(allow=allow, keys=()).order_of(source, event()), StopOrder) is may
+    assert isinstance(order_of(StopRules(allow=allow, keys=()), source, event()), StopOrder) is may
 
 
 class Signer:
@@ -104,8 +105,8 @@ def test_with_keys_only_a_signed_stop_counts() -> None:
     signer = Signer()
     rules = StopRules(allow=(), keys=(Signer().public, signer.public))
     assert rules.signed
-    assert isinstance(rules.order_of("safety-1", event(**signer.params())), StopOrder)
-    assert isinstance(rules.order_of("safety-1", event(estop_id=new_epoch())), StopRefused)
+    assert isinstance(order_of(rules, "safety-1", event(**signer.params())), StopOrder)
+    assert isinstance(order_of(rules, "safety-1", event(estop_id=new_epoch())), StopRefused)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +145,7 @@ def test_a_check_in_that_was_recorded_is_no_emergency_stop() -> None:
     recorded = signer.params(purpose=Purpose.CHECK_IN)
     assert rules.signature_refusal("safety-1", recorded, Purpose.CHECK_IN) is None
     for renamed in (recorded, {**recorded, "purpose": "emergency-stop"}):
-        refused = rules.order_of("safety-1", event(**renamed))
+        refused = order_of(rules, "safety-1", event(**renamed))
         assert isinstance(refused, StopRefused)
         assert "emergency-stop" in refused.why
 
@@ -189,15 +190,15 @@ def test_clocks_are_compared_by_the_messages_of_a_source_that_counts() -> None:
     now = 1000.0
     rules = StopRules(allow=(), keys=(), clock=lambda: now)
     rules.compare_clock("safety-1", {"t": 970.0}, time.monotonic())
-    order = counted(rules.order_of("safety-1", event(estop_id=new_epoch(), t=969.0, pressed_at=968.5)))
+    order = counted(order_of(rules, "safety-1", event(estop_id=new_epoch(), t=969.0, pressed_at=968.5)))
     assert order.clock_ahead_s == pytest.approx(30.0, abs=0.1)
     assert order.delay_s(order.received_at) == pytest.approx(1.5, abs=0.1)
-    assert counted(rules.order_of("safety-2", event(t=969.0))).clock_ahead_s is None
+    assert counted(order_of(rules, "safety-2", event(t=969.0))).clock_ahead_s is None
 
 
 def test_a_mistyped_key_leaves_the_fleet_stoppable_and_says_so(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("DEVICE_CONNECT_ESTOP_PUBLIC_KEYS", "oops")
-    assert isinstance(StopRules().order_of("safety-1", event()), StopOrder)
+    assert isinstance(order_of(StopRules(), "safety-1", event()), StopOrder)
     assert "oops" in caplog.text

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.estop_orders import order_of
 from fixtures.recording_robot import RecordingRobot
 from fixtures.waiting import eventually
 
@@ -151,7 +152,7 @@ def test_answers_in_600_invented_names_keep_no_repetition_from_being_read(letter
     assert controller.stop(["arm-1", "arm-2", "arm-3"], "\N{ROBOT FACE}" * 200, deadline_s=20).ok
     assert len(link.sent) >= 3
     for number, payload in enumerate(link.payloads):
-        read = rules.order_of("safety-1", payload)
+        read = order_of(rules, "safety-1", payload)
         assert isinstance(read, StopOrder)
         assert read.epoch == link.sent[0]["estop_id"]
         assert read.answered >= {"arm-1", "arm-2"} or number < 2

@@ -21,7 +21,7 @@ from strands_robots.audit import audit_head, log_safety_event, own_log_id
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.safety.orders import RobotReport, StopOrder, StopRefused, StopRules, params_of
+from strands_robots.safety.orders import LISTENER, RobotReport, StopOrder, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.turns import shorten_turns
@@ -483,7 +483,7 @@ class EstopListener:
                 params = params_of(received.payload)
                 if self._plane.under_way(params.get("estop_id")):
                     continue
-                order = self._rules.order_of(received.source, received.payload, received.at, params)
+                order = self._rules.order(received.source, params, LISTENER, received.payload, received.at)
                 if isinstance(order, StopRefused):
                     self._refusals.record(order, received.event)
                     if not events.vouched_for(received.source):

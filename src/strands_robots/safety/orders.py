@@ -263,16 +263,6 @@ class StopRules:
     def _may_stop(self, source: str) -> bool:
         return caller_name(source) is not None and (not self._allow or self._fits(source) is not None)
 
-    def order_of(
-        self,
-        source: str,
-        payload: bytes,
-        received: float | None = None,
-        params: Mapping[str, Any] | None = None,
-    ) -> StopOrder | StopRefused:
-        """Decide on the bytes of an ``emergencyStop``; ``params`` if read already."""
-        return self.order(source, params_of(payload) if params is None else params, LISTENER, payload, received)
-
     def order(
         self,
         source: str,
@@ -281,7 +271,10 @@ class StopRules:
         raw: bytes | None = None,
         received: float | None = None,
     ) -> StopOrder | StopRefused:
-        """Decide on the parameters of an ``emergencyStop``; ``raw`` may identify it."""
+        """Decide on the parameters of an ``emergencyStop``.
+
+        ``raw`` are the bytes that they were read from; they identify a message without parameters.
+        """
         why = self.source_refusal(source) or self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
         if why is not None:
             return StopRefused(source, why)
