@@ -117,10 +117,30 @@ def test_buffers_of_a_model_do_not_limit_the_world(world: Simulation, file: Path
     assert height_of_the_cube(world) == pytest.approx(0.02, abs=0.002)
 
 
-def test_floor_of_a_model_carries_a_cube_like_ours(world: Simulation, file: Path) -> None:
-    soft = '<geom type="plane" size="1 1 1" priority="9" solref="-1 -1" margin="0.1"/>'
-    file.write_text(mjcf(f"<worldbody>{soft}</worldbody>"))
+@pytest.mark.parametrize(
+    "own",
+    [
+        'priority="9" solref="-1 -1" margin="0.1"',
+        'friction="1 9 9"',
+        'friction="9 9 9" condim="6"',
+        'pos="0 0 -1"',
+        'pos="0 0 0.5"',
+    ],
+)
+def test_floor_of_a_model_carries_a_cube_like_ours(world: Simulation, file: Path, own: str) -> None:
+    file.write_text(mjcf(f'<worldbody><geom type="plane" size="1 1 1" {own}/></worldbody>'))
     world.add_robot("rod", file)
+    world.step(1000)
+    assert height_of_the_cube(world) == pytest.approx(0.02, abs=0.002)
+    model = world.physics.stage.model
+    (floor,) = (geom for geom in range(model.ngeom) if model.geom_type[geom] == 0 and model.geom_contype[geom])
+    assert model.geom_friction[floor] == pytest.approx([1, 0.005, 0.0001])
+    assert model.geom_condim[floor] == 3
+
+
+def test_floor_of_a_model_that_is_placed_higher_lifts_nothing(world: Simulation, file: Path) -> None:
+    file.write_text(mjcf('<worldbody><geom type="plane" size="1 1 1"/></worldbody>'))
+    world.add_robot("rod", file, position=(0, 0, 0.2))
     world.step(1000)
     assert height_of_the_cube(world) == pytest.approx(0.02, abs=0.002)
 

@@ -33,6 +33,9 @@ _EXACTNESS = (
 )
 """Options of the solver of which the larger value is the more exact one."""
 
+_LEVEL_M = 1e-6
+"""Greatest height of a model's floor that is the floor of the world."""
+
 _BUFFERS = ("memory", "njmax", "nconmax", "nstack")
 """Sizes of buffers: what is enough for a model alone is not beside others."""
 
@@ -53,7 +56,10 @@ def load_fitted(robot: RobotPlan, plan: Plan) -> Any:
     except ValidationError as exc:
         raise ValidationError(f"model {shown(robot.source.label)} cannot share a world: {exc}") from exc
     for geom in filter(is_floor, child.worldbody.geoms):
-        _make_common(geom)
+        if abs(robot.position[2] + float(geom.pos[2])) < _LEVEL_M:
+            _make_common(geom)
+        else:
+            _make_scenery(geom)
     return child
 
 
@@ -191,5 +197,14 @@ def _without_gravity(child: Any) -> None:
 def _make_common(floor: Any) -> None:
     """Give a floor, on which everything stands, the usual contact parameters."""
     usual = mujoco.MjSpec().worldbody.add_geom()
-    for name in ("priority", "solmix", "solref", "solimp", "margin", "gap"):
+    for name in ("priority", "solmix", "solref", "solimp", "margin", "gap", "friction", "condim"):
         setattr(floor, name, getattr(usual, name))
+
+
+def _make_scenery(floor: Any) -> None:
+    """Take a floor that is not at the world's height out of contacts and pictures.
+
+    It is not deleted, for pairs and sensors of the model may name it.
+    """
+    floor.contype = floor.conaffinity = 0
+    floor.rgba = [0, 0, 0, 0]
