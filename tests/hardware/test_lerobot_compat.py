@@ -5,11 +5,14 @@ from __future__ import annotations
 import importlib.machinery
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from strands_robots.hardware import _compat
+from strands_robots.hardware import _compat, lerobot_device
+from strands_robots.hardware.lerobot_device import make_device
 
 STANDINS = ("torch", "accelerate", "datasets", "datasets.utils.logging")
 DRIVER = """
@@ -68,3 +71,19 @@ def test_where_torch_is_installed_nothing_stands_in(packages: Path) -> None:
 def test_a_device_without_a_serial_port_is_never_unplugged() -> None:
     assert not _compat.unplugged(object())
     _compat.drop(object())
+
+
+def test_lerobot_repeats_no_read_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass
+    class Config:
+        """A configuration as LeRobot has them from 0.6 on."""
+
+        id: str | None = None
+        num_read_retries: int = 2
+
+    registry = SimpleNamespace(get_known_choices=lambda: {"arm_follower": Config})
+    devices = SimpleNamespace(__path__=[], __name__="robots", RobotConfig=registry)
+    devices.make_robot_from_config = lambda config: SimpleNamespace(config=config)
+    monkeypatch.setattr(lerobot_device, "lerobot_module", lambda name: devices)
+    assert make_device("arm", {}, calibrated=False).config.num_read_retries == 0
+    assert make_device("arm", {"num_read_retries": 1}, calibrated=False).config.num_read_retries == 1

@@ -182,6 +182,7 @@ def test_an_answer_with_any_byte_changed_is_read_or_refused(make: Make) -> None:
         ([{"single_arm": numpy.array([[[None, 1]]]), "gripper": numpy.zeros((1, 1, 1))}, {}], "unreadable answer"),
         (in_place_of_an_array(archive()), "unreadable answer"),
         (in_place_of_an_array(stating((10**12,))), "unreadable answer"),
+        (in_place_of_an_array(stating((1, -1, 2)) + bytes(32)), "of the shape"),
         (in_place_of_an_array(b"\x93NUMPY\x01\x00\x20\x03" + 800 * b"("), "unreadable answer"),
         (in_place_of_an_array(7), "unreadable answer"),
     ],

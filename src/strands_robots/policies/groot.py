@@ -273,4 +273,6 @@ def _array(file: Any) -> Any:
         raise ValidationError(f"an array whose header cannot be read: {exc}") from exc
     if dtype.kind not in _KINDS:
         raise ValidationError(f"an array of the kind {dtype.kind}")
+    if any(length < 0 for length in shape):
+        raise ValidationError(f"an array of the shape {shape}")
     return numpy.frombuffer(file, dtype, offset=reader.tell()).reshape(shape, order="F" if fortran else "C")

@@ -1,8 +1,8 @@
 """End of a process in which a policy still computes.
 
 While the interpreter shuts down, Python ends every thread that comes back to it from native code. glibc does that by
-unwinding the native code, which torch's does not allow: the process would abort. So the end waits for what is being
-computed; what hangs is named on stderr, and its thread never comes back.
+unwinding the native code, which torch's does not allow: the process would abort. So where torch is loaded the end waits
+for what is being computed. What still runs is named on stderr, and its thread never comes back.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ending = threading.Event()
 def computing(what: str) -> Iterator[None]:
     """Note native code that runs on a daemon thread.
 
-    None begins once the process ends.
+    No computation starts once the process ends.
 
     Args:
         what: its name in the message about one that hangs.
@@ -57,7 +57,7 @@ def name_unfinished() -> bool:
 @atexit.register
 def _end() -> None:
     _ending.set()
-    deadline = time.monotonic() + ENDING_S
+    deadline = time.monotonic() + (ENDING_S if "torch" in sys.modules else 0.0)
     while _running and time.monotonic() < deadline:
         time.sleep(_POLL_S)
     if name_unfinished() and "torch" in sys.modules and platform.libc_ver()[0] == "glibc":

@@ -236,10 +236,6 @@ def test_a_lost_answer_now_and_then_does_not_end_a_rollout(
     assert robot.get_task_status()["task_status"] == "completed", robot.get_task_status()
 
 
-def test_lerobot_repeats_no_read_by_itself(arm: Arm) -> None:
-    assert getattr(arm().device.config, "num_read_retries", 0) == 0
-
-
 def test_an_answer_that_comes_too_late_is_not_taken_for_the_next(arm: Arm, bus: FeetechBus) -> None:
     robot = arm()
     bus.latency_s = 0.5
