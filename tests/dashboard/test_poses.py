@@ -181,6 +181,44 @@ def test_process_that_dies_is_said_and_takes_nothing_along(arm: HardwareRobot) -
     assert "ended" in refused(ArmFeed(arm), sys.executable, "-c", "pass")
 
 
+def test_process_that_cannot_start_is_said(arm: HardwareRobot) -> None:
+    assert "cannot start" in refused(ArmFeed(arm), "/nothing/is/here")
+
+
+POSED = success("here", model="so101", joints={}, gripper=0.5)
+
+
+def test_close_ends_a_process_that_is_stuck_and_starts_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(poses, "PROGRAM", (sys.executable, "-c", "import sys; sys.stdin.read()"))
+    monkeypatch.setattr(poses, "DRAW_S", 3600.0)
+
+    async def looked() -> list[Any]:
+        pictures, feed = Poses(), PageFeed()
+        feed.answers["getPose"] = [POSED]
+        both = [asyncio.create_task(pictures.picture(feed, name)) for name in ("arm-1", "arm-2")]
+        await asyncio.to_thread(eventually, lambda: pictures._process is not None, 60.0, what="the process")
+        pictures.close()
+        answers = await asyncio.wait_for(asyncio.gather(*both), 60.0)
+        await asyncio.to_thread(eventually, lambda: ended(pictures), 60.0, what="the end of the process")
+        pictures.close()
+        return [*answers, await pictures.picture(feed, "arm-1")]
+
+    assert [answer["status"] for answer in asyncio.run(looked())] == ["error"] * 3
+
+
+def test_robot_that_answers_after_the_close_is_not_drawn() -> None:
+    async def looked() -> Any:
+        pictures, feed = Poses(), PageFeed()
+        feed.answers["getPose"], feed.slow["getPose"] = [POSED], asyncio.Event()
+        waiting = asyncio.create_task(pictures.picture(feed, "arm-1"))
+        await asyncio.to_thread(eventually, lambda: feed.calls, 60.0, what="the question")
+        pictures.close()
+        feed.slow["getPose"].set()
+        return await waiting
+
+    assert asyncio.run(looked())["reason"] == poses.CLOSED
+
+
 def test_robot_without_a_model_says_why() -> None:
     feed = PageFeed()
     feed.answers["getPose"] = [error("no model of reachy is known; give model, an MJCF file of the arm.")]
@@ -193,7 +231,7 @@ def test_robot_without_a_model_says_why() -> None:
         ({"joints": {}}, "model must be one of so100, so101"),
         ({"model": "../../etc/passwd", "joints": {}}, "model must be one of so100, so101"),
         ({"model": "so101", "joints": 7}, "joints must be an object"),
-        ({"model": "so101", "joints": {"shoulder_pan": 1.0}}, "does not tell its joint shoulder_lift"),
+        ({"model": "so101", "joints": {"shoulder_pan": 1.0}}, "does not report its joint shoulder_lift"),
         ({"model": "so101", "joints": dict.fromkeys(MOTORS, math.nan)}, "shoulder_pan must be a finite number"),
         ({"model": "so101", "joints": dict.fromkeys(MOTORS, True)}, "shoulder_pan must be a finite number"),
         ({"model": "so101", "joints": dict.fromkeys(MOTORS, 0.0), "gripper": "open"}, "gripper must be"),

@@ -54,7 +54,7 @@ class PosePainter:
         found = {}
         for joint in self._chain.joints:
             if joint.name not in told:
-                raise ValidationError(f"The robot does not tell its joint {joint.name}.")
+                raise ValidationError(f"The robot does not report its joint {joint.name}.")
             found[joint.name] = math.radians(number(joint.name, told[joint.name], low=-7200, high=7200))
         jaw = self._chain.gripper
         if jaw is not None and gripper is not None:

@@ -22,6 +22,8 @@ DRAW_S = 60.0
 IDLE_S = 20.0
 """Seconds without a picture after which the process that draws ends."""
 
+CLOSED = "The page's server ends."
+
 PROGRAM = (sys.executable, "-m", "strands_robots.dashboard.pose_process")
 
 
@@ -31,6 +33,7 @@ class Poses:
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="dashboard-poses")
         self._process: subprocess.Popen[str] | None = None
+        self._closed, self._starting = False, threading.Lock()
         self._idle: asyncio.TimerHandle | None = None
 
     async def picture(self, feed: FleetFeed, robot: str) -> Envelope:
@@ -38,19 +41,29 @@ class Poses:
         pose = await feed.call(robot, "getPose", {}, ANSWER_S)
         if is_error(pose):
             return error(text_of(pose)[:300])
+        if self._closed:
+            return error(CLOSED)
         loop = asyncio.get_running_loop()
         order = {name: pose.get(name) for name in ("model", "joints", "gripper")}
         size = {"width": SIZE[0], "height": SIZE[1]}
         drawn = await loop.run_in_executor(self._thread, self._drawn, json.dumps({**order, **size}, default=str))
         if self._idle is not None:
             self._idle.cancel()
+        if self._closed:
+            return error(CLOSED)
         self._idle = loop.call_later(IDLE_S, self._thread.submit, self._end)
         if "jpeg" not in drawn:
             return error(str(drawn.get("error"))[:300])
         return success("The pose.", jpeg=drawn["jpeg"])
 
     def close(self) -> None:
-        """End the process, and draw no more."""
+        """End the process, even one that is stuck, and draw no more."""
+        with self._starting:
+            if self._closed:
+                return
+            self._closed, process = True, self._process
+        if process is not None:
+            process.kill()  # the thread may be waiting for its answer
         if self._idle is not None:
             self._idle.cancel()
         self._thread.submit(self._end)
@@ -59,11 +72,12 @@ class Poses:
     # On the thread.
 
     def _drawn(self, order: str) -> dict[str, Any]:
-        if self._process is None:
-            self._process = subprocess.Popen(
-                PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-            )
-        process = self._process
+        try:
+            process = self._started()
+        except OSError as exc:
+            return {"error": f"The process that draws the pose cannot start: {exc}"}
+        if process is None:
+            return {"error": CLOSED}
         assert process.stdin is not None and process.stdout is not None
         late = threading.Timer(DRAW_S, process.kill)
         late.start()
@@ -77,6 +91,15 @@ class Poses:
         finally:
             late.cancel()
         return drawn
+
+    def _started(self) -> subprocess.Popen[str] | None:
+        """Return the process, or None once this is closed."""
+        with self._starting:
+            if self._process is None and not self._closed:
+                self._process = subprocess.Popen(
+                    PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+                )
+            return self._process
 
     def _end(self) -> None:
         process, self._process = self._process, None
