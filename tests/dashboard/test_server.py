@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,10 @@ from strands_robots.dashboard import page_session, server
 from strands_robots.dashboard.access import OPERATOR, VIEWER, Access, loopback_origins
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.operator_key import KeyRefusedError, OperatorKey
+from strands_robots.dashboard.pictures import Pictures
+from strands_robots.dashboard.poses import Poses
 from strands_robots.dashboard.server import STATIC, Dashboard
+from strands_robots.envelope import error, success
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.ed25519 import keygen
 
@@ -324,6 +328,45 @@ def test_thumbnails_of_the_visible_cards_are_pushed(make: Make) -> None:
     data = message["bytes"]
     length = int.from_bytes(data[:2], "big")
     assert (data[2 : 2 + length], data[2 + length :]) == (b"dc:arm-1", JPEG)
+
+
+def pose_said(socket: WebSocketTestSession) -> str:
+    return str(received(socket, "pose")["why"])
+
+
+def test_page_is_told_why_no_pose_is_drawn_at_every_change(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_session, "POSE_AGAIN_S", 0.01)
+    monkeypatch.setattr(page_session, "UNKNOWN_AGAIN_S", 0.01)
+    site, drawn = make(), success("the pose", jpeg="")
+    answers = [drawn, drawn, error("the bus is lost"), error("the bus is lost"), drawn]
+
+    async def picture(*_: object) -> Any:
+        return answers.pop(0) if len(answers) > 1 else answers[0]
+
+    monkeypatch.setattr(Poses, "picture", picture)
+    with site.open("/state") as socket:
+        hello(socket)
+        socket.send_json({"type": "watch", "key": "dc:arm-2"})
+        assert pose_said(socket) == "the robot is not known yet."
+        site.model.update("dc", "arm-2", kind="strands_robot")
+        site.model.update("dc", "arm-2", forms=FORMS)
+        assert [pose_said(socket) for _ in range(3)] == ["", "the bus is lost", ""]
+
+
+def test_pictures_end_for_their_viewers_when_the_server_ends() -> None:
+    async def looked() -> list[bytes]:
+        pictures, feed = Pictures(), PageFeed()
+        feed.answers["getPicture"] = [error("none")]
+        waiting = asyncio.create_task(collected(pictures.camera(feed, "arm-1", "blind")))
+        await asyncio.to_thread(eventually, lambda: feed.calls, 60.0, what="the question")
+        pictures.close()
+        seen = await asyncio.wait_for(waiting, 60.0)
+        return seen + await asyncio.wait_for(collected(pictures.camera(feed, "arm-1", "front")), 60.0)
+
+    async def collected(frames: AsyncIterator[bytes]) -> list[bytes]:
+        return [frame async for frame in frames]
+
+    assert asyncio.run(looked()) == []
 
 
 def test_page_that_has_gone_gives_its_robots_back(make: Make) -> None:

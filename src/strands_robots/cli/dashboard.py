@@ -132,7 +132,7 @@ def _bound(host: str, port: int) -> Iterator[socket.socket]:
         CliError: the address is not of this machine, or its port is taken.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio sends small answers at once on sockets of a stated protocol only.
+    # asyncio sets TCP_NODELAY, so that small answers leave at once, only on sockets made with IPPROTO_TCP.
     with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as bound:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -157,10 +157,10 @@ def _serve(
 
     port = int(sockets[0].getsockname()[1])
     app, url = page.app(), f"http://127.0.0.1:{port}/"
-    servers = [QuietServer(configured(app, "127.0.0.1", port))]
+    servers = [QuietServer(configured(app, "127.0.0.1", port), page.end_pictures)]
     if remote is not None:
         tls = {"ssl_certfile": str(remote.cert), "ssl_keyfile": str(remote.key), "lifespan": "off"}
-        servers.append(QuietServer(configured(app, remote.host, port, **tls)))
+        servers.append(QuietServer(configured(app, remote.host, port, **tls), page.end_pictures))
 
     async def run() -> None:
         await asyncio.gather(*(each.serve([bound]) for each, bound in zip(servers, sockets, strict=True)))

@@ -39,8 +39,11 @@ THUMBNAILS_MAX = 12
 ANSWER_MAX = 20_000
 RESUME_S = 5.0
 FORGET_S = 5.0
-POSE_AGAIN_S = 10.0
-"""Seconds until a pose that could not be drawn is tried again."""
+POSE_AGAIN_S = 5.0
+"""Seconds between two looks whether a robot's pose can be drawn."""
+
+UNKNOWN_AGAIN_S = 1.0
+NOT_KNOWN = "the robot is not known yet."
 
 
 Message = Mapping[str, Any]
@@ -239,23 +242,33 @@ class PageSession:
         self._looking = asyncio.create_task(self._look(key)) if key else None
 
     async def _look(self, key: str) -> None:
-        with contextlib.suppress(ValidationError):
-            feed, robot = self._feed(key)
-            self._tell_details(key)
-            await feed.look_closer(robot)
-            self._tell_details(key)
-            while why := await self._no_pose(key, feed, robot):
+        """Tell a robot's details, then every change of why its pose is not drawn."""
+        looked = False
+        told: str | None = None
+        while True:
+            why = NOT_KNOWN
+            with contextlib.suppress(ValidationError):
+                feed, robot = self._feed(key)
+                if not looked:
+                    self._tell_details(key)
+                    await feed.look_closer(robot)
+                    self._tell_details(key)
+                why = await self._no_pose(key, feed, robot)
+                looked = why != NOT_KNOWN
+            if why != told:
                 self.tell({"type": "pose", "key": key, "why": why})
-                await asyncio.sleep(POSE_AGAIN_S)
-            self.tell({"type": "pose", "key": key, "why": ""})
+            told = why
+            await asyncio.sleep(UNKNOWN_AGAIN_S if why == NOT_KNOWN else POSE_AGAIN_S)
 
     async def _no_pose(self, key: str, feed: FleetFeed, robot: str) -> str:
         """Return why no pose of a robot can be drawn, after drawing one; else empty."""
         row = self._server.model.row(key)
-        if row is None or OVERVIEW in row.cameras:
+        if row is None or not row.forms:
+            return NOT_KNOWN
+        if OVERVIEW in row.cameras:
             return ""
         if all(form["name"] != "getPose" for form in row.forms):
-            return "it has no arm whose joints are told in degrees."
+            return "it has no arm that reports joint angles in degrees."
         drawn = await self._server.pictures.poses.picture(feed, robot)
         return text_of(drawn) if is_error(drawn) else ""
 

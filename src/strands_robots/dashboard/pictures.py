@@ -28,6 +28,7 @@ class _Stream:
     frame: bytes = b""
     number: int = 0
     changed: asyncio.Condition = field(default_factory=asyncio.Condition)
+    ended: bool = False
     task: asyncio.Task[None] | None = None
 
 
@@ -36,6 +37,7 @@ class Pictures:
 
     def __init__(self) -> None:
         self.poses = poses.Poses()
+        self._closed = False
         self._streams: dict[tuple[str, str, tuple[int, int]], _Stream] = {}
 
     def camera(
@@ -57,7 +59,7 @@ class Pictures:
     ) -> AsyncGenerator[bytes, None]:
         stream = self._streams.get(key)
         if stream is None:
-            if len(self._streams) >= STREAMS_MAX:
+            if self._closed or len(self._streams) >= STREAMS_MAX:
                 return
             stream = self._streams[key] = _Stream()
             stream.task = asyncio.create_task(_take(stream, ask, hz))
@@ -66,19 +68,23 @@ class Pictures:
         try:
             while True:
                 async with stream.changed:
-                    while stream.number == seen:
+                    while stream.number == seen and not stream.ended:
                         await stream.changed.wait()
+                    if stream.ended:
+                        return
                     seen, frame = stream.number, stream.frame
                 yield frame
         finally:
             stream.viewers -= 1
             if stream.viewers == 0:
-                self._streams.pop(key, None)
+                if self._streams.get(key) is stream:
+                    del self._streams[key]
                 if stream.task is not None:
                     stream.task.cancel()
 
     def close(self) -> None:
-        """End every stream."""
+        """End every stream; its viewers see its end."""
+        self._closed = True
         for stream in self._streams.values():
             if stream.task is not None:
                 stream.task.cancel()
@@ -95,19 +101,24 @@ async def mjpeg(frames: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, No
 
 
 async def _take(stream: _Stream, ask: Callable[[], Awaitable[Envelope]], hz: float) -> None:
-    """Ask for pictures until cancelled."""
-    while True:
-        began = time.monotonic()
-        answer = await ask()
-        encoded = answer.get("jpeg")
-        frame = b"" if is_error(answer) or not isinstance(encoded, str) else _decoded(encoded)
-        if not frame:
-            await asyncio.sleep(AGAIN_S)
-            continue
+    """Ask for pictures until cancelled, then tell the viewers."""
+    try:
+        while True:
+            began = time.monotonic()
+            answer = await ask()
+            encoded = answer.get("jpeg")
+            frame = b"" if is_error(answer) or not isinstance(encoded, str) else _decoded(encoded)
+            if not frame:
+                await asyncio.sleep(AGAIN_S)
+                continue
+            async with stream.changed:
+                stream.frame, stream.number = frame, stream.number + 1
+                stream.changed.notify_all()
+            await asyncio.sleep(max(0.0, began + 1.0 / hz - time.monotonic()))
+    finally:
         async with stream.changed:
-            stream.frame, stream.number = frame, stream.number + 1
+            stream.ended = True
             stream.changed.notify_all()
-        await asyncio.sleep(max(0.0, began + 1.0 / hz - time.monotonic()))
 
 
 def _decoded(encoded: str) -> bytes:

@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import json
 import logging
-from collections.abc import AsyncIterator, Iterable, Mapping
+import socket
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,10 @@ class Dashboard:
         for feed in self.feeds.values():
             feed.close()
 
+    def end_pictures(self) -> None:
+        """End every stream of pictures; on the server's loop."""
+        self._shared.pictures.close()
+
     @contextlib.asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(self._refresh()), asyncio.create_task(self._follow_audit())]
@@ -103,7 +108,7 @@ class Dashboard:
         finally:
             for task in tasks:
                 task.cancel()
-            self._shared.pictures.close()
+            self.end_pictures()
 
     async def _refresh(self) -> None:
         while True:
@@ -200,7 +205,21 @@ class Dashboard:
 
 
 class QuietServer(uvicorn.Server):
-    """Uvicorn without signal handlers: the command has its own."""
+    """Uvicorn without signal handlers, which the command has; it ends streams first.
+
+    Args:
+        config: of the listener.
+        ending: ends the streams of its answers, which the server would wait for and then cut off.
+    """
+
+    def __init__(self, config: uvicorn.Config, ending: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._ending = ending
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the streams, then everything else."""
+        self._ending()
+        await super().shutdown(sockets)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Any:

@@ -89,7 +89,7 @@ def test_pose_of_an_arm_without_a_picture_of_it_is_drawn_from_its_joints(page: A
 
 @pytest.mark.parametrize(
     ("forms", "why"),
-    [(FORMS, "it has no arm whose joints are told in degrees"), (READS_POSE, "no model of reachy is known")],
+    [(FORMS, "it has no arm that reports joint angles in degrees"), (READS_POSE, "no model of reachy is known")],
 )
 def test_pose_that_is_not_drawn_is_explained(page: Any, served: ServedPage, forms: Any, why: str) -> None:
     served.robot("arm-1", forms=forms)
