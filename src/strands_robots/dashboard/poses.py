@@ -33,7 +33,7 @@ class Poses:
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="dashboard-poses")
         self._process: subprocess.Popen[str] | None = None
-        self._closed, self._starting = False, threading.Lock()
+        self._closed, self._starting = threading.Event(), threading.Lock()
         self._idle: asyncio.TimerHandle | None = None
 
     async def picture(self, feed: FleetFeed, robot: str) -> Envelope:
@@ -41,7 +41,7 @@ class Poses:
         pose = await feed.call(robot, "getPose", {}, ANSWER_S)
         if is_error(pose):
             return error(text_of(pose)[:300])
-        if self._closed:
+        if self._closed.is_set():
             return error(CLOSED)
         loop = asyncio.get_running_loop()
         order = {name: pose.get(name) for name in ("model", "joints", "gripper")}
@@ -49,7 +49,7 @@ class Poses:
         drawn = await loop.run_in_executor(self._thread, self._drawn, json.dumps({**order, **size}, default=str))
         if self._idle is not None:
             self._idle.cancel()
-        if self._closed:
+        if self._closed.is_set():
             return error(CLOSED)
         self._idle = loop.call_later(IDLE_S, self._thread.submit, self._end)
         if "jpeg" not in drawn:
@@ -59,9 +59,10 @@ class Poses:
     def close(self) -> None:
         """End the process, even one that is stuck, and draw no more."""
         with self._starting:
-            if self._closed:
+            if self._closed.is_set():
                 return
-            self._closed, process = True, self._process
+            self._closed.set()
+            process = self._process
         if process is not None:
             process.kill()  # the thread may be waiting for its answer
         if self._idle is not None:
@@ -95,7 +96,7 @@ class Poses:
     def _started(self) -> subprocess.Popen[str] | None:
         """Return the process, or None once this is closed."""
         with self._starting:
-            if self._process is None and not self._closed:
+            if self._process is None and not self._closed.is_set():
                 self._process = subprocess.Popen(
                     PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
                 )
