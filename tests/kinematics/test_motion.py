@@ -87,5 +87,7 @@ def test_joint_that_cannot_be_read_is_named() -> None:
 
 
 def test_motions_are_named_by_what_was_asked() -> None:
-    assert go_to(start(), "home", {}).instruction == "goTo place='home'"
+    assert go_to(start(), "home", {}).instruction == "goTo place home"
+    turned = move_joints(start(), {"shoulder_pan": 45.0, "wrist_roll": -60.0})
+    assert turned.instruction == "moveJoints shoulder_pan 45.0 wrist_roll -60.0"
     assert set_gripper(start(), 0.5).told == 0.5

@@ -15,6 +15,8 @@ from strands_robots.kinematics.chain import Floats
 from strands_robots.policies.base import Ranges, numbers
 from strands_robots.utils import shown
 
+_QUOTES = "'\""
+
 SETTLE_S = 1.0
 """Longest wait after a segment for the arm to stand still."""
 
@@ -79,7 +81,11 @@ class Motion:
     @property
     def instruction(self) -> str:
         """Return the motion in one line, as events name it."""
-        return f"{self.verb} {' '.join(f'{name}={shown(value)}' for name, value in self.asked.items())}".strip()
+        words = [self.verb]
+        for name, value in self.asked.items():
+            several = value if isinstance(value, Mapping) else {name: value}
+            words += [f"{each} {shown(what).strip(_QUOTES)}" for each, what in several.items()]
+        return " ".join(words)
 
     @property
     def duration(self) -> float:

@@ -5,6 +5,8 @@ A screen reader reads Chromium's accessibility tree, which these tests read in i
 
 from __future__ import annotations
 
+import base64
+import io
 import re
 from typing import Any
 
@@ -13,6 +15,7 @@ from fixtures.page_driving import open_robot
 from fixtures.page_site import picture, shows
 from fixtures.served_page import FORMS, ServedPage
 from fixtures.waiting import eventually
+from PIL import Image
 
 from strands_robots.dashboard.verb_forms import forms_of
 from strands_robots.envelope import error, success
@@ -76,8 +79,11 @@ def test_pose_of_an_arm_without_a_picture_of_it_is_drawn_from_its_joints(page: A
     picture(page, "pose-of-a-real-arm")
     asked = len(served.feed.asked("getPose"))
     eventually(lambda: len(served.feed.asked("getPose")) > asked, what="it is drawn again")
-    page.locator("#robot a", has_text="All robots").click()
-    page.locator("#cards").wait_for()
+    served.feed.answers["getPose"] = [error("the bus is lost")]
+    page.locator(".pose p", has_text="Not shown: the bus is lost").wait_for(timeout=60_000)
+    served.feed.answers["getPose"] = [success("here", **POSED)]
+    page.locator(".pose img").wait_for(timeout=60_000)
+    leave(page)
 
     def rests() -> bool:
         before = len(served.feed.asked("getPose"))
@@ -97,6 +103,50 @@ def test_pose_that_is_not_drawn_is_explained(page: Any, served: ServedPage, form
     open_robot(page)
     page.locator(".pose p", has_text=f"Not shown: {why}").wait_for(timeout=60_000)
     assert not page.locator(".pose img").is_visible()
+
+
+def leave(page: Any) -> None:
+    """Go back to all robots."""
+    page.locator("#robot a", has_text="All robots").click()
+    page.locator("#cards").wait_for()
+
+
+def test_view_of_a_base_shows_no_joint_of_the_arm_before(page: Any, served: ServedPage) -> None:
+    drives = forms_of([{"name": "drive", "labels": {"direction": "write"}, "parameters": {"properties": {}}}])
+    served.robot("arm-1")
+    served.robot("base-1", forms=(*FORMS, *drives))
+    served.model.observe("dc", "arm-1", {"pan": 0.1, "lift": 0.2})
+    open_robot(page)
+    page.locator("button.jog[aria-label='pan +']").wait_for(timeout=60_000)
+    assert "answers in 1\u00a0ms" in page.locator(".age").inner_text()
+    leave(page)
+    open_robot(page, "base-1")
+
+    def labels() -> list[str]:
+        return [str(each.get_attribute("aria-label")) for each in page.locator("button.jog").all()]
+
+    base = ["back", "forward", "turn right", "turn left"]
+    eventually(lambda: labels() == base, 60.0, what="the buttons of a base alone")
+
+
+def test_pose_is_asked_of_the_server_that_came_after(page: Any, served: ServedPage) -> None:
+    encoded = io.BytesIO()
+    Image.new("RGB", (64, 48), (200, 0, 0)).save(encoded, "JPEG")
+    shot = success("a picture", jpeg=base64.b64encode(encoded.getvalue()).decode())
+    served.feed.answers["getPicture"] = [shot]
+    served.robot("arm-1", cameras=("overview",))
+    open_robot(page)
+
+    def address() -> str:
+        return str(page.locator(".pose img").get_attribute("src") or "")
+
+    eventually(address, 60.0, what="the first stream")
+    before = address()
+    served.end_without_cutting_off()
+    with ServedPage(served.port) as again:
+        again.feed.answers["getPicture"] = [shot]
+        again.robot("arm-1", cameras=("overview",))
+        eventually(lambda: address() not in ("", before), 60.0, what="a stream of the new server")
 
 
 # What a screen reader is told.

@@ -84,7 +84,7 @@ state.addEventListener("hello", ({ detail }) => {
   view.order = null;
   view.drawn.clear();
   view.reconnected();
-  robot.cameras = "";
+  robot.resetPictures();
   robot.watch();
   draw();
 });

@@ -75,9 +75,9 @@ export class RobotView {
     this.joints.replaceChildren(el("p", { text: S.noJoints }));
     this.pads.replaceChildren();
     this.verbs.replaceChildren(el("h3", { id: "verbs-title", text: S.verbs }));
-    this.signature = "";
-    this.cameras = "";
-    this.showPose(S.poseComing);
+    this.signature = this.barKeys = "";
+    this.jointNames = this.names = this.limits = null;
+    this.resetPictures();
     this.takeRefused = false;
     this.jog.key = key;
     this.jog.axes = [];
@@ -86,6 +86,12 @@ export class RobotView {
   }
 
   watch() { if (this.key) this.state.send({ type: "watch", key: this.key }); }
+
+  // The streams of pictures end with their connection.
+  resetPictures() {
+    this.cameras = "";
+    this.showPose(S.poseComing, true);
+  }
 
   close() {
     this.jog.end("hidden");
@@ -122,11 +128,11 @@ export class RobotView {
     if (this.ownPose) this.showPose("");
   }
 
-  // A simulation draws its own; of another arm the page's server draws one from the joints that it tells.
-  showPose(why) {
+  // A simulation draws its own; of another arm the page's server draws one from the joint angles that it reports.
+  showPose(why, coming = false) {
     this.pose.hidden = why !== "";
     this.noPose.hidden = why === "";
-    setText(this.noPose, why && why !== S.poseComing ? S.noPose(why) : why);
+    setText(this.noPose, why && !coming ? S.noPose(why) : why);
     if (why) this.pose.removeAttribute("src");
     else if (!this.pose.getAttribute("src")) this.show(this.pose, "overview", !this.ownPose);
   }
@@ -134,9 +140,9 @@ export class RobotView {
   showCamera() { if (this.chosen.value) this.show(this.camera, this.chosen.value); }
 
   show(image, camera, drawn = false) {
-    const row = this.row();
-    if (!this.hello || !row) return;
-    image.alt = drawn ? S.poseOf(row.id) : S.pictureOf(row.id, camera);
+    if (!this.hello || !this.key) return;
+    const id = this.key.slice(this.key.indexOf(":") + 1);
+    image.alt = drawn ? S.poseOf(id) : S.pictureOf(id, camera);
     image.src = `camera?${new URLSearchParams({ robot: this.key, camera, ticket: this.hello.ticket, ...(drawn ? { pose: "1" } : {}) })}`;
   }
 

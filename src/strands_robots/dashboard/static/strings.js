@@ -76,7 +76,7 @@ export const S = {
   heardNow: "heard within 1\u00a0s",
   heard: (s) => `heard ${s}\u00a0s ago`,
   neverHeard: "not heard yet",
-  roundTrip: (ms) => `link ${Math.round(ms)}\u00a0ms`,
+  roundTrip: (ms) => `answers in ${Math.round(ms)}\u00a0ms`,
   heldBy: (who, kind) => `${who} (${kind}) holds control`,
   heldHere: "You hold control",
   lockedHere: "It is LOCKED: it moves again after a resume, at the bottom of the page.",
