@@ -58,6 +58,9 @@ class ShortTurns(_WhileNeeded):
 
     def _change(self) -> None:
         self._default_s = sys.getswitchinterval()
+        self._shorten()
+
+    def _shorten(self) -> None:
         sys.setswitchinterval(min(self._default_s, SWITCH_S))
 
     def _restore(self) -> None:
@@ -73,7 +76,7 @@ class ShortTurns(_WhileNeeded):
         """Make the turns short again if anyone still needs that."""
         with self._lock:
             if self._users:
-                sys.setswitchinterval(min(self._default_s, SWITCH_S))
+                self._shorten()
 
 
 class LongTurns(_WhileNeeded):

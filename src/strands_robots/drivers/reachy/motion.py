@@ -149,8 +149,9 @@ class MoveUpdates:
                 return None
             except Exception as exc:
                 raise DaemonUnreachableError(f"The daemon's updates of moves broke: {exc}.") from exc
-            if update.get("uuid") == uuid and str(update.get("type")) in MOVE_ENDS:
-                return MoveEnd(MOVE_ENDS[str(update["type"])], str(update.get("details") or ""))
+            end = MOVE_ENDS.get(str(update.get("type")))
+            if update.get("uuid") == uuid and end is not None:
+                return MoveEnd(end, str(update.get("details") or ""))
         return None
 
     def close(self) -> None:
