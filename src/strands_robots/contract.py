@@ -20,7 +20,15 @@ from weakref import WeakKeyDictionary
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate, MotionRefused
-from strands_robots.safety.stopping import StopVerdict, grade, halt_each, json_blocks
+from strands_robots.safety.stopping import (
+    PendingVerdict,
+    StopVerdict,
+    grade,
+    halt_each,
+    halts_in_parts,
+    json_blocks,
+    read_verdict,
+)
 from strands_robots.utils import ValidationError, shown
 
 logger = logging.getLogger(__name__)
@@ -36,7 +44,6 @@ RUNNING = frozenset({"running", "starting", "connecting", "busy"})
 AT_REST = frozenset({"idle", "completed", "stopped", "error"})
 """Values of ``task_status`` of a robot whose task moves nothing; any other value is unknown."""
 
-STATUS_EVERY_S = 0.02
 STATUS_SHARE = 0.5
 """Part of the halt deadline for which the status may go on saying that the task runs."""
 
@@ -217,7 +224,7 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
 
 def body_of(robot: Any) -> Any:
     """Return the robot that :func:`adapt` wrapped, else ``robot`` itself."""
-    return getattr(robot, "wrapped", robot)
+    return robot.wrapped if isinstance(robot, AdaptedRobot) else robot
 
 
 class _PutAway:
@@ -308,7 +315,7 @@ class AdaptedRobot:
         """Stop the task; the robot's own answer where its status does not contradict it."""
         with self._shared.calling():
             answer: Envelope | None = self.wrapped.stop_task()
-            verdict = halt_each({"task": partial(self._checked, answer)})
+        verdict = read_verdict(_StatusAfter(self, {"task": answer}))
         return answer if answer is not None and verdict.stopped else verdict.envelope()
 
     def get_task_status(self) -> Envelope:
@@ -347,52 +354,29 @@ class AdaptedRobot:
             return unsubscribe
         return lambda: None
 
+    @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """The robot's own ``halt`` where it has one, else its task and its teleoperation.
 
         Its status is read afterwards: a robot that says that its task runs has not stopped, whatever it answered.
         """
-        self.gate.revoke()
         began = time.monotonic()
-        own = getattr(self.wrapped, "halt", None)
-        if callable(own):
-            stops: dict[str, Callable[[], object]] = {self.tool_name_str: lambda: own(reason)}
-        else:
-            stops = {"task": self.wrapped.stop_task}
-            teleop = getattr(self.wrapped, "stop_teleoperate", None)
-            if callable(teleop):
-                stops["teleoperation"] = teleop
-        main, *_ = stops
-        with self._shared.calling():
-            answers = {name: _answer(stop) for name, stop in stops.items()}
-            # When everything was asked to stop: the status is waited for.
-            answers[main] = self._checked(answers[main])
-        verdict = halt_each({name: partial(_given, answer) for name, answer in answers.items()})
+        verdict = read_verdict(self.halt_here(reason, began + settings.number("STRANDS_HALT_DEADLINE_S")))
         return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
 
-    def _checked(self, answer: object) -> object:
-        """Return the answer to a stop, or what the status after it says against it."""
-        if grade(answer).stopped is False or not callable(getattr(self.wrapped, "get_task_status", None)):
-            return answer
-        asked, status = time.monotonic(), self._status()
-        if status in RUNNING:
-            deadline = asked + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
-            while status in RUNNING and time.monotonic() < deadline:
-                time.sleep(STATUS_EVERY_S)
-                status = self._status()
-        if status in RUNNING:
-            return error(f"its get_task_status says {status} after the stop, which answered {shown(answer)}")
-        if status not in AT_REST:
-            # Text is an unknown answer to a stop.
-            return "task_status is none of idle, stopped, completed, error, running"
-        return success("Stopped.", stopped=True) if answer is None else answer
-
-    def _status(self) -> str | None:
-        try:
-            return _task_status(self.wrapped.get_task_status())
-        except Exception:
-            logger.exception("%s: its status could not be read after a stop.", self.tool_name_str)
-            return None
+    def halt_here(self, reason: str, deadline: float) -> PendingVerdict:
+        """Ask everything to stop, and leave the answers and the status to be read."""
+        self.gate.revoke()
+        with self._shared.calling():
+            own = getattr(self.wrapped, "halt", None)
+            if callable(own):
+                answers = {self.tool_name_str: _answer(lambda: own(reason))}
+            else:
+                answers = {"task": _answer(self.wrapped.stop_task)}
+                teleop = getattr(self.wrapped, "stop_teleoperate", None)
+                if callable(teleop):
+                    answers["teleoperation"] = _answer(teleop)
+        return _StatusAfter(self, answers)
 
     def _refresh(self, status: str) -> str:
         """Read the joints unless a call is disturbed; else return the reason."""
@@ -410,6 +394,52 @@ class AdaptedRobot:
         except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the answer says what
             return f"The joints could not be read: {type(exc).__name__}: {exc}"
         return ""
+
+
+class _StatusAfter(PendingVerdict):
+    """Answers of a foreign robot to a stop, and its status after them.
+
+    Args:
+        answers: by what was asked to stop; the status may contradict the first.
+    """
+
+    def __init__(self, robot: AdaptedRobot, answers: Mapping[str, object]) -> None:
+        super().__init__(time.monotonic() + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S"))
+        self._robot, self._answers = robot, answers
+        self._main = next(iter(answers))
+        self._name = robot.tool_name_str
+
+    def known(self) -> StopVerdict | None:
+        refused = grade(self._answers[self._main]).stopped is False
+        has_status = callable(getattr(self._robot.wrapped, "get_task_status", None))
+        return None if has_status and not refused else self._verdict(self._answers[self._main])
+
+    def read(self) -> str | None:
+        try:
+            return _task_status(self._robot.wrapped.get_task_status())
+        except Exception:
+            logger.exception("%s: its status could not be read after a stop.", self._name)
+            return None
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        answer = self._answers[self._main]
+        if reading in RUNNING:
+            if not last:
+                return None
+            return self._verdict(
+                error(f"its get_task_status says {reading} after the stop, which answered {shown(answer)}")
+            )
+        if reading not in AT_REST:
+            # Text is an unknown answer to a stop.
+            return self._verdict("task_status is none of idle, stopped, completed, error, running")
+        return self._verdict(success("Stopped.", stopped=True) if answer is None else answer)
+
+    def unread(self, why: str) -> StopVerdict:
+        return StopVerdict(not_stopped={self._main: f"{why}: its stop has returned, its status has not"})
+
+    def _verdict(self, main: object) -> StopVerdict:
+        answers = {**self._answers, self._main: main}
+        return halt_each({name: partial(_given, answer) for name, answer in answers.items()})
 
 
 def _task_status(answer: object) -> str | None:

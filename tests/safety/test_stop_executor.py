@@ -18,8 +18,8 @@ from fixtures.waiting import eventually
 from strands_robots.contract import AdaptedRobot
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.stop_executor import RESERVE, StopExecutor, stop_executor, through_executor
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.stop_executor import RESERVE, StopExecutor, stop_executor
+from strands_robots.safety.stopping import StopVerdict, halts_in_parts
 
 
 class Wedged:
@@ -52,7 +52,7 @@ class DirectWedged(Wedged):
     def unanswered(self, why: str) -> StopVerdict:
         return StopVerdict(not_stopped={"bus": why})
 
-    @through_executor
+    @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         return stop_executor().halt(self, "direct", reason)
 

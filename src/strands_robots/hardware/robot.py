@@ -39,8 +39,8 @@ from strands_robots.safety.gate import (
     refusal_envelope,
 )
 from strands_robots.safety.persistence import hardware_key
-from strands_robots.safety.stop_executor import stop_executor, through_executor
-from strands_robots.safety.stopping import StopLevel, StopVerdict, checked_level, halt_each
+from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stopping import StopLevel, StopVerdict, checked_level, halt_each, halts_in_parts
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
 
@@ -349,7 +349,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         task = self._task
         return f"the task {task.instruction!r}" if task is not None and task.running else ""
 
-    @through_executor
+    @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop every motion and freeze, within ``STRANDS_HALT_DEADLINE_S``.
 

@@ -25,7 +25,8 @@ from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
 from strands_robots.safety.stop_count import StopCount
-from strands_robots.safety.stop_executor import StopExecutor, note_motion, stop_executor
+from strands_robots.safety.stop_executor import StopExecutor, stop_executor
+from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.safety.turns import undisturbed
 from strands_robots.utils import ValidationError, identifier, shown

@@ -2,11 +2,14 @@
 
 The safety plane, an RPC ``stop``, the mesh's ``stop``, ``HardwareRobot.halt`` and a departing process submit to it.
 :meth:`StopExecutor.submit` takes no lock that is held during a halt, so a robot that blocks delays no other robot.
+What has to be read of a robot for its verdict is read on other threads, so a halt never waits for the doubt of an
+earlier one.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import heapq
 import itertools
 import logging
@@ -17,25 +20,36 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Hashable
-from concurrent.futures import Future, InvalidStateError
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol, TypeGuard, TypeVar, cast, runtime_checkable
+from concurrent.futures import Future
+from typing import cast
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, body_of
-from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.stopping import StopVerdict, graded
+from strands_robots.safety.ready_threads import ReadyThreads
+from strands_robots.safety.stop_targets import (
+    HaltsInParts,
+    Target,
+    has_parts,
+    is_direct,
+    note_motion,
+    revoke_permits,
+    target_key,
+)
+from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict
+from strands_robots.safety.submitted_stops import Answered, StopLine, SubmittedStop, TargetSlot
 
 logger = logging.getLogger(__name__)
 
 RESERVE = 3
 """Threads that stand ready for all targets without a thread of their own."""
 
-WAITING_MAX = 4096
-"""Stops of one target that wait for its next halt. Beyond it the oldest is answered by its deadline alone."""
+READERS = 1
+"""Threads that stand ready to read robots after their halts."""
 
-STUCK_MAX = 8
-"""Threads that one target may keep blocked in its halts before no further thread is given to it."""
+STUCK_MAX = 7
+"""Threads of one target that may be given up as blocked; with the one that works there are eight.
+
+The next one that returns serves all stops that wait."""
 
 WATCH_S = 0.05
 """Seconds between two looks for new stops; a deadline that is further away is kept to the millisecond."""
@@ -49,180 +63,7 @@ DIRECT_SHARE, RETURN_SHARE = 0.9, 0.85
 The rest is for the verdict to reach the caller in time."""
 
 
-@runtime_checkable
-class NotesMotion(Protocol):
-    """Target that notes its motions before its permits are void."""
-
-    def halt_ordered(self) -> None:
-        """Note what moves. Must not block."""
-
-
-@runtime_checkable
-class DirectTarget(NotesMotion, Protocol):
-    """Target whose ``halt`` goes through the executor to :meth:`halt_here`.
-
-    It says itself what is known while its halt blocks, and no second thread is started for it meanwhile: whatever
-    blocks the first, such as its bus, would block the second.
-    """
-
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
-        """Halt on this thread by ``deadline`` (monotonic s), unless the device blocks."""
-
-    def unanswered(self, why: str) -> StopVerdict:
-        """Return the verdict while :meth:`halt_here` has not returned. Must not block."""
-
-
-Target = Haltable | DirectTarget
-H = TypeVar("H", bound=Callable[..., StopVerdict])
-
-
-def through_executor(halt: H) -> H:
-    """Mark a public ``halt`` that only submits its target.
-
-    A subclass that overrides it loses the mark, and is halted by its own.
-    """
-    vars(halt)["through_executor"] = True
-    return halt
-
-
-def note_motion(target: object) -> None:
-    """Let a target note what moves, before its permits are void.
-
-    Never raises: a stop follows.
-    """
-    # A check of a protocol costs more than a stop may.
-    note = getattr(target, "halt_ordered", None)
-    if note is not None:
-        try:
-            note()
-        except Exception:
-            logger.exception("A robot could not note what moves before its stop.")
-
-
-def _is_direct(target: object) -> TypeGuard[DirectTarget]:
-    kind = type(target)
-    halt = getattr(kind, "halt", None)
-    return hasattr(kind, "halt_here") and (halt is None or getattr(halt, "through_executor", False))
-
-
-Answered = Callable[[StopVerdict], None]
-
-
-@dataclass(eq=False, slots=True)
-class _Stop:
-    """One submitted stop. Times are monotonic seconds."""
-
-    slot: _Slot | None
-    target: Target | None
-    name: str
-    reason: str
-    within: float
-    since: float
-    answered: Answered | None
-    direct: bool = False
-    extended: bool = False
-    begun: float | None = None
-    submitted: float = field(default_factory=time.monotonic)
-    future: Future[StopVerdict] = field(default_factory=Future)
-    answering: threading.Lock = field(default_factory=threading.Lock)
-
-    def moment(self, part: float) -> float:
-        """Return the moment at which ``part`` of the time to halt has passed."""
-        return self.since + part * self.within
-
-    def resolve(self, answer: object) -> None:
-        """Hand out the graded answer of the halt, marked if it is late."""
-        verdict, late = graded(answer, self.name), self.answered
-        # Watched until the deadline, an answered stop must not keep its robot alive.
-        self.slot = self.target = self.answered = None
-        if not self._set(verdict) and late is not None:
-            late(verdict)
-
-    def extend(self) -> float | None:
-        """Return the later deadline of a stop that waited behind another's halt.
-
-        None where it has had it, or did not wait.
-        """
-        slot = self.slot
-        running = None if slot is None else slot.running
-        if self.direct or self.extended or not running or self.future.done():
-            return None
-        self.extended = True
-        if self.begun is not None:
-            return self.begun + self.within
-        return None if any(each.future.done() for each in running) else self.moment(2.0)
-
-    def expire(self) -> bool:
-        """Answer for the target that did not; False where it has answered."""
-        target = self.target
-        if target is None or self.future.done():
-            return False
-        why = f"no answer in {self.within:g} s"
-        verdict = StopVerdict(not_stopped={self.name: why})
-        if _is_direct(target):
-            try:
-                verdict = graded(target.unanswered(why), self.name)
-            except Exception:
-                logger.exception("%s could not say what it does while its halt blocks.", self.name)
-        return self._set(verdict)
-
-    def _set(self, verdict: StopVerdict) -> bool:
-        elapsed_ms = (time.monotonic() - self.submitted) * 1000
-        # The callbacks of the first answer have returned before a late one is handed out.
-        with self.answering:
-            try:
-                self.future.set_result(replace(verdict, elapsed_ms=elapsed_ms))
-            except InvalidStateError:
-                return False
-            return True
-
-
-class _Slot:
-    """Halts of one target: waiting, running, and the thread that is woken.
-
-    It does not refer to the target; only its stops do.
-    """
-
-    def __init__(self, name: str, wake: queue.SimpleQueue[_Slot | None]) -> None:
-        self.name = name
-        self.wake = wake
-        self.waiting: deque[_Stop] = deque(maxlen=WAITING_MAX)
-        self.running: list[_Stop] | None = None
-        self.changing = threading.Lock()
-        self.owners = 0
-        self.stuck = 0
-        self.thread: threading.Thread | None = None
-
-    def next(self, done: list[_Stop] | None = None) -> list[_Stop] | None:
-        """Take all waiting requests for one halt, or None.
-
-        Args:
-            done: what the calling thread took before.
-        """
-        with self.changing:
-            if self.running is not done:
-                self.stuck -= 1
-                if self.running is not None:
-                    return None
-                # It was given up as stuck and is back; what could have no further thread goes on with it.
-            taken = []
-            while self.waiting:
-                taken.append(self.waiting.popleft())
-                taken[-1].begun = time.monotonic()
-            self.running = taken or None
-            return self.running
-
-    def give_up(self, stuck: list[_Stop]) -> bool:
-        """Abandon the thread that carries out ``stuck``; False if it has returned."""
-        with self.changing:
-            if self.running is not stuck:
-                return False
-            self.running = None
-            self.stuck += 1
-            return True
-
-
-_Wake = queue.SimpleQueue[_Slot | None]
+_Wake = queue.SimpleQueue[TargetSlot | None]
 
 
 class StopExecutor:
@@ -231,6 +72,7 @@ class StopExecutor:
     A target that was attached owns a thread. All others share :data:`RESERVE` threads, and each that is taken is
     replaced at once, so that blocked halts never use them up. Stops of one target that arrive while a halt of it runs
     share the next halt, which begins after them. When a halt misses its deadline, a fresh thread takes over what waits.
+    The same holds of readings for a verdict, which have threads of their own.
 
     Args:
         start: starts a thread; a test fails it.
@@ -238,15 +80,15 @@ class StopExecutor:
 
     def __init__(self, start: Callable[[threading.Thread], None] = threading.Thread.start) -> None:
         self._start_thread = start
-        self._slots: weakref.WeakValueDictionary[Hashable, _Slot] = weakref.WeakValueDictionary()
-        self._attached: dict[Hashable, tuple[_Slot, object]] = {}
-        self._creating, self._attaching, self._counting = threading.Lock(), threading.Lock(), threading.Lock()
-        self._reserve: _Wake = queue.SimpleQueue()
-        self._idle = 0
-        self._reserved = False
-        self._watched: deque[_Stop] = deque()
+        self._slots: weakref.WeakValueDictionary[Hashable, TargetSlot] = weakref.WeakValueDictionary()
+        self._attached: dict[Hashable, tuple[TargetSlot, object]] = {}
+        self._creating, self._attaching = threading.Lock(), threading.Lock()
+        self._watched: deque[SubmittedStop] = deque()
         self._watch_now: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._watcher: threading.Thread | None = None
+        used_up = functools.partial(self._watch_now.put, None)
+        self._reserve = ReadyThreads("halt-reserve", RESERVE, self._serve, start, used_up)
+        self._readers = ReadyThreads("halt-reading", READERS, self._read, start, used_up)
         self._here = threading.local()
         self._numbers = itertools.count()
 
@@ -258,7 +100,7 @@ class StopExecutor:
         """
         with self._attaching:
             self._watch_deadlines()
-            slot, key = self._slot(target, name), _key(target)
+            slot, key = self._slot(target, name), target_key(target)
             if slot.owners == 0:
                 slot.wake, slot.thread = self._ready_thread(name)
                 # What was submitted to the reserve in between waits at the slot.
@@ -272,22 +114,22 @@ class StopExecutor:
         A thread that is blocked in a halt is left behind as a daemon.
         """
         with self._attaching:
-            slot, end = self._attached.get(_key(target), (None, None))
+            slot, end = self._attached.get(target_key(target), (None, None))
             if slot is None:
                 return
             slot.owners -= 1
             if slot.owners:
                 return
-            del self._attached[_key(target)]
+            del self._attached[target_key(target)]
             if isinstance(end, weakref.finalize):
                 end.detach()
             inbox, thread = slot.wake, slot.thread
-            slot.wake, slot.thread = self._reserve, None
-            self._reserve.put(slot)
+            slot.wake, slot.thread = self._reserve.items, None
+            self._reserve.items.put(slot)
             inbox.put(None)
-            if slot.running is not None or slot.waiting:
+            if slot.halts.running is not None or slot.halts.waiting:
                 # What waits behind a halt under way may fall to the reserve, which the watcher fills.
-                self._reserved = True
+                self._reserve.wanted = True
                 self._watch_now.put(None)
         if wait and thread is not None and thread is not threading.current_thread():
             thread.join(wait)
@@ -296,12 +138,7 @@ class StopExecutor:
         """Make the reserve ready for targets that are not attached."""
         with self._attaching:
             self._watch_deadlines()
-            self._reserved = True
-            try:
-                self._refill()
-            except RuntimeError:
-                self._reserved = self._idle > 0
-                raise
+            self._reserve.prepare()
 
     def submit(
         self,
@@ -327,28 +164,27 @@ class StopExecutor:
         """
         limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
         slot = self._slot(target, name)
-        stop = _Stop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
-        stop.direct = _is_direct(target)
+        stop = SubmittedStop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
+        stop.direct = is_direct(target)
         stop.future.set_running_or_notify_cancel()
         if answered is not None:
             stop.future.add_done_callback(lambda future: answered(future.result()))
         note_motion(target)
-        gate = getattr(target, "gate", None)
-        if isinstance(gate, MotionGate) and (stop.direct or slot.running is not None):
+        if stop.direct or slot.halts.running is not None:
             # The halt of any other target voids permits itself, after it has seen what moves, unless it has to wait.
-            gate.revoke()
+            revoke_permits(target)
         if slot in getattr(self._here, "serving", ()):
             # A halt that asks for itself again: this thread is the one that carries it out.
             self._serve(slot, [stop])
             return stop.future
-        slot.waiting.append(stop)
-        if not (self._reserved or slot.owners) and not self._prepared(name):
+        slot.halts.waiting.append(stop)
+        if not (self._reserve.wanted or slot.owners) and not self._prepared(name):
             self._serve(slot)
             return stop.future
         slot.wake.put(slot)
         # Not woken for it: the watcher looks often enough, and a thread that wakes takes time from the stop's own.
         self._watched.append(stop)
-        if not (self._reserved or slot.owners) and not self._prepared(name):
+        if not (self._reserve.wanted or slot.owners) and not self._prepared(name):
             # The target was detached meanwhile, and its thread may have ended.
             self._serve(slot)
         return stop.future
@@ -363,14 +199,14 @@ class StopExecutor:
             # No thread runs any more while the interpreter ends.
             return StopVerdict(unknown={name: "the process is ending, and no thread answers"})
 
-    def _slot(self, target: Target, name: str) -> _Slot:
-        key = _key(target)
+    def _slot(self, target: Target, name: str) -> TargetSlot:
+        key = target_key(target)
         slot = self._slots.get(key)
         if slot is None:
             with self._creating:
                 slot = self._slots.get(key)
                 if slot is None:
-                    slot = self._slots[key] = _Slot(name, self._reserve)
+                    slot = self._slots[key] = TargetSlot(name, self._reserve.items)
         return slot
 
     def _ready_thread(self, name: str) -> tuple[_Wake, threading.Thread]:
@@ -379,13 +215,13 @@ class StopExecutor:
         self._start_thread(thread)
         return inbox, thread
 
-    def _end_with(self, target: Target, key: Hashable, slot: _Slot) -> object:
+    def _end_with(self, target: Target, key: Hashable, slot: TargetSlot) -> object:
         """End the thread with the target, or keep a target that cannot be watched."""
         body = body_of(target)
         if isinstance(key, tuple):
             return body
         try:
-            end = weakref.finalize(body, _end, self._attached, key, slot, self._reserve)
+            end = weakref.finalize(body, _end, self._attached, key, slot, self._reserve.items)
         except TypeError:
             return body
         end.atexit = False
@@ -398,25 +234,9 @@ class StopExecutor:
                 return
             del slot
 
-    def _work_in_reserve(self) -> None:
-        while True:
-            slot = self._reserve.get()
-            with self._counting:
-                self._idle -= 1
-                used_up = self._idle == 0
-            if used_up:
-                self._watch_now.put(None)
-            if slot is not None:
-                self._serve(slot)
-            del slot
-            with self._counting:
-                if self._idle >= RESERVE:
-                    return
-                self._idle += 1
-
-    def _serve(self, slot: _Slot, nested: list[_Stop] | None = None) -> None:
+    def _serve(self, slot: TargetSlot, nested: list[SubmittedStop] | None = None) -> None:
         """Carry out requests at ``slot`` until none waits or another thread took over."""
-        stops = nested or slot.next()
+        stops = nested or slot.halts.next()
         while stops is not None:
             outer = getattr(self._here, "serving", ())
             self._here.serving = (*outer, slot)
@@ -424,7 +244,7 @@ class StopExecutor:
             try:
                 reason, target = stops[0].reason, stops[0].target
                 # Nested, an overridden halt has called the one of its class.
-                if _is_direct(target) or (nested and isinstance(target, DirectTarget)):
+                if has_parts(target) or (nested and isinstance(target, HaltsInParts)):
                     answer = target.halt_here(reason, max(each.moment(RETURN_SHARE) for each in stops))
                 elif target is not None:
                     answer = cast(Haltable, target).halt(reason)
@@ -433,9 +253,30 @@ class StopExecutor:
             finally:
                 self._here.serving = outer
             del target
-            for stop in stops:
-                stop.resolve(answer)
-            stops = None if nested else slot.next(stops)
+            unread = [stop for stop in stops if not stop.halted(answer)]
+            if unread:
+                slot.readings.waiting.extend(unread)
+                self._have_read(slot)
+            del answer, unread
+            stops = None if nested else slot.halts.next(stops)
+
+    def _have_read(self, slot: TargetSlot) -> None:
+        """Have the robot read on another thread."""
+        try:
+            if not self._readers.wanted:
+                self._readers.prepare()
+        except RuntimeError as exc:
+            logger.critical("No thread can be started to read %s; it is read on its halt's: %s.", slot.name, exc)
+            self._read(slot)
+        else:
+            self._readers.items.put(slot)
+
+    def _read(self, slot: TargetSlot) -> None:
+        """Read the robot of ``slot`` until every stop whose halt is over has its verdict."""
+        stops = slot.readings.next()
+        while stops is not None:
+            _judge(slot.readings, stops)
+            stops = slot.readings.next(stops)
 
     def _prepared(self, name: str) -> bool:
         try:
@@ -451,29 +292,15 @@ class StopExecutor:
             self._start_thread(watcher)
             self._watcher = watcher
 
-    def _refill(self) -> None:
-        while True:
-            # Counted first: a thread that has served a target meanwhile must not stay as one too many.
-            with self._counting:
-                if self._idle >= RESERVE or not self._reserved:
-                    return
-                self._idle += 1
-            name = f"halt-reserve-{next(self._numbers)}"
-            try:
-                self._start_thread(threading.Thread(target=self._work_in_reserve, name=name, daemon=True))
-            except BaseException:
-                with self._counting:
-                    self._idle -= 1
-                raise
-
     def _watch(self) -> None:
         """Answer for halts that miss their deadline, and refill the reserve."""
-        due: list[tuple[float, int, _Stop]] = []
+        due: list[tuple[float, int, SubmittedStop]] = []
         without_threads = False
         while True:
             try:
                 self._take_new(due)
-                self._refill()
+                self._reserve.refill()
+                self._readers.refill()
                 if without_threads:
                     logger.warning("The threads that stand ready for stops are complete again.")
                 without_threads = False
@@ -494,7 +321,7 @@ class StopExecutor:
             for stop in late:
                 self._renew(stop)
 
-    def _take_new(self, due: list[tuple[float, int, _Stop]]) -> None:
+    def _take_new(self, due: list[tuple[float, int, SubmittedStop]]) -> None:
         """Wait for a stop, a taken thread of the reserve or the next deadline."""
         timeout = WATCH_S if not due else min(WATCH_S, max(0.0, due[0][0] - time.monotonic()))
         with contextlib.suppress(queue.Empty):
@@ -504,21 +331,25 @@ class StopExecutor:
             at = stop.moment(DIRECT_SHARE if stop.direct else 1.0)
             heapq.heappush(due, (at, next(self._numbers), stop))
 
-    def _renew(self, stop: _Stop) -> None:
+    def _renew(self, stop: SubmittedStop) -> None:
         """Let a fresh thread take over what waits behind a halt that missed its deadline."""
-        slot = stop.slot
-        if slot is None or stop.direct:
+        slot, line = stop.slot, stop.line()
+        if slot is None or line is None:
             return
-        stuck = slot.running
+        halts = line is slot.halts
+        if halts and stop.direct:
+            return
+        what, done = ("halt", "halt it") if halts else ("reading", "read it")
+        stuck = line.running
         if stuck is None or not any(each.future.done() for each in stuck):
             return
-        if slot.stuck >= STUCK_MAX:
-            logger.critical("%s is stuck in its halt, and so are %d threads of it.", stop.name, slot.stuck)
+        if line.stuck >= STUCK_MAX:
+            logger.critical("%s is stuck in its %s, and so are %d threads of it.", stop.name, what, line.stuck)
             return
         try:
             with self._attaching:
-                fresh = self._ready_thread(stop.name) if slot.owners else None
-                if not slot.give_up(stuck):
+                fresh = self._ready_thread(stop.name) if halts and slot.owners else None
+                if not line.give_up(stuck):
                     if fresh is not None:
                         fresh[0].put(None)
                     return
@@ -527,23 +358,52 @@ class StopExecutor:
                     slot.wake, slot.thread = fresh
                     # Where a thread of the reserve is the stuck one, the target's own still waits.
                     before.put(None)
-            slot.wake.put(slot)
+            (slot.wake if halts else self._readers.items).put(slot)
         except RuntimeError as exc:
-            logger.critical("%s is stuck in its halt and no other thread can halt it: %s.", stop.name, exc)
+            logger.critical("%s is stuck in its %s and no other thread can %s: %s.", stop.name, what, done, exc)
 
 
-def _key(target: Target) -> Hashable:
-    """Return an identity that is equal for the same target."""
-    body = body_of(target)
-    params = getattr(type(body), "__dataclass_params__", None)
-    if params is None or not (params.frozen and params.eq):
-        return id(body)
-    # By the identity of its parts, which may be robots without a hash, and by the value of a name.
-    parts = (getattr(body, each.name) for each in fields(cast(Any, body)))
-    return (type(body), *(part if isinstance(part, str) else id(part) for part in parts))
+def _judge(line: StopLine, stops: list[SubmittedStop]) -> None:
+    """Read the robot until ``stops``, and what comes meanwhile, have their verdicts."""
+    unread: list[SubmittedStop] = []
+    fresh: list[SubmittedStop] | None = list(stops)
+    while fresh is not None:
+        unread += [each for each in fresh if not _resolved(each, lambda pending: pending.known())]
+        if not unread:
+            return
+        reading = _reading(unread[-1])
+        fresh = line.more(stops)
+        # A thread that was given up looks no more.
+        last, now = fresh is None, time.monotonic()
+        unread = [each for each in unread if not _resolved(each, functools.partial(_judged, reading, last, now))]
+        if unread and not fresh:
+            time.sleep(READ_EVERY_S)
 
 
-def _end(attached: dict[Hashable, tuple[_Slot, object]], key: Hashable, slot: _Slot, reserve: _Wake) -> None:
+def _judged(reading: object, last: bool, now: float, pending: PendingVerdict) -> StopVerdict | None:
+    return pending.judged(reading, last=last or now >= pending.until)
+
+
+def _reading(stop: SubmittedStop) -> object:
+    try:
+        return None if stop.pending is None else stop.pending.read()
+    except BaseException as exc:  # noqa: BLE001 - whatever a robot raises is judged
+        return exc
+
+
+def _resolved(stop: SubmittedStop, judge: Callable[[PendingVerdict], StopVerdict | None]) -> bool:
+    """Resolve a stop by what ``judge`` says; False where that is nothing yet."""
+    pending = stop.pending
+    try:
+        verdict = None if pending is None else judge(pending)
+    except BaseException as exc:  # noqa: BLE001 - an answer that cannot be read is a robot that may be moving
+        verdict = StopVerdict(unknown={stop.name: f"its answer cannot be read ({type(exc).__name__})"})
+    if verdict is not None:
+        stop.resolve(verdict)
+    return verdict is not None or pending is None
+
+
+def _end(attached: dict[Hashable, tuple[TargetSlot, object]], key: Hashable, slot: TargetSlot, reserve: _Wake) -> None:
     # Called by the garbage collector, on any thread: it may take no lock.
     attached.pop(key, None)
     inbox, slot.wake, slot.owners = slot.wake, reserve, 0

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import logging
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal, cast
+from typing import Literal, TypeVar, cast
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
@@ -82,6 +83,64 @@ class StopVerdict:
         doubts = [f"{name} did not stop: {why}" for name, why in self.not_stopped.items()]
         doubts += [f"{name}: {why}" for name, why in self.unknown.items()]
         return error("; ".join(doubts), **fields)
+
+
+class PendingVerdict(ABC):
+    """Verdict of a halt that is over, where the robot has to be read for it.
+
+    Reading a robot may hang, and the next stop must not wait for that: whoever halted returns this, and it is read on
+    another thread. One reading serves all halts that were over when it began.
+
+    Args:
+        until: the moment, in monotonic s, from which a reading is the last one.
+    """
+
+    def __init__(self, until: float) -> None:
+        self.until = until
+
+    @abstractmethod
+    def known(self) -> StopVerdict | None:
+        """Return the verdict if the answer to the stop settles it without a reading."""
+
+    @abstractmethod
+    def read(self) -> object:
+        """Read what the robot says now. May block."""
+
+    @abstractmethod
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        """Return the verdict by a reading; None, unless it is the last, to read again."""
+
+    @abstractmethod
+    def unread(self, why: str) -> StopVerdict:
+        """Return the verdict where no reading came in time. Must not block."""
+
+
+READ_EVERY_S = 0.02
+"""Seconds between two readings of a robot that still moves after a halt."""
+
+
+def read_verdict(answer: StopVerdict | PendingVerdict) -> StopVerdict:
+    """Return the verdict of a halt, read on this thread for as long as that takes."""
+    if isinstance(answer, StopVerdict):
+        return answer
+    verdict = answer.known()
+    while verdict is None:
+        verdict = answer.judged(answer.read(), last=time.monotonic() >= answer.until)
+        if verdict is None:
+            time.sleep(READ_EVERY_S)
+    return verdict
+
+
+H = TypeVar("H", bound=Callable[..., StopVerdict])
+
+
+def halts_in_parts(halt: H) -> H:
+    """Mark a public ``halt`` whose parts the stop executor calls by itself.
+
+    A subclass that overrides it loses the mark, and is halted by its own.
+    """
+    vars(halt)["halts_in_parts"] = True
+    return halt
 
 
 def stop_level() -> StopLevel:

@@ -1,0 +1,116 @@
+"""Targets of a stop, as the stop executor sees them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Hashable
+from dataclasses import fields
+from typing import Any, Protocol, TypeGuard, cast, runtime_checkable
+
+from strands_robots.contract import Haltable, body_of
+from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.stopping import PendingVerdict, StopVerdict, graded
+
+logger = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class NotesMotion(Protocol):
+    """Target that notes its motions before its permits are void."""
+
+    def halt_ordered(self) -> None:
+        """Note what moves. Must not block."""
+
+
+@runtime_checkable
+class HaltsInParts(Protocol):
+    """Target whose verdict may have to be read after its halt.
+
+    Its public ``halt`` is marked by :func:`~strands_robots.safety.stopping.halts_in_parts`.
+    """
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
+        """Halt on this thread by ``deadline`` (monotonic s), unless the device blocks."""
+
+
+@runtime_checkable
+class DirectTarget(NotesMotion, HaltsInParts, Protocol):
+    """Target that says itself what is known while its :meth:`halt_here` blocks.
+
+    No second thread is started for it meanwhile: whatever blocks the first, such as its bus, would block the second.
+    """
+
+    def unanswered(self, why: str) -> StopVerdict:
+        """Return the verdict while :meth:`halt_here` has not returned. Must not block."""
+
+
+Target = Haltable | HaltsInParts
+
+
+def note_motion(target: object) -> None:
+    """Let a target note what moves, before its permits are void.
+
+    Never raises: a stop follows.
+    """
+    # Of its class: an attribute of the robot's own may be looked up anywhere. A check of a protocol costs more than
+    # a stop may.
+    note = getattr(type(target), "halt_ordered", None)
+    if note is not None:
+        try:
+            note(target)
+        except Exception:
+            logger.exception("A robot could not note what moves before its stop.")
+
+
+def revoke_permits(target: object) -> None:
+    """Void the permits of a target that has a gate of ours."""
+    try:
+        # Without its ``__getattr__``, which may look names up anywhere.
+        gate = object.__getattribute__(target, "gate")
+    except AttributeError:
+        return
+    if isinstance(gate, MotionGate):
+        gate.revoke()
+
+
+def has_parts(target: object) -> TypeGuard[HaltsInParts]:
+    """Return whether the executor calls the parts of its halt."""
+    kind = type(target)
+    halt = getattr(kind, "halt", None)
+    return hasattr(kind, "halt_here") and (halt is None or getattr(halt, "halts_in_parts", False))
+
+
+def is_direct(target: object) -> TypeGuard[DirectTarget]:
+    """Return whether it answers for itself while its halt blocks."""
+    return has_parts(target) and hasattr(type(target), "unanswered")
+
+
+class ForeignAnswer(PendingVerdict):
+    """A robot's own answer to its halt, which runs its code when it is graded."""
+
+    def __init__(self, answer: object, name: str) -> None:
+        super().__init__(0.0)
+        self._answer, self._name = answer, name
+
+    def known(self) -> StopVerdict:
+        return graded(self._answer, self._name)
+
+    def read(self) -> object:
+        return None
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict:
+        return self.known()
+
+    def unread(self, why: str) -> StopVerdict:
+        return StopVerdict(not_stopped={self._name: why})
+
+
+def target_key(target: Target) -> Hashable:
+    """Return an identity that is equal for the same target."""
+    body = body_of(target)
+    params = getattr(type(body), "__dataclass_params__", None)
+    if params is None or not (params.frozen and params.eq):
+        return id(body)
+    # By the identity of its parts, which may be robots without a hash, and by the value of a name.
+    parts = (getattr(body, each.name) for each in fields(cast(Any, body)))
+    return (type(body), *(part if isinstance(part, str) else id(part) for part in parts))
