@@ -21,8 +21,8 @@ METHODS = ("arm", "gamepad", "keyboard", "phone")
 class TeleopMixin:
     """Verbs of teleoperation for a host that has the members declared here.
 
-    One source drives a body at a time. The host's ``halt`` calls :meth:`teleop_stops`, and its ``starting`` is the
-    re-entrant lock under which it checks that a body is free and starts a motion.
+    One source drives a body at a time. The host's ``halt`` calls :meth:`void_teleoperation`, and its ``starting`` is
+    the re-entrant lock under which it checks that a body is free and starts a motion.
     """
 
     gate: MotionGate
@@ -143,12 +143,12 @@ class TeleopMixin:
             if led == robot:
                 self._teleop_waiting.void(name)
 
-    def teleop_stops(self, deadline: float) -> dict[str, Callable[[], object]]:
-        """Request the stop of every session; return the waits until ``deadline``."""
+    def void_teleoperation(self) -> dict[str, Rollout]:
+        """Void every session; return them as a halt names them."""
         running = self.teleoperating()
         for session in running.values():
-            session.request_stop()
-        return {f"teleoperation {name}": partial(session.ended_by, deadline) for name, session in running.items()}
+            session.void()
+        return {f"teleoperation {name}": session for name, session in running.items()}
 
     @cached_property
     def _teleop_leaders(self) -> dict[str, tuple[str, Callable[..., LeaderPolicy]]]:

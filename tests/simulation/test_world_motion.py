@@ -17,7 +17,7 @@ from strands_robots.contract import RolloutEvent
 from strands_robots.envelope import Envelope, error
 from strands_robots.safety.gate import Permit
 from strands_robots.safety.orders import StopOrder, new_epoch
-from strands_robots.safety.stopping import Outcome, StopVerdict, grade, halt_each
+from strands_robots.safety.stopping import Outcome, StopVerdict, grade, read_verdict
 from strands_robots.simulation import Simulation
 from strands_robots.simulation import world as world_module
 
@@ -490,12 +490,12 @@ def test_halt_during_a_reset_leaves_the_world_unchanged(world: Simulation, monke
     world.send_action({"shoulder_pan": 0.5}, "left")
     world.step(500)
 
-    def halted_again(sources: Any) -> StopVerdict:
+    def halted_again(answer: Any) -> StopVerdict:
         monkeypatch.undo()
         assert world.halt("another caller").stopped is True
-        return halt_each(sources)
+        return read_verdict(answer)
 
-    monkeypatch.setattr(world_module, "halt_each", halted_again)
+    monkeypatch.setattr(world_module, "read_verdict", halted_again)
     assert world.reset()["status"] == "error"
     assert world.get_observation("left")["shoulder_pan"] > 0.3
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import threading
-import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from strands_robots.policies.base import checked_action, is_velocity, numbers
 from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
-from strands_robots.policies.rollout import Rollout, RolloutObservers, rollout_options, unfollowed
+from strands_robots.policies.rollout import Rollout, RolloutObservers, RolloutsEnd, rollout_options, unfollowed
 from strands_robots.policies.settling import Settling, checked_rest_pose
 from strands_robots.recording.cameras import LazyFrames
 from strands_robots.safety.gate import (
@@ -40,7 +39,7 @@ from strands_robots.safety.gate import (
 )
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stopping import StopLevel, StopVerdict, checked_level, halt_each, halts_in_parts
+from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
 
@@ -115,6 +114,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         self._moved: dict[str, None] = {}
         self._halting: dict[str, None] = {}
         self._frozen_at = -1
+        self._latest_halt: StopVerdict | PendingVerdict = StopVerdict()
 
     @property
     def safety_key(self) -> str:
@@ -331,7 +331,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         task = self._task
         if task is None or not task.running:
             return success("No task runs.", stopped=True, was_running=False, **self._task_fields())
-        task.request_stop()
+        task.void()
         verdict = stop_executor().halt(_TaskStop(self._body, task), self.tool_name_str, "stop_task")
         fields = {"stopped": bool(verdict.stopped), "was_running": True, **self._task_fields()}
         if verdict.stopped:
@@ -363,23 +363,20 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         """Note what moves; a loop whose permit is void counts as halted."""
         self._moved.update(dict.fromkeys(self._moving()))
 
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
-        """Halt on the stop executor's thread; return by ``deadline`` if the bus does."""
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
+        """Halt on the stop executor's thread, unless the bus blocks; wait for no loop."""
         ordered = self.gate.generation
-        if self._settling is not None and self._settling.running and ordered == self._frozen_at:
-            # Ordered before the halt that began to settle had frozen the robot: the two are one stop.
-            return StopVerdict(settling=True)
-        with self._halted(deadline) as verdicts:
+        if ordered == self._frozen_at and not self._body.driven:
             # A halt that waited for the bus when this one was ordered has frozen the robot for both.
-            if ordered != self._frozen_at or self._body.driven:
-                seen = self.gate.generation
-                self._body.stop()
-                self._frozen_at = seen
-        verdict = self._settled_after(*verdicts)
-        logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
-        return verdict
+            return self._latest_halt
+        with self._halted(deadline, self._settled_after) as verdicts:
+            seen = self.gate.generation
+            self._body.stop()
+            self._frozen_at = seen
+        self._latest_halt = verdicts[0]
+        return self._latest_halt
 
-    def release_here(self, motors: Collection[str], deadline: float) -> StopVerdict:
+    def release_here(self, motors: Collection[str], deadline: float) -> StopVerdict | PendingVerdict:
         """Halt and switch torque off on the stop executor's thread."""
         if self._settling is not None:
             self._settling.take()
@@ -388,30 +385,32 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         return verdicts[0]
 
     @contextmanager
-    def _halted(self, deadline: float) -> Iterator[list[StopVerdict]]:
-        """Void every permit and ask every loop to end; inside, the body is frozen.
+    def _halted(
+        self, deadline: float, then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict
+    ) -> Iterator[list[StopVerdict | PendingVerdict]]:
+        """Void every permit and loop; inside, the body is frozen.
 
-        Yields a list that has the verdict afterwards.
+        Yields a list that has the verdict afterwards, which ``then`` makes of the halt's own.
         """
-        verdicts: list[StopVerdict] = []
+        verdicts: list[StopVerdict | PendingVerdict] = []
         moved = self._halting = dict.fromkeys([*self._moved, *self._moving()])
         self._moved = {}
         self.gate.revoke()
-        ends = self._ends(deadline)
+        loops = self._voided_loops()
         try:
             with self._body.stopping():
                 yield verdicts
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
             verdicts.append(_unfrozen(_failure(self.tool_name_str, exc), moved))
         else:
-            verdicts.append(halt_each({**dict.fromkeys(moved, _stopped), **ends}))
+            verdicts.append(RolloutsEnd(moved, loops, deadline, then).at_once())
         finally:
             self._halting = {}
 
     def unanswered(self, why: str) -> StopVerdict:
         """Return the verdict while the bus does not answer."""
         if self._frozen_at == self.gate.generation:
-            return halt_each(self._ends(time.monotonic()))
+            return RolloutsEnd((), self._voided_loops(), 0.0).unread(why)
         return _unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
 
     @answered
@@ -439,11 +438,16 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         return success(f"Torque is off: {', '.join(answer['released'])}.", **fields)
 
     def _settled_after(self, verdict: StopVerdict) -> StopVerdict:
-        """Let a robot that was just frozen settle, if it does so."""
-        settling = self._settling
-        if settling is None or not settling.take() or not verdict.stopped:
+        """Let a robot that was frozen settle, if it does so and no other stop came."""
+        settling, generation = self._settling, self._frozen_at
+        if settling is None:
             return verdict
-        return replace(verdict, settling=settling.begin(self._frozen_at))
+        if generation != self.gate.generation:
+            # The two stops are one, and the later one lets the arm settle.
+            return replace(verdict, settling=settling.running)
+        if not settling.take() or not verdict.stopped:
+            return verdict
+        return replace(verdict, settling=settling.begin(generation))
 
     def wait_settled(self) -> str:
         """Wait for the end of a settling, at most 6 s; return a sentence on it."""
@@ -501,14 +505,14 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         task += ["settling"] if self._settling is not None and self._settling.running else []
         return task + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
 
-    def _ends(self, deadline: float) -> dict[str, Callable[[], object]]:
-        """Ask every loop to end; how to wait for each."""
-        ends: dict[str, Callable[[], object]] = {}
+    def _voided_loops(self) -> dict[str, Rollout]:
+        """Void every running loop; return them as a verdict names them."""
+        loops: dict[str, Rollout] = {}
         task = self._task
         if task is not None and task.running:
-            task.request_stop()
-            ends["task"] = partial(task.ended_by, deadline)
-        return ends | self.teleop_stops(deadline)
+            task.void()
+            loops["task"] = task
+        return loops | self.void_teleoperation()
 
     def _task_of(
         self, instruction: str, provider: str, duration: float, options: dict[str, Any]
@@ -628,12 +632,12 @@ class _TaskStop:
     def halt_ordered(self) -> None:
         """The caller has noted the task."""
 
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         try:
             self.body.stop()
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
             return self.unanswered(_failure(self.body.name, exc))
-        return halt_each({"task": partial(self.task.ended_by, deadline)})
+        return RolloutsEnd((), {"task": self.task}, deadline)
 
     def unanswered(self, why: str) -> StopVerdict:
         return StopVerdict(not_stopped={"task": why})
@@ -650,7 +654,7 @@ class _TorqueRelease:
         """Note what moves."""
         self.robot.halt_ordered()
 
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         return self.robot.release_here(self.motors.split(",") if self.motors else (), deadline)
 
     def unanswered(self, why: str) -> StopVerdict:
@@ -661,10 +665,6 @@ def _failure(name: str, exc: Exception) -> str:
     problem = f"it could not be frozen: {type(exc).__name__}: {exc}"
     logger.critical("%s did not stop: %s", name, problem)
     return problem
-
-
-def _stopped() -> Envelope:
-    return success("Stopped.", stopped=True)
 
 
 def _unfrozen(problem: str, moving: Mapping[str, None]) -> StopVerdict:

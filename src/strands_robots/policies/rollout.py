@@ -12,8 +12,9 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any, Literal, Protocol, TypedDict
 
 from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
@@ -31,6 +32,7 @@ from strands_robots.policies.base import (
 )
 from strands_robots.policies.loop_counts import Counted
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
@@ -292,9 +294,17 @@ class Rollout:
         return not self.running
 
     def request_stop(self) -> None:
-        """Void the permit, wake the loop and interrupt the policy; return at once."""
+        """Void the permit, wake the loop and interrupt the policy."""
+        self.void()
+        self.interrupt()
+
+    def void(self) -> None:
+        """Void the permit and wake the loop; asks nothing of the policy."""
         self._permit.withdraw()
         self._stop_requested.set()
+
+    def interrupt(self) -> None:
+        """Interrupt the policy, which may take its time: no halt waits for this."""
         try:
             self._policy.interrupt()
         except Exception:
@@ -445,3 +455,56 @@ class Rollout:
                 **more,
             )
         )
+
+
+class RolloutsEnd(PendingVerdict):
+    """Verdict of a halt that has voided loops, and does not wait for their ends.
+
+    Args:
+        moved: what has moved and was frozen.
+        loops: the voided rollouts, by what a verdict calls them.
+        until: the moment, in monotonic s, until which their ends are waited for.
+        then: makes the final verdict.
+    """
+
+    def __init__(
+        self,
+        moved: Iterable[str],
+        loops: Mapping[str, Rollout],
+        until: float,
+        then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict,
+    ) -> None:
+        # The reading itself waits for the end of a loop.
+        super().__init__(until, pause_s=0.0)
+        self._moved, self._loops, self._then = tuple(moved), loops, then
+        self._final: StopVerdict | None = None
+
+    def at_once(self) -> StopVerdict | PendingVerdict:
+        """Return the verdict where no loop has to end, else this."""
+        return self if self._loops else self._then(self._found())
+
+    def known(self) -> StopVerdict | None:
+        for each in self._loops.values() if self._final is None else ():
+            each.interrupt()
+        return self.judged(None, last=False)
+
+    def read(self) -> None:
+        for each in self._loops.values():
+            if each.running:
+                each.join(READ_EVERY_S)
+                return
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        found = self._found()
+        if self._final is None and (found.stopped or last):
+            # Once: it may have the robot settle.
+            self._final = self._then(found)
+        return self._final
+
+    def unread(self, why: str) -> StopVerdict:
+        return self._found()
+
+    def _found(self) -> StopVerdict:
+        still = success("Stopped.", stopped=True)
+        ends = {name: partial(each.ended_by, time.monotonic()) for name, each in self._loops.items()}
+        return halt_each({**{name: lambda: still for name in self._moved}, **ends})

@@ -35,7 +35,7 @@ from strands_robots.safety.stop_targets import (
     revoke_permits,
     target_key,
 )
-from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict
+from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.safety.submitted_stops import Answered, StopLine, SubmittedStop, TargetSlot
 
 logger = logging.getLogger(__name__)
@@ -371,22 +371,23 @@ def _judge(line: StopLine, stops: list[SubmittedStop]) -> None:
         unread += [each for each in fresh if not _resolved(each, lambda pending: pending.known())]
         if not unread:
             return
-        reading = _reading(unread[-1])
+        newest = unread[-1].pending
+        reading = _reading(newest)
         fresh = line.more(stops)
         # A thread that was given up looks no more.
         last, now = fresh is None, time.monotonic()
         unread = [each for each in unread if not _resolved(each, functools.partial(_judged, reading, last, now))]
-        if unread and not fresh:
-            time.sleep(READ_EVERY_S)
+        if unread and not fresh and newest is not None:
+            time.sleep(newest.pause_s)
 
 
 def _judged(reading: object, last: bool, now: float, pending: PendingVerdict) -> StopVerdict | None:
     return pending.judged(reading, last=last or now >= pending.until)
 
 
-def _reading(stop: SubmittedStop) -> object:
+def _reading(pending: PendingVerdict | None) -> object:
     try:
-        return None if stop.pending is None else stop.pending.read()
+        return None if pending is None else pending.read()
     except BaseException as exc:  # noqa: BLE001 - whatever a robot raises is judged
         return exc
 

@@ -85,6 +85,10 @@ class StopVerdict:
         return error("; ".join(doubts), **fields)
 
 
+READ_EVERY_S = 0.02
+"""Seconds between two readings of a robot that still moves after a halt."""
+
+
 class PendingVerdict(ABC):
     """Verdict of a halt that is over, where the robot has to be read for it.
 
@@ -93,10 +97,11 @@ class PendingVerdict(ABC):
 
     Args:
         until: the moment, in monotonic s, from which a reading is the last one.
+        pause_s: seconds between two readings.
     """
 
-    def __init__(self, until: float) -> None:
-        self.until = until
+    def __init__(self, until: float, pause_s: float = READ_EVERY_S) -> None:
+        self.until, self.pause_s = until, pause_s
 
     @abstractmethod
     def known(self) -> StopVerdict | None:
@@ -115,10 +120,6 @@ class PendingVerdict(ABC):
         """Return the verdict where no reading came in time. Must not block."""
 
 
-READ_EVERY_S = 0.02
-"""Seconds between two readings of a robot that still moves after a halt."""
-
-
 def read_verdict(answer: StopVerdict | PendingVerdict) -> StopVerdict:
     """Return the verdict of a halt, read on this thread for as long as that takes."""
     if isinstance(answer, StopVerdict):
@@ -127,7 +128,7 @@ def read_verdict(answer: StopVerdict | PendingVerdict) -> StopVerdict:
     while verdict is None:
         verdict = answer.judged(answer.read(), last=time.monotonic() >= answer.until)
         if verdict is None:
-            time.sleep(READ_EVERY_S)
+            time.sleep(answer.pause_s)
     return verdict
 
 

@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,9 +22,16 @@ from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
-from strands_robots.policies.rollout import STOP_JOIN_S, Rollout, RolloutObservers, rollout_options, unfollowed
+from strands_robots.policies.rollout import (
+    STOP_JOIN_S,
+    Rollout,
+    RolloutObservers,
+    RolloutsEnd,
+    rollout_options,
+    unfollowed,
+)
 from strands_robots.safety.gate import MotionGate, Waiting, answered
-from strands_robots.safety.stopping import StopLevel, StopVerdict, halt_each
+from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.simulation import projection
 from strands_robots.simulation.body import PICTURE, RobotBody
 from strands_robots.simulation.objects import targets_of
@@ -268,7 +274,7 @@ class Simulation(ArmMixin, TeleopMixin):
         with self.starting:
             # Nothing starts a rollout while this lock is held; a stop that comes meanwhile voids the fresh permit.
             permit = self.gate.renew(permit)
-            verdict = self._freeze("reset")
+            verdict = read_verdict(self._freeze(time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")))
             if not verdict.stopped:
                 return verdict.envelope()
             self.physics.reset(permit)
@@ -427,8 +433,9 @@ class Simulation(ArmMixin, TeleopMixin):
             # After a single action the servos go on to its targets.
             self._torque.freeze_one(body)
             return success(f"{body.name} ran no policy; it is held.", robot=body.name, stopped=True, was_running=False)
-        rollout.request_stop()
+        rollout.void()
         self._torque.freeze_one(body)
+        rollout.interrupt()
         stopped = bool(rollout.ended_by(time.monotonic() + STOP_JOIN_S)["stopped"])
         row = {**_row(rollout), "stopped": stopped, "was_running": True}
         if not stopped:
@@ -460,17 +467,18 @@ class Simulation(ArmMixin, TeleopMixin):
         rollout = self._running().get(robot)
         return "" if rollout is None else f"the policy {rollout.policy_name} ({rollout.instruction!r})"
 
+    @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
-        """Stop everything that moves a robot, freeze all; then as the stop level says.
+        """Stop everything that moves a robot, freeze all; then as the stop level says."""
+        return read_verdict(self.halt_here(reason, time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")))
 
-        The gate is revoked first and the setpoints are frozen second; both take microseconds, and after them no
-        action is written, whatever a policy is doing. Last it waits for the loops to end, to report whether they did.
-        """
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
+        """Void every permit, freeze, and leave the ends of the loops to be read."""
         try:
             self.halt_ordered()
         finally:
             generation = self.gate.revoke()
-        return self._torque.after(self._freeze(reason), generation)
+        return self._freeze(deadline, lambda verdict: self._torque.after(verdict, generation))
 
     def halt_ordered(self) -> None:
         """Note what moves; a loop whose permit is void counts as halted."""
@@ -664,20 +672,14 @@ class Simulation(ArmMixin, TeleopMixin):
                 rollout.start()
                 return rollout
 
-    def _freeze(self, reason: str) -> StopVerdict:
-        deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
+    def _freeze(
+        self, deadline: float, then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict
+    ) -> StopVerdict | PendingVerdict:
         self._torque.freeze(self.physics, self._clock)
         moved, self._moved = self._moved, {}
-        running = self._running()
-        for rollout in running.values():
-            rollout.request_stop()
-        sources: dict[str, Callable[[], object]] = {
-            **dict.fromkeys(moved, partial(success, "Stopped.", stopped=True)),
-            **{name: partial(rollout.ended_by, deadline) for name, rollout in running.items()},
-            **self.teleop_stops(deadline),
-        }
-        logger.info("Halting %s (%s): %s.", self.tool_name_str, reason or "no reason given", ", ".join(sources) or "-")
-        return halt_each(sources)
+        for rollout in (running := self._running()).values():
+            rollout.void()
+        return RolloutsEnd(moved, running | self.void_teleoperation(), deadline, then).at_once()
 
 
 def _row(rollout: Rollout) -> dict[str, Any]:
