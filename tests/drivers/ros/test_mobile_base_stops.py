@@ -14,6 +14,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.ros.link import OnMessage, RosError, Unwatch
 from strands_robots.ros.memory import MemoryLink
+from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import Outcome, grade
 
 
@@ -363,3 +364,20 @@ def test_halt_without_a_thread_sends_a_zero_over_the_connection_that_exists(
         patched.setattr(threading.Thread, "start", none_left)
         assert robot.halt().stopped
     assert (len(link.urgent), velocities(link)) == (urgent, [(0.0, 0.0)] * behind)
+
+
+def test_each_stop_sends_its_zero_while_odometry_is_silent(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "30")
+    robot = made(odom_topic="/odom", publish_rate=1.0)
+    stops = []
+    for number in range(5):
+        stops.append(stop_executor().submit(robot, "base", "test"))
+        eventually(lambda number=number: len(memory(robot).sent) > number, what="its zero")  # type: ignore[misc]
+    assert not any(each.done() for each in stops)
+
+    def all_told() -> bool:
+        tell_speed(memory(robot), 0.0)
+        return all(each.done() for each in stops)
+
+    eventually(all_told)
+    assert all(each.result().stopped for each in stops)

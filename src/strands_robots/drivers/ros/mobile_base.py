@@ -21,7 +21,7 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, RosLink
 from strands_robots.ros.names import bare_kind, graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole
 
 logger = logging.getLogger(__name__)
@@ -29,6 +29,9 @@ logger = logging.getLogger(__name__)
 TWIST = "geometry_msgs/msg/Twist"
 ANSWER_SHARE = 0.9
 """Part of the halt deadline that a halt waits for stillness; the rest is for its verdict to arrive in time."""
+
+LOOK_S = 0.005
+"""Seconds between two looks at a base that is to come to rest."""
 
 LINK_ERRORS = (RosError, MissingExtraError)
 NO_POLICIES = "{} is a mobile base and runs no policies; use drive."
@@ -212,6 +215,7 @@ class MobileBaseRobot:
         drive = self._motion
         self._driven |= self._latched or (isinstance(drive, Drive) and not drive.ended.is_set())
 
+    @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """Void every permit, send zeros until the base is still, return the verdict.
 
@@ -221,6 +225,11 @@ class MobileBaseRobot:
         """
         began = time.monotonic()
         deadline = began + ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+        verdict = read_verdict(self.halt_here(reason, deadline))
+        return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
+
+    def halt_here(self, reason: str, deadline: float) -> PendingVerdict:
+        """Void every permit and begin to send zeros; leave the base's rest to be read."""
         self.halt_ordered()
         self.gate.revoke()
         self._odometry.expect_stillness()
@@ -228,11 +237,9 @@ class MobileBaseRobot:
         driven, self._driven = self._driven, False
         if drive is not None:
             drive.interrupt()
-        hold = self._hold.begin()
-        verdict = self._verdict(hold, drive, driven, deadline)
-        self._latched = self._latched and not verdict.stopped
-        logger.info("Halted %s (%s): %s", self.tool_name_str, reason or "no reason given", verdict.stopped)
-        return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
+        return _BaseAtRest(
+            self._hold.begin(), drive, odometry=self._odometry, driven=driven, until=deadline, then=self._halted
+        )
 
     # Reads.
 
@@ -424,24 +431,9 @@ class MobileBaseRobot:
         self._odometry.start_in_background()
         return self._odometry.still
 
-    def _verdict(self, hold: ZeroVelocityHold, drive: Drive | None, driven: bool, deadline: float) -> StopVerdict:
-        source = "drive" if driven else "velocity"
-        hold.sent.wait(max(0.0, deadline - time.monotonic()))
-        if not hold.sent.is_set():
-            why = hold.problem or "the link did not take the zero in time"
-            return StopVerdict(not_stopped={source: why})
-        if drive is not None and not drive.ended.wait(max(0.0, deadline - time.monotonic())):
-            return StopVerdict(not_stopped={source: "the drive has not ended in time"})
-        if self._odometry.topic is not None:
-            while not self._odometry.still and time.monotonic() < deadline:
-                time.sleep(0.005)
-            if self._odometry.still is None:
-                return StopVerdict(unknown={source: f"zeros are sent, but {self._odometry.topic} is silent"})
-            if not self._odometry.still:
-                linear, angular = self._odometry.last_speeds or (0.0, 0.0)
-                why = f"zeros are sent, but odometry still reports {linear:.2f} m/s and {angular:.2f} rad/s"
-                return StopVerdict(not_stopped={source: why})
-        return StopVerdict(halted=("drive",) if driven else ())
+    def _halted(self, verdict: StopVerdict) -> StopVerdict:
+        self._latched = self._latched and not verdict.stopped
+        return verdict
 
     def _read(self, verb: str, argument: str, source: tuple[str | None, str | None], timeout: object) -> Envelope:
         try:
@@ -452,6 +444,59 @@ class MobileBaseRobot:
         except (ValidationError, *LINK_ERRORS) as exc:
             return error(str(exc))
         return success(f"One message of {source[0]}.", topic=source[0], message=message)
+
+
+class _BaseAtRest(PendingVerdict):
+    """Verdict on a base to which zeros go out.
+
+    Args:
+        then: gets the final verdict.
+    """
+
+    def __init__(
+        self,
+        hold: ZeroVelocityHold,
+        drive: Drive | None,
+        *,
+        odometry: OdometryMonitor,
+        driven: bool,
+        until: float,
+        then: Callable[[StopVerdict], StopVerdict],
+    ) -> None:
+        # The reading itself waits.
+        super().__init__(until, pause_s=0.0)
+        self._hold, self._drive, self._odometry, self._then = hold, drive, odometry, then
+        self._driven = driven
+        self._source = "drive" if driven else "velocity"
+
+    def known(self) -> StopVerdict | None:
+        return self.judged(None, last=False)
+
+    def read(self) -> None:
+        if not self._hold.sent.is_set():
+            self._hold.sent.wait(LOOK_S)
+        elif self._drive is not None and not self._drive.ended.is_set():
+            self._drive.ended.wait(LOOK_S)
+        else:
+            time.sleep(LOOK_S)
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        verdict = self.unread("")
+        return self._then(verdict) if verdict.stopped or last else None
+
+    def unread(self, why: str) -> StopVerdict:
+        source, odometry = self._source, self._odometry
+        if not self._hold.sent.is_set():
+            return StopVerdict(not_stopped={source: self._hold.problem or "the link did not take the zero in time"})
+        if self._drive is not None and not self._drive.ended.is_set():
+            return StopVerdict(not_stopped={source: "the drive has not ended in time"})
+        if odometry.topic is not None and odometry.still is None:
+            return StopVerdict(unknown={source: f"zeros are sent, but {odometry.topic} is silent"})
+        if odometry.topic is not None and not odometry.still:
+            linear, angular = odometry.last_speeds or (0.0, 0.0)
+            why = f"zeros are sent, but odometry still reports {linear:.2f} m/s and {angular:.2f} rad/s"
+            return StopVerdict(not_stopped={source: why})
+        return StopVerdict(halted=("drive",) if self._driven else ())
 
 
 class PosedBaseRobot(MobileBaseRobot):

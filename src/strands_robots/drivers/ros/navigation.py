@@ -84,13 +84,6 @@ class Navigation(BaseMotion):
     def _lost_goal(self) -> Goal | None:
         return None if self.report is None else self.report.lost_goal
 
-    def wait_until_over(self, within_s: float) -> None:
-        """Wait for the end of the goal, including the late end of a lost one."""
-        deadline = time.monotonic() + within_s
-        self.ended.wait(within_s)
-        if self._lost_goal is not None:
-            self._lost_goal.done.wait(max(0.0, deadline - time.monotonic()))
-
     def cancel_again(self) -> None:
         """Cancel a lost goal once more."""
         lost = self._lost_goal

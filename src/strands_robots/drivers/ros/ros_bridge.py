@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 from typing import Any
 
-from strands_robots import settings
-from strands_robots.drivers.ros.mobile_base import ANSWER_SHARE, TWIST, AgentVerb, PosedBaseRobot
+from strands_robots.drivers.ros.mobile_base import TWIST, AgentVerb, PosedBaseRobot
 from strands_robots.drivers.ros.navigation import Destination, Navigation
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
@@ -16,7 +14,7 @@ from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name, interface
 from strands_robots.ros.ros2 import Ros2Link
 from strands_robots.safety.gate import Permit
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.utils import ValidationError, number, text
 
 NAVIGATE = "nav2_msgs/action/NavigateToPose"
@@ -134,29 +132,19 @@ class RosBridgedRobot(PosedBaseRobot):
         refusal = self._run_in_background(goal)
         return refusal or success(f"On the way: {goal.instruction}.", timeout=goal.to.timeout_s)
 
-    def halt(self, reason: str = "") -> StopVerdict:
-        """Cancel the navigation goal and stop the base; see :meth:`MobileBaseRobot.halt`.
+    def halt_here(self, reason: str, deadline: float) -> PendingVerdict:
+        """Cancel the navigation goal and stop the base.
 
         A goal that its server has not ended by the deadline is a base that did not stop: its stack may send
         velocities beside our zeros.
         """
-        began = time.monotonic()
         goal = self._navigation
         if goal is None or goal.doubt() is None:
-            return super().halt(reason)
+            return super().halt_here(reason, deadline)
         # Revoking the permit cancels a goal that is still waited for; a lost one is cancelled again.
         self.gate.revoke()
         not_cancelled = self._cancel_again(goal) if goal.ended.is_set() else ""
-        verdict = super().halt(reason)
-        left = ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S") - (time.monotonic() - began)
-        goal.wait_until_over(max(0.0, left))
-        doubt = goal.doubt()
-        spent = (time.monotonic() - began) * 1000
-        if doubt is None:
-            return replace(verdict, halted=(*verdict.halted, "navigation"), elapsed_ms=spent)
-        return replace(
-            verdict, not_stopped={**verdict.not_stopped, "navigation": doubt + not_cancelled}, elapsed_ms=spent
-        )
+        return _NavigationOver(super().halt_here(reason, deadline), goal, not_cancelled)
 
     def disconnect(self) -> None:
         """Cancel the navigation goal too, and give it a moment to end."""
@@ -205,3 +193,36 @@ class RosBridgedRobot(PosedBaseRobot):
         except RuntimeError as exc:
             return f"; its server was not asked again: {exc}"
         return ""
+
+
+class _NavigationOver(PendingVerdict):
+    """Verdict on a base and on the end of its navigation goal.
+
+    Args:
+        base: the verdict on the base alone.
+        not_cancelled: added to the doubt about the goal.
+    """
+
+    def __init__(self, base: PendingVerdict, goal: Navigation, not_cancelled: str) -> None:
+        super().__init__(base.until, pause_s=0.0)
+        self._base, self._goal, self._not_cancelled = base, goal, not_cancelled
+
+    def known(self) -> StopVerdict | None:
+        return self.judged(None, last=False)
+
+    def read(self) -> None:
+        self._base.read()
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        base = self._base.judged(reading, last=last)
+        over = self._goal.doubt() is None
+        return None if base is None or not (over or last) else self._with_goal(base)
+
+    def unread(self, why: str) -> StopVerdict:
+        return self._with_goal(self._base.unread(why))
+
+    def _with_goal(self, base: StopVerdict) -> StopVerdict:
+        doubt = self._goal.doubt()
+        if doubt is None:
+            return replace(base, halted=(*base.halted, "navigation"))
+        return replace(base, not_stopped={**base.not_stopped, "navigation": doubt + self._not_cancelled})
