@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fixtures.waiting import eventually
@@ -15,6 +16,7 @@ from fixtures.waiting import eventually
 from strands_robots import audit, settings
 from strands_robots.audit import flush_audit
 from strands_robots.policies import settling
+from strands_robots.safety.stop_log import flush_stop_log
 
 # What is set in the shell that starts the tests would change what they say; how pictures are made stays as it is.
 for setting in settings.declared():
@@ -57,6 +59,23 @@ def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     monkeypatch.setattr(audit, "FLUSH_S", 20.0)
     yield directory
     flush_audit(0.5)
+
+
+class _WrittenLog:
+    """The log as a test reads it, once the records of the safety plane are in it."""
+
+    def __init__(self, log: pytest.LogCaptureFixture) -> None:
+        self._log = log
+
+    def __getattr__(self, name: str) -> Any:
+        flush_stop_log(20.0)
+        return getattr(self._log, name)
+
+
+@pytest.fixture
+def caplog(caplog: pytest.LogCaptureFixture) -> Any:
+    """Pytest's log; the safety plane's records are written on a thread of their own."""
+    return _WrittenLog(caplog)
 
 
 @pytest.fixture

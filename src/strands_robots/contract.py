@@ -7,7 +7,6 @@ Networks, tools and the command line reach a robot only through these protocols.
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -20,6 +19,7 @@ from weakref import WeakKeyDictionary
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import (
     PendingVerdict,
     StopVerdict,
@@ -31,7 +31,7 @@ from strands_robots.safety.stopping import (
 )
 from strands_robots.utils import ValidationError, shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 Joints = dict[str, float]
 

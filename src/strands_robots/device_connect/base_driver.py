@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
-import logging
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -32,6 +31,7 @@ from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control import ControlChange
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
@@ -40,7 +40,7 @@ from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.utils import WAIT_S, ValidationError, shown, text
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 T = TypeVar("T")
 

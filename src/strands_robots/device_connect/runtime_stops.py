@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 from typing import Any, Protocol
 
 from device_connect_edge.messaging.exceptions import MessagingError
@@ -16,8 +15,9 @@ from device_connect_edge.messaging.exceptions import MessagingError
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.discovery import parts
 from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.stop_log import stop_logger
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 
 class RegisteredDevice(Protocol):

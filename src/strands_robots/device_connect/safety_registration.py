@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import time
 from collections.abc import Mapping
 from functools import cached_property
@@ -23,8 +22,9 @@ from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_log import stop_logger
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 
 def register_safety(

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import atexit
 import contextlib
-import logging
 import threading
 import weakref
 from collections.abc import Callable, Collection
@@ -19,11 +18,12 @@ from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, VERDICT, OnEvent, OnState, StopLink
+from strands_robots.safety.stop_log import stop_logger
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends.zenoh_session import LinkedSession
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 RETRY_S = 0.25
 TRY_MS = 1000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -18,10 +17,11 @@ from strands_robots.hardware.device_facts import require_port
 from strands_robots.hardware.speed import default_speeds
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopLevel
 from strands_robots.utils import ValidationError, number, shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 T = TypeVar("T")
 

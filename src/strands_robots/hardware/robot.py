@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -39,6 +38,7 @@ from strands_robots.safety.gate import (
 )
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm
     from strands_robots.kinematics.motion import Motion
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 WIND_DOWN_S = 5.0
 """Seconds beyond its duration that :meth:`HardwareRobot.run_task` waits for a task."""

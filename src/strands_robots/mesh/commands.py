@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from functools import partial
@@ -17,6 +16,7 @@ from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
@@ -27,7 +27,7 @@ from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
 from strands_robots.utils import ValidationError, shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 MISSING_COMMAND = "missing or malformed command"
 REPLAYED = "replay rejected"

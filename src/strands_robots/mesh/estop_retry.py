@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -11,10 +10,11 @@ from typing import Any
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.older_peers import SAFETY_S
 from strands_robots.mesh.rpc import Requester, stop_outcome
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, explain
 from strands_robots.utils import shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 RETRY_EVERY_S = SAFETY_S
 RETRY_ANSWER_S = 1.0

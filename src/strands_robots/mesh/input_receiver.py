@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import Counter
@@ -22,9 +21,10 @@ from strands_robots.mesh.transport import Sample
 from strands_robots.policies.base import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 ApplyFn = Callable[[Any, dict[str, float]], Any]
 

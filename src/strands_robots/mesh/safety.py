@@ -44,6 +44,7 @@ from strands_robots.safety.peer_answers import (
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
 from strands_robots.safety.statements import Proof, Purpose, proof_of
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Own
@@ -52,7 +53,7 @@ from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.utils import ValidationError, identifier
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 COLLECT_S = 3.0
 """Seconds in which the answers to an e-stop are collected."""

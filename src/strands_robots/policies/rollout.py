@@ -7,7 +7,6 @@ A rollout that ends in any other way than a halt makes the body hold its positio
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -32,12 +31,13 @@ from strands_robots.policies.base import (
 )
 from strands_robots.policies.loop_counts import Counted
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 State = Literal["idle", "running", "completed", "stopped", "error"]
 

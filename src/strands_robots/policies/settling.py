@@ -7,7 +7,6 @@ each in its own time.
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -22,9 +21,10 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.policies.base import Action, Ranges
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, Permit, PermitVoidError
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, mapping, number, shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 SETTLE_S = 5.0
 """Longest time that an arm may take to its rest pose, in seconds."""

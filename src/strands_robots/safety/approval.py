@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import secrets
 from collections.abc import Callable, Sequence
@@ -21,9 +20,10 @@ from pathlib import Path
 
 from strands_robots import settings
 from strands_robots.safety.state_files import boot, make_private, read_private, require_private, uptime
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import identifier, number
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 GRANT_S = 300.0
 """Seconds for which a grant is good when the operator states nothing else."""

@@ -9,16 +9,16 @@ The lists are comma lists of case-sensitive globs (:func:`fnmatch.fnmatchcase`),
 
 from __future__ import annotations
 
-import logging
 import re
 import threading
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase, translate
 
 from strands_robots import settings
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 ANONYMOUS = "anonymous"
 """The entry that admits callers without a name, which the framework's plain agent tools are."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import secrets
 import time
@@ -30,9 +29,10 @@ from strands_robots.safety.state_files import (
     require_private,
     uptime,
 )
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import identifier, text
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 VALID_S = 60.0
 

@@ -7,7 +7,6 @@ and no telemetry of its process stands before a stop.
 from __future__ import annotations
 
 import json
-import logging
 import secrets
 import threading
 import time
@@ -33,10 +32,11 @@ from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, signed_bytes
 from strands_robots.safety.statements import Proof, Purpose, proof_of
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError, device_id, number
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 REPEAT_S = (0.005, 0.005, 0.01, 0.01, 0.02, 0.05, 0.1, 0.2)
 """Pauses between repetitions; the last one goes on. Quick at first, for what is lost at once."""

@@ -8,7 +8,6 @@ the stop executor: two hand-offs.
 from __future__ import annotations
 
 import json
-import logging
 import secrets
 import threading
 import time
@@ -24,10 +23,11 @@ from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import LISTENER, RobotReport, StopOrder, StopRefused, StopRules, params_of
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 ESTOP = "emergencyStop"
 VERDICT = "emergencyStopVerdict"

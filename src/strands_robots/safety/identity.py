@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import logging
 import os
 import secrets
 import time
@@ -23,9 +22,10 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.state_files import OPEN, StateFileError, make_private, read_private, require_private
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import identifier
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 ROBOTS = "robots"
 """Folder of the keys of robots; a console's keys have a folder of their own."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
@@ -11,8 +10,9 @@ from strands_robots.audit import audit_head, log_witness
 from strands_robots.safety.identity import EnrolledKeys, KeyFileError, SigningIdentity
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Proof, Purpose, distrust, proof_of, signed
+from strands_robots.safety.stop_log import stop_logger
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 ANNOUNCED_S = 10.0
 """Seconds for which an announced lockout state is not signed anew while it stays the same."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import logging
 import os
 import re
 import threading
@@ -25,9 +24,10 @@ from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.state_files import StateFileError, adopt, make_private, read_private, require_private
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import field_values
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 VERSION = 2
 VERSION_OF_ALL = 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import threading
 import time
 from collections.abc import Collection, Iterable
@@ -26,12 +25,13 @@ from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
 from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.safety.turns import undisturbed
 from strands_robots.utils import ValidationError, identifier, shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 REPORTS_KEPT = 64
 HALT_AGAIN_S = 0.25

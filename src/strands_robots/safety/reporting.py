@@ -7,7 +7,6 @@ nothing else: the file is written by a thread of its own, and the audit has its 
 from __future__ import annotations
 
 import contextlib
-import logging
 import queue
 import random
 import threading
@@ -16,9 +15,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from strands_robots.safety.orders import RobotReport, StopOrder
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 GRACE_S = 0.03
 """Lockouts are written when every robot has answered, or after this long: a slow halt delays only its own report."""

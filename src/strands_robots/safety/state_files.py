@@ -8,15 +8,15 @@ taken from the clock since boot, which nobody can set.
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import stat
 import time
 from pathlib import Path
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.stop_log import stop_logger
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 FILE_MAX_BYTES = 16 * 2**20
 WRITABLE = 0o022

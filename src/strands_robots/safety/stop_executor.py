@@ -12,7 +12,6 @@ import contextlib
 import functools
 import heapq
 import itertools
-import logging
 import os
 import queue
 import threading
@@ -26,6 +25,7 @@ from typing import cast
 from strands_robots import settings
 from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.ready_threads import ReadyThreads
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import (
     HaltsInParts,
     Target,
@@ -38,7 +38,7 @@ from strands_robots.safety.stop_targets import (
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.safety.submitted_stops import Answered, StopLine, SubmittedStop, TargetSlot
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 RESERVE = 3
 """Threads that stand ready for all targets without a thread of their own."""

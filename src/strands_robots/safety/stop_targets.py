@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Hashable
 from dataclasses import fields
 from typing import Any, Protocol, TypeGuard, cast, runtime_checkable
 
 from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, graded
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 
 @runtime_checkable

@@ -7,7 +7,6 @@ a timeout and an unknown shape are four different answers, and only an affirmati
 
 from __future__ import annotations
 
-import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -17,9 +16,10 @@ from typing import Literal, TypeVar, cast
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, choice, shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 StopLevel = Literal["hold", "limp", "settle"]
 STOP_LEVELS = ("hold", "limp", "settle")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import queue
 import threading
 import time
@@ -11,10 +10,11 @@ from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field, replace
 
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import ForeignAnswer, Target, is_direct
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, graded
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 WAITING_MAX = 4096
 """Stops of one target that wait for its next halt. Beyond it the oldest is answered by its deadline alone."""

@@ -7,7 +7,6 @@ raises :class:`Refused`, which says which it was. Whatever is raised on the way 
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -21,13 +20,14 @@ from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import Approval, Claim
 from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.control import Admission, ControlLeases, NotHolderError, leases_of
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
 from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.utils import ValidationError
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 
 class RefusalReason(Enum):

@@ -6,7 +6,6 @@ flood costs its sender answers and no robot its stop, and answers are given on a
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
@@ -15,10 +14,11 @@ from functools import partial
 
 from strands_robots.contract import Haltable
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.workers import UNBOUNDED
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 CALLER_MAX = 256
 """Stops of one caller that wait for an answer; beyond it the caller's oldest loses its own."""

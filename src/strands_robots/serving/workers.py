@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import queue
 import sys
 import threading
@@ -22,8 +21,9 @@ from weakref import WeakKeyDictionary
 
 from strands_robots.contract import body_of
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.stop_log import stop_logger
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 T = TypeVar("T")
 Job = Callable[[], None]

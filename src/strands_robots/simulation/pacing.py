@@ -9,14 +9,14 @@ hand commands alone start nothing until the next lease, so the same steps give t
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 import time
 from collections.abc import Iterator
 
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.simulation.physics import Physics
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 TICK_S = 0.005
 """Period in which the pacing thread visits each running world."""

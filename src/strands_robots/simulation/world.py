@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -31,6 +30,7 @@ from strands_robots.policies.rollout import (
     unfollowed,
 )
 from strands_robots.safety.gate import MotionGate, Waiting, answered
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.simulation import projection
 from strands_robots.simulation.body import PICTURE, RobotBody
@@ -54,7 +54,7 @@ from strands_robots.simulation.stop_torque import StopTorque
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown, text, whole
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 STEPS_MAX = 1_000_000
 """Most steps of one call: about half a minute of computing for one arm."""

@@ -6,7 +6,6 @@ for 1.5 seconds: after a restart an old socket stays open and silent, so the soc
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -26,9 +25,10 @@ from strands_robots.drivers.reachy.links import (
 )
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
 from strands_robots.drivers.reachy.target import HeadPose
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, choice, json_object, port
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 FRESH_S = 1.5
 """Oldest sample that still counts, in seconds: joints come at 37 to 50 Hz."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import re
 import threading
 from collections.abc import Callable, Sequence
@@ -28,9 +27,10 @@ from strands_robots.drivers.reachy.rest import (
     url_host,
 )
 from strands_robots.drivers.reachy.target import Target
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier, json_object, missing_extra, shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 ZENOH_PORT = 7447
 DEFAULT_PREFIX = "reachy_mini"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -21,10 +20,11 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, RosLink
 from strands_robots.ros.names import bare_kind, graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 TWIST = "geometry_msgs/msg/Twist"
 ANSWER_SHARE = 0.9

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Mapping
@@ -13,9 +12,10 @@ from strands_robots.drivers.ros.motion import BaseMotion
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.link import Goal, GoalReport, Message, RosError, RosLink, run_goal
 from strands_robots.safety.gate import Permit
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import MissingExtraError
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 FEEDBACK_KEPT = 5
 """Number of the last samples of feedback that an answer carries."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -10,9 +9,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.ros.link import Message, RosError, RosLink, Unwatch
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import MissingExtraError
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 STILL_LINEAR = 0.01
 """m/s below which a base counts as still."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -18,8 +17,9 @@ from strands_robots.ros.link import (
     UrgentLink,
 )
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.stop_log import stop_logger
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 BLIND_HOLD_S = 5.0
 """Seconds of zeros, accepted without a failure, for a base whose odometry is silent."""
