@@ -15,13 +15,13 @@ from strands_robots.safety import ed25519
 from strands_robots.serving.control import (
     PURPOSE,
     VERSION,
-    ControlChange,
     ControlLease,
     LeaseWatch,
     NotHolderError,
     leases_of,
     sign_take,
 )
+from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS

@@ -28,6 +28,7 @@ from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.safety.resume import NEWEST_S, NONCES_MAX, OLDEST_S, configured_keys
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
 from strands_robots.utils import shown
 
 logger = logging.getLogger(__name__)
@@ -70,6 +71,7 @@ class Lease:
         ttl_s: it is over so long after its last use; None for a lease without such a time.
         until: the moment at which it is over.
         one_motion: it is over with the motion that it was made for.
+        begun: a motion under it has begun; a lease of one motion without one is given back.
     """
 
     holder: str
@@ -78,75 +80,27 @@ class Lease:
     ttl_s: float | None = None
     until: float | None = None
     one_motion: bool = False
+    begun: bool = False
 
     def left(self, now: float) -> float | None:
         """Return the seconds left, None for the lease of one motion."""
         return None if self.until is None or self.one_motion else round(max(self.until - now, 0.0), 3)
 
 
-@dataclass(frozen=True, slots=True)
-class ControlChange:
-    """A change of the holder, as observers are told.
-
-    Attributes:
-        event: ``acquired``, ``released``, ``expired`` or ``taken``.
-        reason: the one that a human gave for taking control.
-    """
-
-    event: str
-    robot: str
-    holder: str
-    kind: str
-    epoch: int
-    reason: str = ""
-
-
-OnChange = Callable[[ControlChange], None]
-
-
-class _Observers:
-    """Observers of a holder's changes; thread-safe, and one that fails alone."""
-
-    def __init__(self) -> None:
-        self._changing = threading.Lock()
-        self._observers: tuple[OnChange, ...] = ()
-
-    def add(self, observer: OnChange) -> Callable[[], None]:
-        """Tell ``observer`` of every change; return what ends that."""
-        with self._changing:
-            self._observers = (*self._observers, observer)
-
-        def end() -> None:
-            with self._changing:
-                self._observers = tuple(each for each in self._observers if each is not observer)
-
-        return end
-
-    def tell(self, change: ControlChange) -> None:
-        """Hand a change to every observer."""
-        for observer in self._observers:
-            try:
-                observer(change)
-            except Exception:
-                logger.exception("An observer of the control lease failed.")
-
-
 class Admission:
-    """Leave of one motion to begin; of a holder with a lease it is nothing to end.
+    """Leave of one motion to begin.
 
     Args:
-        starting: the motions of this robot that were admitted and have not begun or been refused.
+        end: is told of the end; nothing is held without it.
     """
 
-    def __init__(self, starting: set[Admission] | None = None) -> None:
-        self._starting = starting
-        if starting is not None:
-            starting.add(self)
+    def __init__(self, end: Callable[[Admission, bool], None] | None = None) -> None:
+        self._end = end
 
-    def close(self) -> None:
-        """Report that the motion has begun, or that it was refused."""
-        if self._starting is not None:
-            self._starting.discard(self)
+    def close(self, begun: bool = True) -> None:
+        """Report that the motion has begun, or with False that it was refused."""
+        if self._end is not None:
+            self._end(self, begun)
 
 
 def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], float] = time.time) -> dict[str, Any]:
@@ -249,7 +203,7 @@ class ControlLease:
         self._starting: set[Admission] = set()
         self._displaced: dict[str, str] = {}
         self._nonces: dict[str, float] = {}
-        self._observers = _Observers()
+        self._observers = Observers()
         self.epoch = 0
         """Rises with every new holder."""
 
@@ -344,35 +298,62 @@ class ControlLease:
         self._halt(f"control taken by {holder}: {reason}")
         return answer
 
-    def admit(self, verb: str, caller: object, lease_id: str, ttl_s: float = 0.0) -> Admission:
+    def admit(self, verb: str, caller: object, lease_id: str, ttl_s: float = 0.0, *, hold: bool = True) -> Admission:
         """Admit a motion of the holder, or hold a free robot for it.
 
         Args:
             ttl_s: on a free robot ``lease_id`` is a secret of the caller's own, and the motion is halted so long after
                 the last renewal; 0 for a motion that needs none. A held lease lasts no longer than that from then on.
+            hold: False to ask and change nothing.
 
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
         self._settle()
         with self._changing:
-            holder, lease = _name(caller), self._lease
-            if lease is None and (ttl_s or not lease_id):
-                self._hold_for_motion(holder, HUMAN if verb == FOLLOW else AGENT, lease_id, ttl_s)
-            elif lease_id:
-                if not self._used(verb, lease_id, ttl_s).one_motion:
-                    return Admission()
-            elif lease is not None and not _owns(lease, holder):
-                raise self._not_holder(verb, lease)
-            return Admission(self._starting)
+            holder, before = _name(caller), self._lease
+            self._refuse(verb, holder, lease_id, ttl_s)
+            if not hold:
+                return Admission()
+            if before is None:
+                after = self._hold_for_motion(holder, HUMAN if verb == FOLLOW else AGENT, lease_id, ttl_s)
+            else:
+                after = self._used(verb, lease_id, ttl_s) if lease_id else before
+            admission = Admission(lambda each, begun: self._admitted(each, begun, before, after))
+            if after.one_motion:
+                self._starting.add(admission)
+            return admission
 
-    def _hold_for_motion(self, holder: str, kind: str, lease_id: str, ttl_s: float) -> None:
+    def _refuse(self, verb: str, holder: str, lease_id: str, ttl_s: float) -> None:
+        lease = self._lease
+        if lease_id and (lease is not None or not ttl_s):
+            self._required(verb, lease_id)
+        elif lease is not None and not _owns(lease, holder):
+            raise self._not_holder(verb, lease)
+
+    def _admitted(self, admission: Admission, begun: bool, before: Lease | None, after: Lease) -> None:
+        """End an admission; one that began nothing takes back what it changed."""
+        with self._changing:
+            self._starting.discard(admission)
+            lease = self._lease
+            if lease is None or lease.lease_id != after.lease_id:
+                return
+            if begun:
+                self._lease = lease if lease.begun else replace(lease, begun=True)
+            elif lease.one_motion and not lease.begun and not self._starting:
+                self._lease = None
+            elif lease is after is not before and before is not None:
+                self._lease = before
+                self._watched(self)  # which may wait for a later moment
+
+    def _hold_for_motion(self, holder: str, kind: str, lease_id: str, ttl_s: float) -> Lease:
         if not ttl_s:
             # Known by its name alone; without a lease_id nobody can renew it.
-            self._lease = Lease(holder, kind, secrets.token_hex(16), one_motion=True)
-            return
-        self._lease = Lease(holder, kind, lease_id, ttl_s, self._clock() + ttl_s, one_motion=True)
+            lease = self._lease = Lease(holder, kind, secrets.token_hex(16), one_motion=True)
+            return lease
+        lease = self._lease = Lease(holder, kind, lease_id, ttl_s, self._clock() + ttl_s, one_motion=True)
         self._watched(self)
+        return lease
 
     def refuse_others(self, verb: str, caller: object, lease_id: str) -> None:
         """Refuse a motion of the whole world, unless it is the holder's.
@@ -437,13 +418,17 @@ class ControlLease:
         )
 
     def _used(self, verb: str, lease_id: str, at_most_s: float = 0.0) -> Lease:
+        lease = self._required(verb, lease_id)
+        if lease.ttl_s is not None:
+            ttl_s = min(lease.ttl_s, at_most_s or lease.ttl_s)
+            lease = self._lease = replace(lease, ttl_s=ttl_s, until=self._clock() + ttl_s)
+            if at_most_s:
+                self._watched(self)  # which may wait for a later moment
+        return lease
+
+    def _required(self, verb: str, lease_id: str) -> Lease:
         lease = self._lease
         if lease is not None and _is(lease, lease_id):
-            if lease.ttl_s is not None:
-                ttl_s = min(lease.ttl_s, at_most_s or lease.ttl_s)
-                lease = self._lease = replace(lease, ttl_s=ttl_s, until=self._clock() + ttl_s)
-                if at_most_s:
-                    self._watched(self)  # which may wait for a later moment
             return lease
         taker = self._displaced.get(lease_id)
         if taker is not None:
@@ -524,7 +509,7 @@ class ControlLeases:
         self._served: list[weakref.ref[Robot]] = []
         self._by_name: dict[str, ControlLease] = {}
         self._changing = threading.Lock()
-        self._observers = _Observers()
+        self._observers = Observers()
         self._streams: weakref.WeakSet[InputStreams] = weakref.WeakSet()
 
     def attach(self, streams: InputStreams) -> None:
@@ -566,14 +551,16 @@ class ControlLeases:
                 lease.observe(self._observers.tell)
         return lease
 
-    def admit(self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0) -> Admission:
+    def admit(
+        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, *, hold: bool = True
+    ) -> Admission:
         """Admit a motion of the named robot; with None of all robots of the world.
 
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
         if name is not None or not isinstance(self._robot(), WorldRobot):
-            return self.of(name or "").admit(command, caller, lease_id, ttl_s)
+            return self.of(name or "").admit(command, caller, lease_id, ttl_s, hold=hold)
         for each in tuple(self._by_name.values()):
             each.refuse_others(command, caller, lease_id)
         return Admission()
@@ -648,9 +635,11 @@ class _OneOf(ControlLeases):
         """Return the lease of this robot."""
         return self._world.of(self._name)
 
-    def admit(self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0) -> Admission:
+    def admit(
+        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, *, hold: bool = True
+    ) -> Admission:
         """Admit a motion of this robot."""
-        return self._world.admit(command, caller, lease_id, self._name, ttl_s)
+        return self._world.admit(command, caller, lease_id, self._name, ttl_s, hold=hold)
 
     def facts(self) -> dict[str, Any]:
         """Return the holder of this robot."""
