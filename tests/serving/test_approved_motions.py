@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from fixtures.toy_robots import ToyRobot
+from fixtures.waiting import eventually
 
 from strands_robots.envelope import error
 from strands_robots.safety.approval import Approval, Grants, digest
@@ -179,6 +180,49 @@ def test_a_refused_call_leaves_the_lease_of_another_as_it_was(
     assert before["holder"] == "agent-a"
     assert not ok(refuse(robot, line))
     assert line.leases.facts() == before
+
+
+def test_calls_that_the_robot_refuses_keep_nobody_from_moving_it(robot: ToyRobot, grants: Grants) -> None:
+    line = pipeline(robot, grants, "execute")
+    over, tries = threading.Event(), [0]
+
+    def spam() -> None:
+        while not over.is_set():
+            assert not ok(refuse_by_the_robot(robot, line))
+            tries[0] += 1
+
+    with ThreadPoolExecutor(3) as pool:
+        spamming = [pool.submit(spam) for _ in range(3)]
+        try:
+            for _ in range(50):
+                eventually(lambda due=tries[0] + 3: tries[0] >= due)
+                answer = served(line, "agent-a").result
+                assert answer["status"] == "success", answer
+                robot.halt()
+        finally:
+            over.set()
+        for each in spamming:
+            each.result()
+
+
+def test_a_start_that_hangs_refuses_others_by_its_callers_name(robot: ToyRobot, grants: Grants) -> None:
+    line = pipeline(robot, grants, "execute")
+    starting, let_go = threading.Event(), threading.Event()
+
+    def hang() -> None:
+        starting.set()
+        let_go.wait()
+
+    robot.before["start_task"] = hang
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(served, line, "agent-b", EVIL)
+        try:
+            assert starting.wait(20.0)
+            answer = served(line, "agent-a").result
+        finally:
+            let_go.set()
+        assert ok(first.result())
+    assert (answer["code"], answer["holder"]) == ("not_holder", "agent-b")
 
 
 def test_a_refused_call_gives_its_holder_no_other_time(robot: ToyRobot, grants: Grants) -> None:

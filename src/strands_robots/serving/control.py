@@ -18,6 +18,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
@@ -28,6 +29,7 @@ from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.safety.resume import NEWEST_S, NONCES_MAX, OLDEST_S, configured_keys
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.serving.admissions import Admission, Admissions
 from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
 from strands_robots.utils import shown
 
@@ -85,22 +87,6 @@ class Lease:
     def left(self, now: float) -> float | None:
         """Return the seconds left, None for the lease of one motion."""
         return None if self.until is None or self.one_motion else round(max(self.until - now, 0.0), 3)
-
-
-class Admission:
-    """Leave of one motion to begin.
-
-    Args:
-        end: is told of the end; nothing is held without it.
-    """
-
-    def __init__(self, end: Callable[[Admission, bool], None] | None = None) -> None:
-        self._end = end
-
-    def close(self, begun: bool = True) -> None:
-        """Report that the motion has begun, or with False that it was refused."""
-        if self._end is not None:
-            self._end(self, begun)
 
 
 def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], float] = time.time) -> dict[str, Any]:
@@ -200,7 +186,7 @@ class ControlLease:
         self._clock, self._wall, self._watched = clock, wall, watched
         self._changing = threading.RLock()
         self._lease: Lease | None = None
-        self._starting: set[Admission] = set()
+        self._starting = Admissions(self._changing)
         self._displaced: dict[str, str] = {}
         self._nonces: dict[str, float] = {}
         self._observers = Observers()
@@ -311,7 +297,12 @@ class ControlLease:
         """
         self._settle()
         with self._changing:
-            holder, before = _name(caller), self._lease
+            holder = _name(caller)
+            if hold:
+                self._starting.wait(partial(self._undecided, holder, lease_id), lambda: self._lease is None)
+            elif self._undecided(holder, lease_id):
+                return Admission()
+            before = self._lease
             self._refuse(verb, holder, lease_id, ttl_s)
             if not hold:
                 return Admission()
@@ -331,10 +322,17 @@ class ControlLease:
         elif lease is not None and not _owns(lease, holder):
             raise self._not_holder(verb, lease)
 
+    def _undecided(self, holder: str, lease_id: str) -> bool:
+        """True while the robot may yet refuse the motion of another that holds it."""
+        lease = self._lease
+        if lease is None or lease.begun or not (lease.one_motion and self._starting):
+            return False
+        return not _owns(lease, holder, lease_id)
+
     def _admitted(self, admission: Admission, begun: bool, before: Lease | None, after: Lease) -> None:
         """End an admission; one that began nothing takes back what it changed."""
         with self._changing:
-            self._starting.discard(admission)
+            self._starting.close(admission)
             lease = self._lease
             if lease is None or lease.lease_id != after.lease_id:
                 return

@@ -22,7 +22,8 @@ from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import Approval, Claim, digest
 from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
-from strands_robots.serving.control import Admission, ControlLeases, NotHolderError, leases_of
+from strands_robots.serving.admissions import Admission
+from strands_robots.serving.control import ControlLeases, NotHolderError, leases_of
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
