@@ -1,4 +1,4 @@
-"""Changes of a robot's holder, as observers are told."""
+"""Changes of a robot's holder, and those who are told of them."""
 
 from __future__ import annotations
 
