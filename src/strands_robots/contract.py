@@ -306,6 +306,7 @@ class AdaptedRobot:
             )
         if not permit.valid:
             # The stop came while the robot was starting, and may have found nothing to stop.
+            permit.begin()
             again = self.halt("halted while it started")
             end = "and was stopped again" if again.stopped else "and DID NOT STOP AGAIN"
             return error(f"start_task is refused: {self.tool_name_str} was halted while it started, {end}.")

@@ -85,7 +85,7 @@ _declare(
         "STRANDS_ROBOT_COMMAND_ALLOW",
         "list",
         "",
-        "Motion verbs the operator approves on real hardware: 'verb' or 'verb@peer'.",
+        "Motion verbs the operator approves on real hardware: 'verb', 'verb@peer' or 'verb@peer:caller'.",
     ),
     Setting(
         "STRANDS_ROS2_COMMAND_ALLOW",

@@ -184,6 +184,14 @@ def test_grant_can_be_claimed_once(run: Run, state_directory: Path) -> None:
     assert grants.claim("execute", "arm-1") is None
 
 
+def test_grant_for_a_caller_is_for_no_other(run: Run, state_directory: Path) -> None:
+    assert "by desk" in run("grant", "execute@arm-1", "--caller", "desk").stdout
+    grants = Grants(state_directory / "grants")
+    assert grants.claim("execute", "arm-1", ("second",)) is None
+    assert grants.claim("execute", "arm-1", ("desk",)) is not None
+    assert run("grant", "execute@arm-1", "--caller", "de\nsk").exit_code == 2
+
+
 @pytest.mark.parametrize("what", ["execute", "@arm-1", "execute@", "exe cute@arm-1", "execute@arm/1"])
 def test_grant_of_anything_but_verb_at_peer_is_wrong_usage(run: Run, what: str) -> None:
     result = run("grant", what)

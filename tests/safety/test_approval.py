@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from strands_robots.safety.approval import Approval, Claim, Grants
+from strands_robots.safety.approval import Approval, Claim, Grants, digest
 from strands_robots.utils import ValidationError
 
 
@@ -52,6 +52,14 @@ def test_an_entry_for_something_else_approves_nothing(grants: Grants, entry: str
     assert approval(grants, entry).claim("execute", "arm-1") is None
 
 
+def test_an_entry_may_name_the_caller(grants: Grants) -> None:
+    approver = approval(grants, "execute@arm-1:desk")
+    assert approver.claim("execute", "arm-1", ("desk", "desk__1")) == Claim()
+    for callers in ((), ("second",), ("desk__1",)):
+        assert approver.claim("execute", "arm-1", callers) is None
+    assert approver.claim("execute", "arm-2", ("desk",)) is None
+
+
 def test_the_bypass_approves_everything(grants: Grants) -> None:
     assert approval(grants, bypass=True).claim("reset", "arm-1") == Claim()
 
@@ -80,6 +88,47 @@ def test_a_grant_is_for_one_verb_of_one_peer(grants: Grants) -> None:
     assert grants.claim("execute", "arm-2") is None
     assert grants.claim("execute", "arm") is None
     assert grants.claim("execute", "arm-1") is not None
+
+
+def test_a_grant_for_a_caller_and_arguments_is_left_alone_by_others(grants: Grants) -> None:
+    good, evil = digest({"instruction": "GOOD"}), digest({"instruction": "EVIL"})
+    path = grants.grant("execute", "arm-1", caller="desk", arguments_digest=good)
+    for callers, arguments in (((), good), (("second",), good), (("desk",), evil), (("desk",), ""), ((), "")):
+        assert grants.claim("execute", "arm-1", callers, arguments) is None
+        assert grants.fitting("execute", "arm-1", callers, arguments) == []
+        assert path.exists()
+    assert grants.fitting("execute", "arm-1", ("second", "desk"), good) == [path]
+    assert path.exists()
+    assert grants.claim("execute", "arm-1", ("second", "desk"), good) is not None
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ({"x": 1}, {"x": 1.0}, True),
+        ({"x": -0.0}, {"x": 0}, True),
+        ({"x": 1, "y": 2}, {"y": 2.0, "x": 1}, True),
+        ({"joints": {"pan": 1}}, {"joints": {"pan": 1.0}}, True),
+        ({"at": [1, 2]}, {"at": (1.0, 2.0)}, True),
+        ({"x": 1, "approach": None}, {"x": 1}, True),
+        ({"x": 1}, {"x": True}, False),
+        ({"x": 1}, {"x": "1"}, False),
+        ({"x": 1}, {"y": 1}, False),
+        ({"x": 0.1}, {"x": 0.1000000001}, False),
+        ({"joints": {"pan": 1}}, {"joints": {"pan": 2}}, False),
+        ({"x": 2**53}, {"x": 2**53 + 1}, False),
+    ],
+)
+def test_a_digest_is_of_the_values_however_they_were_written(
+    one: dict[str, object], other: dict[str, object], same: bool
+) -> None:
+    assert (digest(one) == digest(other)) is same
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), object(), b"raw"])
+def test_arguments_that_json_cannot_carry_have_no_digest(value: object) -> None:
+    with pytest.raises(ValidationError, match="JSON"):
+        digest({"x": value})
 
 
 def test_a_grant_expires(grants: Grants, clock: Clock) -> None:

@@ -143,14 +143,19 @@ def grant(
     screen: Screen,
     what: Annotated[str, typer.Argument(metavar="VERB@PEER", help="Such as execute@arm-1.")],
     seconds: Annotated[float, typer.Option("--for", help="Seconds for which the grant is valid.")] = GRANT_S,
+    caller: Annotated[str, typer.Option("--caller", help="The only caller that it is for.")] = "",
 ) -> None:
-    """Approve one motion of real hardware, once; run it on the robot's own machine."""
+    """Approve one motion of real hardware, once; run it on the robot's own machine.
+
+    A caller's name is what it says it is, but on a mesh with certificates: there its certificate has to prove it.
+    """
     verb, at, peer = what.partition("@")
     if not (verb and at and peer):
         raise CliError(f"grant takes VERB@PEER, such as execute@arm-1, not {what!r}.", Exit.USAGE)
-    Grants(state_dir() / "grants").grant(verb, peer, seconds)
-    screen.data({"status": "success", "verb": verb, "peer": peer, "seconds": seconds})
-    screen.say(f"Granted: {verb} on {peer}, once, within {seconds:g} s.", "green")
+    Grants(state_dir() / "grants").grant(verb, peer, seconds, caller=caller)
+    screen.data({"status": "success", "verb": verb, "peer": peer, "seconds": seconds, "caller": caller})
+    whose = f" by {caller}" if caller else ""
+    screen.say(f"Granted: {verb} on {peer}{whose}, once, within {seconds:g} s.", "green")
 
 
 def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:

@@ -79,7 +79,7 @@ def serve(
     estop_allow: Annotated[str | None, _allow("--estop-allow", "Sources whose emergency stop counts: globs.")] = None,
     policy_allow: Annotated[str | None, _allow("--policy-allow", "Policy providers callers may ask for.")] = None,
     command_allow: Annotated[
-        str | None, _allow("--command-allow", "Verbs approved on real hardware: verb or verb@peer.")
+        str | None, _allow("--command-allow", "Verbs approved on real hardware: verb, verb@peer or verb@peer:caller.")
     ] = None,
     policies: Annotated[
         Path | None, typer.Option("--policies", help="File of policy profiles, which callers choose by name.")

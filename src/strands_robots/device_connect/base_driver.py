@@ -28,16 +28,16 @@ from strands_robots.device_connect.state_reports import report_changes, sweep
 from strands_robots.device_connect.telemetry import RolloutPump
 from strands_robots.envelope import Envelope, error, jsonable, success
 from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name
 from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.control import ControlChange
+from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
-from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
+from strands_robots.serving.world_stops import stop_within
 from strands_robots.utils import WAIT_S, ValidationError, shown, text
 
 logger = stop_logger(__name__)
@@ -210,15 +210,16 @@ class RobotDriver(CollectedOnce):
             self.wake()
         return enveloped(verb.name, result.result)
 
-    def authorize(self, command: Command, arguments: Arguments) -> None:
-        """Refuse a caller that may not move the robot, and a policy not allowed."""
+    def authorize(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
+        """Refuse a caller or a policy that is not allowed; return the caller's name."""
         if command.verb.kind is not Kind.MOTION:
-            return
+            return ()
         refusal = self.authorization.motion(command.caller, command.verb.name)
         if refusal is None and "policy_provider" in arguments:
             refusal = self.authorization.provider(arguments["policy_provider"])
         if refusal is not None:
             raise Refused(RefusalReason.CALLER, refusal)
+        return (caller_name(command.caller) or ANONYMOUS,)
 
     def _resume(self, arguments: Arguments) -> Envelope:
         registration = self.registration

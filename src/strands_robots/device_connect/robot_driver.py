@@ -61,10 +61,11 @@ class RobotDeviceDriver(RobotDriver):
             description=f"Robot {self._model}{profile_list()}",
         )
 
-    def authorize(self, command: Command, arguments: Arguments) -> None:
+    def authorize(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
         """Refuse as every device does; note the policy for a robot without events."""
-        super().authorize(command, arguments)
+        callers = super().authorize(command, arguments)
         self._provider = arguments.get("policy_provider", self._provider)
+        return callers
 
     @emit()
     async def taskStarted(self, instruction: str, policy_provider: str, follows_instruction: bool = True) -> None:

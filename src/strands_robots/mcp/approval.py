@@ -1,8 +1,9 @@
 """Approval of a motion of real hardware by the user of an MCP client.
 
 The robot refuses a motion that its operator has not approved. A client that can ask its user (elicitation) is then
-given the question: what will move, how far, how fast, and a picture. A yes issues a one-shot grant on this machine,
-as ``strands-robots grant`` does, and the motion is tried once more.
+given the question: what will move, how far, how fast, and a picture. A yes issues a one-shot grant on this machine
+for this caller and these arguments alone, and the motion is tried once more. Nothing is held while the user thinks; a
+yes that the robot did not take is gone.
 """
 
 # mypy: disable-error-code="misc"
@@ -31,7 +32,7 @@ from pydantic import BaseModel, Field
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.results import jpeg_of, result
-from strands_robots.safety.approval import Approval, Grants, state_dir
+from strands_robots.safety.approval import Approval, Grants, digest, state_dir
 from strands_robots.safety.state_files import StateFileError
 from strands_robots.utils import ValidationError
 
@@ -55,12 +56,15 @@ class Wish:
     """A motion that a client asks for.
 
     Attributes:
+        params: what the client asked for, as its user is shown it.
+        sent: the arguments that the robot gets, besides the lease's: an approval is for these.
         run: carries it out.
     """
 
     robot: str
     verb: str
     params: Mapping[str, Any]
+    sent: Mapping[str, Any]
     run: Callable[[], Awaitable[Envelope]]
 
 
@@ -80,10 +84,11 @@ class Approvals:
     async def carry_out(self, context: Context[Any, Any], access: ClientAccess, wish: Wish) -> Outcome:
         """Carry out a motion, with the approval of the client's user if it needs one."""
         robot, verb, params = wish.robot, wish.verb, wish.params
-        motion = json.dumps([access.caller.fleet.source, robot, verb, params], sort_keys=True, default=str)
+        source = access.caller.fleet.source
+        motion = json.dumps([source, robot, verb, wish.sent], sort_keys=True, default=str)
         answered = self._answered(context, motion)
         if answered is not None:
-            return result(await self._granted(wish) if answered else _declined(robot, verb))
+            return result(await self._granted(wish, source) if answered else _declined(robot, verb))
         answer = await wish.run()
         if answer.get("reason") != Approval.refusal(verb, robot):
             return result(answer)
@@ -97,7 +102,7 @@ class Approvals:
             return self._ask(message, motion)
         reply = await context.elicit(message, Approve)
         yes = reply.action == "accept" and reply.data.approve
-        return result(await self._granted(wish) if yes else _declined(robot, verb))
+        return result(await self._granted(wish, source) if yes else _declined(robot, verb))
 
     def _ask(self, message: str, motion: str) -> InputRequiredResult:
         now = time.monotonic()
@@ -122,10 +127,11 @@ class Approvals:
             return False
         return (reply.content or {}).get("approve") is True
 
-    async def _granted(self, wish: Wish) -> Envelope:
+    async def _granted(self, wish: Wish, source: str) -> Envelope:
         robot, verb = wish.robot, wish.verb
         try:
-            grant = self._grants().grant(verb, robot, GRANT_S)
+            bound = {"caller": source, "arguments_digest": digest(wish.sent)}
+            grant = self._grants().grant(verb, robot, GRANT_S, **bound)
         except (StateFileError, ValidationError, OSError) as refused:
             return error(f"The approval could not be recorded: {refused}")
         try:

@@ -101,7 +101,7 @@ class Caller:
         if not wait and not self._holds(target):
             return _needs_lease()
         lease = await self._for_motion(target, verb)
-        arguments = {**params, "wait": wait, **lease}
+        arguments = {**move_arguments(params, wait=wait), **lease}
 
         async def to_the_end(motion: _Halting) -> Envelope:
             answer = await motion.begin(verb, arguments, ANSWER_S + WAIT_S)
@@ -143,7 +143,7 @@ class Caller:
             return error(str(refused))
         target = await self._target(robot, {"robot_name": robot_name}, leased=True)
         at_robot = min(lasts, SILENCE_S)
-        params = {"kind": "agent", "ttl_s": at_robot, **({"robot_name": robot_name} if robot_name else {})}
+        params = acquire_arguments(lasts, robot_name)
         # While a motion of its own runs, the secret of that motion says that the robot is this client's.
         moves = any(each.target[0] == robot for each in self._moving)
         own = self._lease(target) or ({LEASE_ID: self._secret(robot)} if moves else {})
@@ -357,6 +357,16 @@ def runs(status: Envelope, robot_name: str) -> bool:
     if isinstance(policies, Mapping):
         return robot_name in policies if robot_name else bool(policies)
     return str(status.get("task_status", "")).lower() in RUNNING
+
+
+def move_arguments(params: Mapping[str, Any], *, wait: bool) -> dict[str, Any]:
+    """Return the arguments of an arm's motion, as a robot gets them."""
+    return {**params, "wait": wait}
+
+
+def acquire_arguments(ttl_s: float, robot_name: str) -> dict[str, Any]:
+    """Return the arguments of ``acquireControl``, as a robot gets them."""
+    return {"kind": "agent", "ttl_s": min(ttl_s, SILENCE_S), **({"robot_name": robot_name} if robot_name else {})}
 
 
 def _named(params: Mapping[str, Any]) -> dict[str, Any]:

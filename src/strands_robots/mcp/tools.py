@@ -22,6 +22,7 @@ from strands_robots.cli.resume import ask_robots, lockable_robots
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
+from strands_robots.mcp.caller import acquire_arguments, move_arguments
 from strands_robots.mcp.results import Result, facts, picture, quoted, result, row
 from strands_robots.utils import ValidationError, text
 
@@ -173,7 +174,8 @@ def add_motions(server: MCPServer[Any], access: AccessOf, approvals: Approvals) 
                     return await client.caller.run_policy(robot, params, wait=wait)
                 return await client.caller.move(robot, verb, params, wait=wait)
 
-        return await approvals.carry_out(context, client, Wish(robot, verb, params, run))
+        sent = params if verb == "execute" else move_arguments(params, wait=wait)
+        return await approvals.carry_out(context, client, Wish(robot, verb, params, sent, run))
 
     @server.tool(annotations=MOTION)
     async def move(  # noqa: PLR0917 - tools are called by names
@@ -256,8 +258,9 @@ def add_control(server: MCPServer[Any], access: AccessOf, approvals: Approvals) 
         """Hold a robot while connected; it halts ttl_s seconds after a lost client."""
         client = access(context)
         params = {"ttl_s": ttl_s, **_given(robot_name=robot_name)}
+        sent = acquire_arguments(ttl_s, robot_name)
         run = partial(client.caller.acquire, robot, ttl_s, robot_name)
-        return await approvals.carry_out(context, client, Wish(robot, "acquireControl", params, run))
+        return await approvals.carry_out(context, client, Wish(robot, "acquireControl", params, sent, run))
 
     @server.tool(annotations=STOP)
     async def release_control(context: Context[Any, Any], robot: Robot, robot_name: InWorld = "") -> Result:

@@ -14,17 +14,19 @@ from strands_robots.mesh.console_keys import MOTION
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
+from strands_robots.mesh.wire_identity import IdentityError
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
-from strands_robots.serving.robot_verbs import peer_stop_answer, robot_stop, run_to_end, stop_within
+from strands_robots.serving.robot_verbs import peer_stop_answer, run_to_end
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
+from strands_robots.serving.world_stops import robot_stop, stop_within
 from strands_robots.utils import ValidationError, shown
 
 logger = stop_logger(__name__)
@@ -34,7 +36,6 @@ REPLAYED = "replay rejected"
 LOCKED = "command rejected"
 DISPATCH = "dispatch error"
 BUSY = "busy"
-NO_ROOTS = "this peer has no roots to check signatures against"
 PING = {"action": "ping"}
 """The command of a bare ping: nothing in it needs checking."""
 
@@ -64,8 +65,8 @@ class SenderCheck:
         # Of its own, so that a flood of commands that prove nothing pushes no signed one out.
         self._proven = RecentKeys(REPLAY_S, PROVEN_MAX, context.monotonic, displace=False)
 
-    def __call__(self, command: Command, arguments: Arguments) -> None:
-        """Raise :class:`Refused` where the sender may not."""
+    def __call__(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
+        """Return the sender's proven names; raise :class:`Refused` where it may not."""
         request: wire.Request = command.proof
         # What only takes energy away is done twice, and whatever the sender's clock says: refusing one as a replay
         # could only leave a robot moving.
@@ -74,35 +75,47 @@ class SenderCheck:
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the timestamp is not fresh")
             if not self._replays.first((request.sender_id, request.turn_id)):
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the turn was carried out before")
-        if self._hardware and command.verb.kind is Kind.MOTION:
-            why = self._unproven(request) or self._counted_before(request)
-            if why is not None:
-                text = (
-                    f"{command.verb.name} moves real hardware, and its sender cannot be attributed: {why}. A console "
-                    f"on another machine is enrolled at this one, besides operator approval."
-                )
-                raise Refused(RefusalReason.APPROVAL, text, reason=f"the sender is not attributed: {why}")
+        if not self._hardware or command.verb.kind is not Kind.MOTION:
+            return ()
+        try:
+            names = self._proven_names(request)
+            self._require_first(request)
+        except IdentityError as why:
+            text = (
+                f"{command.verb.name} moves real hardware, and its sender cannot be attributed: {why}. A console "
+                f"on another machine is enrolled at this one, besides operator approval."
+            )
+            raise Refused(RefusalReason.APPROVAL, text, reason=f"the sender is not attributed: {why}") from None
+        return names
 
-    def _unproven(self, request: wire.Request) -> str | None:
-        """Return the reason why nothing proves the sender, or None.
+    def _proven_names(self, request: wire.Request) -> tuple[str, ...]:
+        """Return the names that the sender's proof is good for.
 
-        The session on a sample is no proof: its publisher chooses it.
+        A certificate proves the peer id and its own name. A console's key proves no name: the one that its message
+        bears counts where no certificates are in use. The session on a sample is no proof: its publisher chooses it.
+
+        Raises:
+            IdentityError: nothing proves the sender.
         """
         context = self._context
-        certified = context.identity.refusal(request.body, request.sender_id) if context.identity.checks else NO_ROOTS
-        if context.identity.required or certified is None:
-            return certified or self._elsewhere(request)
-        return context.consoles.refusal(request.body, MOTION) or self._elsewhere(request)
+        try:
+            return request.sender_id, context.identity.verify(request.body, request.sender_id).common_name
+        except IdentityError:
+            if context.identity.required:
+                raise
+        refusal = context.consoles.refusal(request.body, MOTION)
+        if refusal is not None:
+            raise IdentityError(refusal)
+        return () if context.identity.checks else (request.sender_id,)
 
-    def _counted_before(self, request: wire.Request) -> str | None:
-        """Return the reason why a proven command may have been carried out, or None."""
+    def _require_first(self, request: wire.Request) -> None:
+        """Raise :class:`IdentityError` for another's command, or one sent before."""
+        if not request.is_for(self._context.peer_id):
+            raise IdentityError("it was signed for another peer")
         if request.timestamp is None or self._context.predates(request.timestamp):
-            return "it was issued before this peer started, by its sender's clock; send it again"
-        first = self._proven.first((request.sender_id, request.turn_id))
-        return None if first else "it was carried out before, or too many signed commands came in a minute"
-
-    def _elsewhere(self, request: wire.Request) -> str | None:
-        return None if request.is_for(self._context.peer_id) else "it was signed for another peer"
+            raise IdentityError("it was issued before this peer started, by its sender's clock; send it again")
+        if not self._proven.first((request.sender_id, request.turn_id)):
+            raise IdentityError("it was carried out before, or too many signed commands came in a minute")
 
 
 def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:

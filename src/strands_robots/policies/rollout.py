@@ -342,6 +342,7 @@ class Rollout:
                         self._begun.set()
                     finally:
                         self._notify("started")
+                    self._permit.begin()
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"

@@ -1,27 +1,33 @@
 """The operator's approval of verbs that move real hardware.
 
-A verb is approved by ``STRANDS_ROBOT_COMMAND_ALLOW`` (a comma list of ``verb`` or ``verb@peer``), by
-``BYPASS_TOOL_CONSENT``, or by a one-shot grant that an operator at the robot's own machine issued with
-``strands-robots grant VERB@PEER``.
+A verb is approved by ``STRANDS_ROBOT_COMMAND_ALLOW`` (a comma list of ``verb``, ``verb@peer`` or
+``verb@peer:caller``), by ``BYPASS_TOOL_CONSENT``, or by a one-shot grant that an operator at the robot's own machine
+issued with ``strands-robots grant VERB@PEER``. A grant may name the caller that it is for, and the digest of the
+arguments: the yes to a question has both.
 
-A grant is a small file. Claiming it is one rename, so two callers cannot both have it; a command that is then
-refused for another reason gives it back, and a process that dies in between leaves it claimed and useless.
+A grant is a small file. It is read first: a command that it is not for leaves it as it is. Claiming it is one rename,
+so two callers cannot both have it; a command that then starts nothing gives it back, and a process that dies in between
+leaves it claimed and useless.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from strands_robots import settings
+from strands_robots.safety.authorization import NAME_MAX
+from strands_robots.safety.ed25519 import canonical
 from strands_robots.safety.state_files import boot, make_private, read_private, require_private, uptime
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.utils import identifier, number
+from strands_robots.utils import ValidationError, identifier, number, text
 
 logger = stop_logger(__name__)
 
@@ -39,9 +45,32 @@ def state_dir() -> Path:
     return Path(stated).expanduser() if stated else Path.home() / ".strands_robots"
 
 
-def listed(verb: str, peer: str, allow: Sequence[str]) -> bool:
-    """True when ``allow`` holds the verb, for all peers or for this one."""
-    return verb in allow or f"{verb}@{peer}" in allow
+def listed(verb: str, peer: str, allow: Sequence[str], callers: Collection[str] = ()) -> bool:
+    """True when ``allow`` has the verb: for all, for this peer, or for a caller."""
+    return any(each in allow for each in (verb, f"{verb}@{peer}", *(f"{verb}@{peer}:{name}" for name in callers)))
+
+
+def digest(arguments: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a motion's arguments, in hex.
+
+    What is None was not given, and 1 is 1.0.
+
+    Raises:
+        ValidationError: JSON cannot carry them.
+    """
+    try:
+        given = {name: _plain(value) for name, value in arguments.items() if value is not None}
+        return hashlib.sha256(canonical(given)).hexdigest()
+    except (TypeError, ValueError, RecursionError) as exc:
+        raise ValidationError(f"arguments must be values that JSON can carry: {exc}.") from None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,49 +105,71 @@ class Grants:
         self._root = folder.parent
         self._clock = clock
 
-    def grant(self, verb: str, peer: str, seconds: float = GRANT_S) -> Path:
+    def grant(
+        self, verb: str, peer: str, seconds: float = GRANT_S, *, caller: str = "", arguments_digest: str = ""
+    ) -> Path:
         """Let ``verb`` be done once on ``peer`` within ``seconds``.
 
+        Args:
+            caller: the only one that it is for; empty for all.
+            arguments_digest: the :func:`digest` of the only arguments that it is for; empty for all.
+
         Raises:
-            ValidationError: ``verb`` or ``peer`` is no identifier, or ``seconds`` is not above 0 and at most a day.
+            ValidationError: ``verb`` or ``peer`` is no identifier, ``caller`` is no name, or ``seconds`` is not above 0
+                and at most a day.
             StateFileError: the folder is not this user's alone.
         """
         name = f"{identifier('verb', verb)}@{identifier('peer', peer)}"
         lasts = number("seconds", seconds, above=0, high=GRANT_MAX_S)
+        bound = {"caller": text("caller", caller, longest=NAME_MAX, empty=True), "digest": arguments_digest}
         make_private(self.folder)
         require_private(self.folder, self._root)
         path = self.folder / f"{name}+{secrets.token_hex(8)}"
         writing = path.with_name(f".{path.name}")
         with os.fdopen(os.open(writing, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            json.dump({"verb": verb, "peer": peer, "boot": boot(), "until": self._clock() + lasts}, file)
+            json.dump({"verb": verb, "peer": peer, "boot": boot(), "until": self._clock() + lasts, **bound}, file)
         writing.rename(path)
         return path
 
-    def claim(self, verb: str, peer: str) -> Claim | None:
-        """Take one grant that is still good, or None."""
-        for path in sorted(self.folder.glob(f"{verb}@{peer}+*")) if self.folder.is_dir() else []:
-            if path.name.endswith(_CLAIMED):
-                continue
+    def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Claim | None:
+        """Take one grant that is for this command, or None."""
+        for path in self.fitting(verb, peer, callers, arguments_digest):
             taken = path.with_name(path.name + _CLAIMED)
-            try:
+            with contextlib.suppress(FileNotFoundError):  # another command was first
                 path.rename(taken)
-            except FileNotFoundError:
-                continue
-            if self._good(taken, verb, peer):
                 return Claim(taken)
-            taken.unlink(missing_ok=True)
         return None
 
-    def _good(self, path: Path, verb: str, peer: str) -> bool:
+    def fitting(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> list[Path]:
+        """Return the grants that are for this command, the narrowest first."""
+        found: list[tuple[int, str, Path]] = []
+        for path in self.folder.glob(f"{verb}@{peer}+*") if self.folder.is_dir() else []:
+            if path.name.endswith(_CLAIMED):
+                continue
+            grant = self._read(path, verb, peer)
+            if grant is None:
+                continue
+            caller, bound = grant.get("caller", ""), grant.get("digest", "")
+            if caller in ("", *callers) and bound in ("", arguments_digest):
+                found.append((2 * (bound == "") + (caller == ""), path.name, path))
+        return [path for *_, path in sorted(found)]
+
+    def _read(self, path: Path, verb: str, peer: str) -> dict[str, Any] | None:
+        """Return a grant that is still good; remove any other."""
         try:
             grant = json.loads(read_private(path, self._root))
             until = number("until", grant["until"])
-        except (OSError, ValueError, KeyError, TypeError) as exc:
-            logger.warning("The grant %s is void: %s", path.name.removesuffix(_CLAIMED), exc)
-            return False
-        named = (grant.get("verb"), grant.get("peer"), grant.get("boot")) == (verb, peer, boot())
-        now = self._clock()
-        return named and now < until <= now + GRANT_MAX_S
+            named = (grant.get("verb"), grant.get("peer"), grant.get("boot")) == (verb, peer, boot())
+        except FileNotFoundError:  # claimed meanwhile
+            return None
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as exc:
+            logger.warning("The grant %s is void: %s", path.name, exc)
+        else:
+            now = self._clock()
+            if named and now < until <= now + GRANT_MAX_S:
+                return dict(grant)
+        path.unlink(missing_ok=True)
+        return None
 
 
 class Approval:
@@ -140,11 +191,25 @@ class Approval:
         self._bypass = bypass
         self._grants = grants
 
-    def claim(self, verb: str, peer: str) -> Claim | None:
-        """Return leave to do ``verb`` on ``peer`` now, or None when not approved."""
-        if listed(verb, peer, self._read("STRANDS_ROBOT_COMMAND_ALLOW")) or self._bypass():
+    def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Claim | None:
+        """Return leave to do ``verb`` on ``peer`` now, or None when not approved.
+
+        Args:
+            callers: the names that an approval may know the caller by.
+            arguments_digest: of the command's arguments, see :func:`digest`.
+        """
+        if self._standing(verb, peer, callers):
             return Claim()
-        return self._grants().claim(verb, peer)
+        return self._grants().claim(verb, peer, callers, arguments_digest)
+
+    def given(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> bool:
+        """Return whether :meth:`claim` would give leave now; nothing is taken."""
+        if self._standing(verb, peer, callers):
+            return True
+        return bool(self._grants().fitting(verb, peer, callers, arguments_digest))
+
+    def _standing(self, verb: str, peer: str, callers: Collection[str]) -> bool:
+        return listed(verb, peer, self._read("STRANDS_ROBOT_COMMAND_ALLOW"), callers) or self._bypass()
 
     @staticmethod
     def refusal(verb: str, peer: str) -> str:

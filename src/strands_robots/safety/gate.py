@@ -68,13 +68,18 @@ def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
 
 
 class Asked:
-    """A call for motion and its time; a later halt voids what it begins."""
+    """A call for motion and its time; a later halt voids what it begins.
 
-    __slots__ = ("__weakref__", "generation", "given_up")
+    Attributes:
+        begun: something has moved by it, whatever it is answered.
+    """
+
+    __slots__ = ("__weakref__", "begun", "generation", "given_up")
 
     def __init__(self, generation: int) -> None:
         self.generation = generation
         self.given_up = False
+        self.begun = False
 
     def give_up(self) -> None:
         """Void what the call began or may still begin, and nothing else."""
@@ -120,6 +125,10 @@ class Permit:
     def inside(self) -> AbstractContextManager[None]:
         """Make motions begun inside, on this thread, part of this one."""
         return self._gate.asked_at(self._asked)
+
+    def begin(self) -> None:
+        """Note that something moves by this permit from now on."""
+        self._asked.begun = True
 
     def withdraw(self) -> None:
         """Void this permit alone: one motion stops, the robot stays free."""

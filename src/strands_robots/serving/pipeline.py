@@ -1,14 +1,15 @@
 """Pipeline of a command from any network to a robot's method.
 
 In order: arguments, caller, control lease, lockout, the operator's approval, the robot's method. The first that refuses
-raises :class:`Refused`, which says which it was. Whatever is raised on the way becomes an
+raises :class:`Refused`, which says which it was. The robot is held and a grant is claimed when nothing has refused, and
+both are given back where the robot then starts nothing. Whatever is raised on the way becomes an
 :class:`Result` here alone. Stops take no part in it: they go to the stop executor at once, for every caller.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
@@ -18,12 +19,13 @@ from weakref import WeakKeyDictionary
 from strands_robots.contract import Robot
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.approval import Approval, Claim
+from strands_robots.safety.approval import Approval, Claim, digest
 from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.serving.control import Admission, ControlLeases, NotHolderError, leases_of
+from strands_robots.serving.admissions import Admission
+from strands_robots.serving.control import ControlLeases, NotHolderError, leases_of
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
-from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, Arguments, Kind, Verb
+from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.utils import ValidationError
 
@@ -91,14 +93,37 @@ def busy(command: Command) -> Result:
     return Result(refused.envelope, refused)
 
 
-Authorize = Callable[[Command, Arguments], None]
-"""Raises :class:`Refused` where the caller may not; :mod:`strands_robots.safety.authorization` decides."""
+Authorize = Callable[[Command, Arguments], Collection[str] | None]
+"""Raises :class:`Refused` where the caller may not; :mod:`strands_robots.safety.authorization` decides.
+
+Returns the names by which an approval may know the caller, None without any.
+"""
 
 Answered = Callable[[Result], None]
 """Gets a command's answer on the thread that served it; it may not raise."""
 
 Own = Callable[[Arguments], object]
 """Carries out a verb that is the network peer's own and not its robot's."""
+
+
+Admit = Callable[[bool], Admission]
+"""Asks the control lease for a motion, and holds the robot for it where the argument is True."""
+
+
+@dataclass
+class Leave:
+    """Leave of one motion to begin: the robot, and the operator's approval."""
+
+    admission: Admission = field(default_factory=Admission)
+    claim: Claim = field(default_factory=Claim)
+
+    def close(self, begun: bool) -> None:
+        """Spend the grant of a motion that has begun; give back all else."""
+        self.admission.close(begun)
+        if begun:
+            self.claim.spend()
+        else:
+            self.claim.give_back()
 
 
 class PendingCommands:
@@ -190,18 +215,21 @@ class Pipeline:
 
     def serve(self, command: Command, answered: Answered) -> None:
         """Carry ``command`` out on this thread and hand its answer to ``answered``."""
-        verb, claim, admission = command.verb, Claim(), Admission()
+        verb, leave = command.verb, Leave()
         result: object = None
         refusal: Refused | None = None
+        begun = False
         with self._changed:
             self._serving.append(verb.name)
         try:
             arguments = self._checked(command)
-            self.authorize(command, arguments)
-            admission = self._admitted(command, arguments)
+            callers = self.authorize(command, arguments) or ()
+            admit = self._control(command, arguments)
             with self.pending.serving(command.asked):
                 if verb.kind is Kind.MOTION:
-                    claim = self._claim(verb, arguments)
+                    self._give_leave(leave, command, arguments, admit, callers)
+                # Of what ends in an exception nobody knows whether it moves.
+                begun = True
                 if verb.name in self.own:
                     result = self.own[verb.name](arguments)
                 elif self.robot is None:
@@ -210,21 +238,19 @@ class Pipeline:
                     result = verb.run(self.robot, arguments)
                 else:
                     result = getattr(self.robot, verb.method)(**arguments)
+                begun = not is_error(result)
         except Refused as refused:
-            refusal, result = refused, refused.envelope
+            refusal, result, begun = refused, refused.envelope, False
         except (ValidationError, MotionRefused, NotHolderError) as exc:
-            result = error(str(exc)) if isinstance(exc, ValidationError) else exc.envelope
+            result, begun = error(str(exc)) if isinstance(exc, ValidationError) else exc.envelope, False
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)
             refusal = Refused(RefusalReason.FAILED, f"{verb.name} failed inside the device; its log has the details.")
             result = refusal.envelope
         try:
-            admission.close()
-            if result is None or is_error(result):
-                claim.give_back()
-            else:
-                claim.spend()
+            # A motion that began and ended badly is answered with an error, too.
+            leave.close(begun or (command.asked is not None and command.asked.begun))
             answered(Result(result, refusal))
         finally:
             with self._changed:
@@ -253,49 +279,71 @@ class Pipeline:
         except ValidationError as exc:
             raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None
 
-    def _admitted(self, command: Command, arguments: dict[str, Any]) -> Admission:
-        """Ask the control lease for a motion; give its own verbs what they act on."""
+    def _control(self, command: Command, arguments: dict[str, Any]) -> Admit:
+        """Return a motion's question to the lease; give the lease's verbs their parts."""
         verb, leases = command.verb, self.leases
         if verb.on_lease:
             if leases is None:
                 raise Refused(RefusalReason.CONTROL, f"{verb.name}: no robot is registered on this peer.")
             arguments |= {"caller": command.caller, "robot": self.peer_id(), "leases": leases}
-            return Admission()
+            return lambda hold: Admission()
         if not verb.leased:
-            return Admission()
+            return lambda hold: Admission()
         lease_id, ttl_s = arguments.pop(LEASE_ID, "") or "", arguments.pop(LEASE_TTL_S, 0.0) or 0.0
         if ttl_s and not lease_id:
             raise Refused(RefusalReason.ARGUMENTS, f"{LEASE_TTL_S} needs a {LEASE_ID}: a secret of the caller's own.")
-        if leases is None:
-            return Admission()
         name = None if verb.of_world else arguments.get("robot_name", "")
-        try:
-            return leases.admit(verb.name, command.caller, lease_id, name, ttl_s)
-        except NotHolderError as exc:
-            raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
 
-    def _claim(self, verb: Verb, arguments: Arguments) -> Claim:
-        """Check the lockout and, for hardware, the policy and the operator's approval."""
-        if self.robot is not None and not verb.while_locked:
-            locked = self.robot.gate.lockout(verb.name)
-            if locked is not None:
-                text = str(locked.get("reason", "locked"))
-                if verb.instead:
-                    text = f"{text} {verb.instead} works while it is locked, with the operator's approval."
-                    locked = {**locked, **error(text)}
-                raise Refused(RefusalReason.LOCKOUT, text, reason="locked by an emergency stop", envelope=locked)
-            # Halted since the command arrived: refused before a grant is spent on it.
-            late = self.robot.gate.refusal(verb.name)
-            if late is not None:
-                raise MotionRefused(late)
+        def admit(hold: bool) -> Admission:
+            if leases is None:
+                return Admission()
+            try:
+                return leases.admit(verb.name, command.caller, lease_id, name, ttl_s, hold=hold)
+            except NotHolderError as exc:
+                raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
+
+        return admit
+
+    def _give_leave(
+        self, leave: Leave, command: Command, arguments: Arguments, admit: Admit, callers: Collection[str]
+    ) -> None:
+        """Ask all whether the motion may begin, then hold the robot and claim a grant.
+
+        A call that is refused must not keep others from moving, so nothing is held before.
+        """
+        verb = command.verb
+        admit(False)
+        self._refuse_locked(verb)
         if not self.hardware:
-            return Claim()
+            leave.admission = admit(True)
+            return
         if arguments.get("policy_provider") == MOCK and getattr(self.robot, "runs_policies", False):
             refusal = mock_refusal()
             if refusal is not None:
                 raise Refused(RefusalReason.APPROVAL, f"{verb.name} is refused: {refusal}", reason="mock on hardware")
-        claim = self.approval.claim(verb.name, self.peer_id())
-        if claim is None:
-            text = Approval.refusal(verb.name, self.peer_id())
-            raise Refused(RefusalReason.APPROVAL, text, reason="the operator has not approved it")
-        return claim
+        own = {name: value for name, value in command.arguments.items() if name in verb.by_name.keys() - LEASE_NAMES}
+        wanted = verb.name, self.peer_id(), callers, digest(own)
+        if self.approval.given(*wanted):
+            leave.admission = admit(True)
+            claim = self.approval.claim(*wanted)
+            if claim is not None:
+                leave.claim = claim
+                return
+        text = Approval.refusal(verb.name, self.peer_id())
+        raise Refused(RefusalReason.APPROVAL, text, reason="the operator has not approved it")
+
+    def _refuse_locked(self, verb: Verb) -> None:
+        """Refuse a motion of a locked robot, or one older than the last halt."""
+        if self.robot is None or verb.while_locked:
+            return
+        locked = self.robot.gate.lockout(verb.name)
+        if locked is not None:
+            text = str(locked.get("reason", "locked"))
+            if verb.instead:
+                text = f"{text} {verb.instead} works while it is locked, with the operator's approval."
+                locked = {**locked, **error(text)}
+            raise Refused(RefusalReason.LOCKOUT, text, reason="locked by an emergency stop", envelope=locked)
+        # Halted since the command arrived: refused before a grant is spent on it.
+        late = self.robot.gate.refusal(verb.name)
+        if late is not None:
+            raise MotionRefused(late)

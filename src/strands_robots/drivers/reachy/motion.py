@@ -246,6 +246,7 @@ class MotionController:
                 if before is not None:
                     before()
                 motion.check()
+                motion.permit.begin()  # an answer that is lost or unreadable may be that of a move
                 motion.uuid = _uuid(path, self._connection.rest.post(path))
             except Exception as exc:
                 if updates is not None:
@@ -387,6 +388,7 @@ class MotionController:
             with self._write:
                 motion.check()
                 self._connection.link().send_target(target)
+                motion.permit.begin()
         except (DaemonUnreachableError, MotionRefused) as exc:
             self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
             raise

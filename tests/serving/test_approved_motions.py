@@ -1,0 +1,292 @@
+"""What an approval is spent by, and what a refused call leaves behind: nothing."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.toy_robots import ToyRobot
+from fixtures.waiting import eventually
+
+from strands_robots.envelope import error
+from strands_robots.safety.approval import Approval, Grants, digest
+from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result
+from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.verbs import Arguments
+
+GOOD = {"instruction": "GOOD", "duration": 300.0}
+EVIL = {"instruction": "EVIL", "duration": 300.0}
+SECRET = "agent-a's own"
+
+
+class Locked:
+    def refusal(self, verb: str) -> dict[str, Any]:
+        return error(f"{verb} refused: locked by epoch abc")
+
+
+@pytest.fixture
+def robot() -> Iterator[ToyRobot]:
+    toy = ToyRobot()
+    yield toy
+    toy.close()
+
+
+@pytest.fixture
+def grants(tmp_path: Path) -> Grants:
+    return Grants(tmp_path / "grants")
+
+
+def pipeline(robot: Any, grants: Grants, *allow: str) -> Pipeline:
+    def authorize(command: Command, arguments: Arguments) -> tuple[str, ...]:
+        if command.caller == "stranger":
+            raise Refused(RefusalReason.CALLER, "not you")
+        return (str(command.caller),)
+
+    approval = Approval(lambda _: allow, lambda: False, lambda: grants)
+    return Pipeline.of(robot, lambda: "arm-1", hardware=True, authorize=authorize, approval=approval)
+
+
+def served(line: Pipeline, caller: str, arguments: Arguments = GOOD, verb: str = "execute") -> Result:
+    results: list[Result] = []
+    line.serve(Command(ARM_VERBS[verb], arguments, caller, line.pending.arrive()), results.append)
+    return results[0]
+
+
+def ok(result: Result) -> bool:
+    return bool(result.result["status"] == "success")
+
+
+def test_a_bound_grant_moves_nothing_else_and_is_not_disturbed(robot: ToyRobot, grants: Grants) -> None:
+    path = grants.grant("execute", "arm-1", caller="agent-a", arguments_digest=digest(GOOD))
+    line = pipeline(robot, grants)
+    over, seen = threading.Event(), [0, 0]
+
+    def spam() -> None:
+        while not over.is_set():
+            seen[0] += 1
+            seen[1] += not path.exists()
+            for caller, arguments in (("agent-b", EVIL), ("agent-a", EVIL), ("agent-b", GOOD)):
+                refusal = served(line, caller, arguments).refusal
+                assert refusal is not None
+                assert refusal.why is RefusalReason.APPROVAL
+
+    with ThreadPoolExecutor(3) as pool:
+        spamming = [pool.submit(spam) for _ in range(3)]
+        try:
+            while seen[0] < 300 and not any(each.done() for each in spamming):
+                assert path.exists()
+        finally:
+            over.set()
+        for each in spamming:
+            each.result()
+    assert seen[1] == 0, "the grant was renamed by a command that it was not for"
+    assert ok(served(line, "agent-a"))
+    assert not path.exists()
+
+
+def test_the_leases_arguments_are_no_part_of_what_was_approved(robot: ToyRobot, grants: Grants) -> None:
+    grants.grant("execute", "arm-1", caller="agent-a", arguments_digest=digest({**GOOD, "duration": 300}))
+    line = pipeline(robot, grants)
+    assert ok(served(line, "agent-a", {**GOOD, "lease_id": SECRET, "lease_ttl_s": 5.0}))
+
+
+def test_the_narrowest_grant_is_spent_first(robot: ToyRobot, grants: Grants) -> None:
+    typed = grants.grant("execute", "arm-1")
+    named = grants.grant("execute", "arm-1", caller="agent-a")
+    yes = grants.grant("execute", "arm-1", caller="agent-a", arguments_digest=digest(GOOD))
+    line = pipeline(robot, grants)
+    for spent, left in ((yes, [named, typed]), (named, [typed]), (typed, [])):
+        assert ok(served(line, "agent-a"))
+        robot.halt()
+        assert not spent.exists()
+        assert all(each.exists() for each in left)
+
+
+def refuse_arguments(robot: ToyRobot, line: Pipeline) -> Result:
+    return served(line, "agent-b", {**EVIL, "duration": -1})
+
+
+def refuse_secret(robot: ToyRobot, line: Pipeline) -> Result:
+    return served(line, "agent-b", {**EVIL, "lease_ttl_s": 5.0})
+
+
+def refuse_caller(robot: ToyRobot, line: Pipeline) -> Result:
+    return served(line, "stranger", EVIL)
+
+
+def refuse_lockout(robot: ToyRobot, line: Pipeline) -> Result:
+    latch = Locked()
+    robot.gate.attach(latch)
+    try:
+        return served(line, "agent-b", EVIL)
+    finally:
+        robot.gate.detach(latch)
+
+
+def refuse_approval(robot: ToyRobot, line: Pipeline) -> Result:
+    return served(line, "agent-b", {"opening": 1.0}, "setGripper")
+
+
+def refuse_late(robot: ToyRobot, line: Pipeline) -> Result:
+    results: list[Result] = []
+    command = Command(ARM_VERBS["execute"], EVIL, "agent-b", line.pending.arrive())
+    robot.gate.revoke()
+    line.serve(command, results.append)
+    return results[0]
+
+
+def refuse_by_the_robot(robot: ToyRobot, line: Pipeline) -> Result:
+    return served(line, "agent-b", {**EVIL, "policy_provider": "unknown"})
+
+
+def refuse_with_a_time(robot: ToyRobot, line: Pipeline) -> Result:
+    wanted = {**EVIL, "policy_provider": "unknown", "lease_id": "agent-b's own", "lease_ttl_s": 5.0}
+    return served(line, "agent-b", wanted)
+
+
+REFUSALS = [
+    *(refuse_arguments, refuse_secret, refuse_caller, refuse_lockout, refuse_approval, refuse_late),
+    *(refuse_by_the_robot, refuse_with_a_time),
+]
+
+
+@pytest.mark.parametrize("refuse", REFUSALS)
+def test_a_refused_call_leaves_a_free_robot_free(
+    robot: ToyRobot, grants: Grants, refuse: Callable[[ToyRobot, Pipeline], Result]
+) -> None:
+    def no_status() -> None:
+        raise OSError("a robot whose state is not known keeps the lease of a motion")
+
+    line = pipeline(robot, grants, "execute")
+    assert line.leases is not None
+    robot.before["get_task_status"] = no_status
+    assert not ok(refuse(robot, line))
+    assert line.leases.facts() == {"held": False, "epoch": 0}
+    assert ok(served(line, "agent-a"))
+
+
+@pytest.mark.parametrize("refuse", REFUSALS)
+def test_a_refused_call_leaves_the_lease_of_another_as_it_was(
+    robot: ToyRobot, grants: Grants, refuse: Callable[[ToyRobot, Pipeline], Result]
+) -> None:
+    line = pipeline(robot, grants, "execute")
+    assert line.leases is not None
+    assert ok(served(line, "agent-a"))
+    before = line.leases.facts()
+    assert before["holder"] == "agent-a"
+    assert not ok(refuse(robot, line))
+    assert line.leases.facts() == before
+
+
+def test_calls_that_the_robot_refuses_keep_nobody_from_moving_it(robot: ToyRobot, grants: Grants) -> None:
+    line = pipeline(robot, grants, "execute")
+    over, tries = threading.Event(), [0]
+
+    def spam() -> None:
+        while not over.is_set():
+            assert not ok(refuse_by_the_robot(robot, line))
+            tries[0] += 1
+
+    with ThreadPoolExecutor(3) as pool:
+        spamming = [pool.submit(spam) for _ in range(3)]
+        try:
+            for _ in range(50):
+                eventually(lambda due=tries[0] + 3: tries[0] >= due)
+                answer = served(line, "agent-a").result
+                assert answer["status"] == "success", answer
+                robot.halt()
+        finally:
+            over.set()
+        for each in spamming:
+            each.result()
+
+
+def test_a_start_that_hangs_refuses_others_by_its_callers_name(robot: ToyRobot, grants: Grants) -> None:
+    line = pipeline(robot, grants, "execute")
+    starting, let_go = threading.Event(), threading.Event()
+
+    def hang() -> None:
+        starting.set()
+        let_go.wait()
+
+    robot.before["start_task"] = hang
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(served, line, "agent-b", EVIL)
+        try:
+            assert starting.wait(20.0)
+            answer = served(line, "agent-a").result
+        finally:
+            let_go.set()
+        assert ok(first.result())
+    assert (answer["code"], answer["holder"]) == ("not_holder", "agent-b")
+
+
+def test_a_refused_call_gives_its_holder_no_other_time(robot: ToyRobot, grants: Grants) -> None:
+    line = pipeline(robot, grants, "execute", "acquireControl")
+    assert line.leases is not None
+    held = served(line, "agent-a", {"ttl_s": 600.0}, "acquireControl").result["lease_id"]
+    due = line.leases.of().due
+    wanted = {**EVIL, "policy_provider": "unknown", "lease_id": held, "lease_ttl_s": 2.0}
+    assert not ok(served(line, "agent-a", wanted))
+    assert line.leases.of().due == due
+    assert ok(served(line, "agent-a", {**GOOD, "lease_id": held, "lease_ttl_s": 2.0}))
+    shorter = line.leases.of().due
+    assert shorter is not None
+    assert due is not None
+    assert shorter < due
+
+
+def test_a_second_call_of_the_holder_that_is_refused_does_not_end_the_first(robot: ToyRobot, grants: Grants) -> None:
+    line = pipeline(robot, grants, "execute")
+    assert line.leases is not None
+    assert ok(served(line, "agent-a"))
+    assert not ok(served(line, "agent-a", EVIL)), "the robot was not busy"
+    assert line.leases.facts()["holder"] == "agent-a"
+
+
+def test_a_grant_is_kept_while_another_holds_the_robot(robot: ToyRobot, grants: Grants) -> None:
+    path = grants.grant("execute", "arm-1", caller="agent-a")
+    line = pipeline(robot, grants, "execute@arm-1:agent-b")
+    assert ok(served(line, "agent-b"))
+    refusal = served(line, "agent-a").refusal
+    assert refusal is not None
+    assert refusal.why is RefusalReason.CONTROL
+    assert path.exists()
+    robot.halt()
+    assert ok(served(line, "agent-a"))
+    assert not path.exists()
+
+
+def began_and_failed(robot: ToyRobot) -> object:
+    robot.gate.permit("execute").begin()
+    return error("it was stopped")
+
+
+def raised(robot: ToyRobot) -> object:
+    raise OSError("no answer")
+
+
+def answered_nothing(robot: ToyRobot) -> object:
+    return None
+
+
+def refused(robot: ToyRobot) -> object:
+    robot.gate.permit("execute")
+    return error("it is busy")
+
+
+@pytest.mark.parametrize(
+    ("answer", "spent"), [(began_and_failed, True), (raised, True), (answered_nothing, True), (refused, False)]
+)
+def test_a_grant_is_spent_by_what_began_or_may_have(
+    robot: ToyRobot, grants: Grants, answer: Callable[[ToyRobot], object], spent: bool
+) -> None:
+    grants.grant("execute", "arm-1")
+    line = pipeline(robot, grants)
+    line.own = {"execute": lambda arguments: answer(robot)}
+    served(line, "agent-a")
+    assert (grants.claim("execute", "arm-1") is None) is spent
