@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 
 from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.envelope import Envelope
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stopping import StopVerdict, explain, halt_each, verdict_of
+from strands_robots.safety.stopping import (
+    PendingVerdict,
+    StopVerdict,
+    explain,
+    graded,
+    halt_each,
+    halts_in_parts,
+    read_verdict,
+    verdict_of,
+)
 from strands_robots.utils import ValidationError
 
 
@@ -18,27 +28,69 @@ class WorldStop:
 
     world: WorldRobot
 
+    @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """Halt the world and grade each rollout; an error outweighs success."""
-        world, running = self.world, list[str]()
-        unlisted: dict[str, str] = {}
+        return read_verdict(self.halt_here(reason, 0.0))
+
+    def halt_here(self, reason: str, deadline: float) -> PendingVerdict:
+        """Order the halt of the world; leave its rollouts to be read.
+
+        The halt comes first: a policy that hangs would have the others move on while its own stop waits for it. It has
+        its own deadline, so that one that hangs leaves the rollouts their own stops.
+        """
+        world = self.world
+        # A world that notes its motion lists it at once. Any other is listed after its halt, for that may hang.
+        before = _Rollouts(world) if hasattr(type(world), "halt_ordered") else None
+        return _WorldEnds(world, stop_executor().submit(world, world.tool_name_str, reason), before)
+
+
+class _Rollouts:
+    """Names of the robots of a world whose rollouts run, or the reason why they are not known."""
+
+    def __init__(self, world: WorldRobot) -> None:
+        self.running: list[str] = []
+        self.unlisted: dict[str, str] = {}
         try:
-            running = [str(row.get("robot", "")) for row in world.list_policies_running()]
-        except Exception as exc:  # noqa: BLE001 - a world that changes under the stop is halted as a whole below
-            unlisted = {"rollouts": explain(exc)}
-        # The halt comes first: a policy that hangs would have the others move on while its own stop waits for it.
-        # It has its own deadline, so that one that hangs leaves the rollouts their own stops.
-        rest = stop_executor().halt(world, world.tool_name_str, reason)
+            self.running = [str(row.get("robot", "")) for row in world.list_policies_running()]
+        except Exception as exc:  # noqa: BLE001 - a world that changes under the stop is halted as a whole
+            self.unlisted = {"rollouts": explain(exc)}
+
+
+class _WorldEnds(PendingVerdict):
+    """Verdict on a world whose halt was ordered, and on each of its rollouts."""
+
+    def __init__(self, world: WorldRobot, halting: Future[StopVerdict], before: _Rollouts | None) -> None:
+        super().__init__(0.0)
+        self._world, self._halting, self._before = world, halting, before
+
+    def known(self) -> None:
+        return None
+
+    def read(self) -> StopVerdict:
+        rest = self._rest()
+        listed = self._before or _Rollouts(self._world)
         # A world that settles has answered for its rollouts, and a second stop would freeze it.
-        asked = [] if rest.settling else [name for name in running if name not in rest.not_stopped]
-        rollouts = halt_each({name: RobotStop(world, name).stop for name in asked})
+        asked = [] if rest.settling else [name for name in listed.running if name not in rest.not_stopped]
+        rollouts = halt_each({name: RobotStop(self._world, name).stop for name in asked})
+        return replace(rollouts, unknown={**rollouts.unknown, **listed.unlisted})
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict:
+        rest, rollouts = self._rest(), graded(reading, self._world.tool_name_str)
         return StopVerdict(
-            (*rollouts.halted, *(name for name in rest.halted if name not in asked)),
+            (*rollouts.halted, *(name for name in rest.halted if name not in rollouts.halted)),
             {**rest.not_stopped, **rollouts.not_stopped},
-            {**rest.unknown, **rollouts.unknown, **unlisted},
+            {**rest.unknown, **rollouts.unknown},
             rest.elapsed_ms + rollouts.elapsed_ms,
             rest.settling,
         )
+
+    def unread(self, why: str) -> StopVerdict:
+        return StopVerdict(not_stopped={self._world.tool_name_str: why})
+
+    def _rest(self) -> StopVerdict:
+        # The executor answers at the latest when the deadline is over, behind another halt when it is over twice.
+        return self._halting.result(2 * settings.number("STRANDS_HALT_DEADLINE_S") + 1.0)
 
 
 @dataclass(frozen=True)
