@@ -9,11 +9,10 @@ reading. ``pickle.loads`` is never used. Format: ``pickletools`` of the standard
 from __future__ import annotations
 
 import io
-import itertools
 import pickle
 import pickletools
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -25,8 +24,11 @@ HELPERS = "lerobot.async_inference.helpers"
 SIZE_MAX = 4096
 """Most numbers of one action."""
 
-OPERATIONS_MAX = 500_000
-"""Most operations and numbers of one answer; a chunk of a hundred actions has about ten thousand operations."""
+OPERATIONS_MAX = 20_000
+"""Most operations of one answer, which take 20 ms; a chunk of a hundred actions has about ten thousand."""
+
+NUMBERS_MAX = 65_536
+"""Most numbers of one answer: 1,000 actions of 64 joints."""
 
 HEADER_MAX = 4096
 """Longest part of a tensor's file before its numbers, in bytes; torch writes about 400."""
@@ -92,22 +94,40 @@ def read_actions(data: bytes) -> list[PickledAction]:
         UnreadablePickleError: anything else than a list of actions whose numbers are a flat tensor of float32 or
             float64.
     """
-    # The numbers of all actions are counted together: one piece of bytes may stand for many of them.
-    operations = iter(range(OPERATIONS_MAX))
-    answer = _read(io.BytesIO(data), operations)
+    # All actions are counted together: one piece of bytes may stand for many of them.
+    left = _Left()
+    answer = _read(io.BytesIO(data), left)
     if not isinstance(answer, list):
         raise UnreadablePickleError(f"a list of actions was expected, not {_shown(answer)}")
-    return [_action(each, operations) for each in answer]
+    return [_action(each, left) for each in answer]
 
 
-def _read(stream: BinaryIO, operations: Iterator[int]) -> Any:
+@dataclass
+class _Left:
+    """Operations and numbers that the rest of an answer may have."""
+
+    operations: int = OPERATIONS_MAX
+    numbers: int = NUMBERS_MAX
+
+    def take_operation(self) -> None:
+        self.operations -= 1
+        if self.operations < 0:
+            raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX:,} operations")
+
+    def take_numbers(self, count: int) -> None:
+        self.numbers -= count
+        if self.numbers < 0:
+            raise UnreadablePickleError(f"it has more than {NUMBERS_MAX:,} numbers")
+
+
+def _read(stream: BinaryIO, left: _Left) -> Any:
     """Return the next pickle of a stream as lists, maps and objects.
 
     Raises:
         UnreadablePickleError: an operation or a name that is not read here, more operations than are left, or a pickle
             that is cut off or malformed.
     """
-    reader = _Reader(operations)
+    reader = _Reader(left)
     try:
         for opcode, argument, _ in pickletools.genops(stream):
             if opcode.name == "STOP":
@@ -123,15 +143,14 @@ def _read(stream: BinaryIO, operations: Iterator[int]) -> Any:
 class _Reader:
     """Stack and memo of one pickle."""
 
-    def __init__(self, operations: Iterator[int]) -> None:
-        self._operations = operations
+    def __init__(self, left: _Left) -> None:
+        self._left = left
         self._stack: list[Any] = []
         self._marks: list[int] = []
         self._memo: dict[int, Any] = {}
 
     def take(self, name: str, argument: Any) -> None:
-        if next(self._operations, None) is None:
-            raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX} operations and numbers")
+        self._left.take_operation()
         if name in _IGNORED:
             return
         if name in _VALUES:
@@ -247,23 +266,23 @@ _STEPS: dict[str, Callable[[_Reader, Any], None]] = {
 """Operations by name; all others end the reading."""
 
 
-def _action(found: Any, operations: Iterator[int]) -> PickledAction:
+def _action(found: Any, left: _Left) -> PickledAction:
     if not isinstance(found, PickledObject) or found.name != _ACTION or not isinstance(found.state, dict):
         raise UnreadablePickleError(f"an action was expected, not {_shown(found)}")
     timestamp, timestep = found.state.get("timestamp"), found.state.get("timestep")
     if type(timestamp) is not float or type(timestep) is not int:
         raise UnreadablePickleError(f"an action has the step {_shown(timestep)} at {_shown(timestamp)}")
-    return PickledAction(timestamp, timestep, _tensor(found.state.get("action"), operations))
+    return PickledAction(timestamp, timestep, _tensor(found.state.get("action"), left))
 
 
-def _tensor(found: Any, operations: Iterator[int]) -> tuple[float, ...]:
+def _tensor(found: Any, left: _Left) -> tuple[float, ...]:
     """Return the numbers of a flat tensor."""
     if not isinstance(found, PickledObject) or found.name != _TENSOR or len(found.args) < 4:
         raise UnreadablePickleError(f"an action must be a tensor, not {_shown(found)}")
     storage, offset, size, stride = found.args[:4]
     if not isinstance(storage, PickledObject) or storage.name != _STORAGE or len(storage.args) != 1:
         raise UnreadablePickleError("a tensor must have its numbers as bytes")
-    kind, numbers = _storage(storage.args[0], operations)
+    kind, numbers = _storage(storage.args[0], left)
     if not (_flat(size) and _flat(stride) and _is_count(offset) and 1 <= size[0] <= SIZE_MAX and stride[0] == 1):
         raise UnreadablePickleError(f"an action must be a flat tensor, not one of the size {_shown(size)}")
     code, width = kind
@@ -271,20 +290,19 @@ def _tensor(found: Any, operations: Iterator[int]) -> tuple[float, ...]:
     if last > len(numbers):
         raise UnreadablePickleError("a tensor has more numbers than its bytes")
     # One action may stand in the list many times, and each time its numbers are copied.
-    if sum(1 for _ in itertools.islice(operations, size[0])) < size[0]:
-        raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX} operations and numbers")
+    left.take_numbers(size[0])
     return struct.unpack(f"<{size[0]}{code}", numbers[first:last])
 
 
-def _storage(data: Any, operations: Iterator[int]) -> tuple[tuple[str, int], memoryview]:
+def _storage(data: Any, left: _Left) -> tuple[tuple[str, int], memoryview]:
     """Return the kind and the bytes of the numbers in a file of torch's older format."""
     if not isinstance(data, bytes):
         raise UnreadablePickleError("a tensor must have its numbers as bytes")
     stream = io.BytesIO(memoryview(data)[:HEADER_MAX])
-    magic, version, _ = (_read(stream, operations) for _ in range(3))
+    magic, version, _ = (_read(stream, left) for _ in range(3))
     if type(magic) is not int or type(version) is not int or (magic, version) != (_MAGIC, _VERSION):
         raise UnreadablePickleError("a tensor's file is of another format")
-    stored, keys = _read(stream, operations), _read(stream, operations)
+    stored, keys = _read(stream, left), _read(stream, left)
     parts = stored.args if isinstance(stored, PickledObject) and stored.name == "stored" else ()
     kind = parts[1].name if len(parts) >= 5 and isinstance(parts[1], PickledName) else ""
     if kind not in _KINDS or not _is_text(parts[0]) or parts[0] != "storage" or not _is_count(parts[4]):
