@@ -15,8 +15,8 @@ from strands_robots.utils import ValidationError
 MESSAGE_MAX = 2**20
 """Longest message, in bytes: forty times a chunk of a hundred actions of 32 joints in float64."""
 
-ELEMENTS_MAX = 20_000
-"""Most values in a message, keys included: three times a chunk of a hundred actions, each a map of 32 joints."""
+ELEMENTS_MAX = 12_000
+"""Most values in a message, keys included: twice a chunk of a hundred actions, each a map of 32 joints."""
 
 DEPTH_MAX = 32
 """Deepest nesting; an answer of GR00T has five."""

@@ -25,6 +25,7 @@ from strands_robots.policies.policy_server import (
     PolicyServerError,
     ServedPolicy,
     actions_of,
+    checked_chunk,
     compare,
     numbers_of,
     picture_key,
@@ -73,6 +74,14 @@ class GrootConnection:
             question["api_token"] = self._token
         self._open().send(_module("msgpack").packb(question, default=_encoded))
         frame = wait_for_answer(self._url, self._receive, deadline, interrupted, self.close)
+        return self.read(frame)
+
+    def read(self, frame: bytes) -> Any:
+        """Return what an answer holds.
+
+        Raises:
+            PolicyServerError: it cannot be read, or is the server's error.
+        """
         try:
             answer = decode_msgpack(frame)
         except ForeignDataError as exc:
@@ -153,19 +162,19 @@ class GrootPolicy(ServedPolicy):
         given = {str(part).removeprefix("action."): each for part, each in answer.items()}
         if missing := sorted(self._action.keys() - given.keys()):
             raise PolicyServerError(f"the server answered no {', '.join(missing)}; it has {shown(sorted(given))}")
-        rows = {}
+        numpy, chunks = _module("numpy"), {}
         for part, keys in self._action.items():
             chunk = _array(given[part])
             if chunk.ndim == 3 and chunk.shape[0] == 1:
                 chunk = chunk[0]
-            rows[part] = actions_of(chunk[:, None] if chunk.ndim == 1 and len(keys) == 1 else chunk, keys)
-        lengths = {part: len(each) for part, each in rows.items()}
+            chunk = chunk[:, None] if chunk.ndim == 1 and len(keys) == 1 else chunk
+            chunks[part] = checked_chunk(chunk, len(keys))
+        lengths = {part: len(each) for part, each in chunks.items()}
         if len(set(lengths.values())) != 1:
             raise PolicyServerError(f"the server answered parts of different lengths: {lengths}")
-        together = [
-            {key: value for part in step for key, value in part.items()} for step in zip(*rows.values(), strict=True)
-        ]
-        return [{key: step[key] for key in self.profile.action} for step in together]
+        together = [key for keys in self._action.values() for key in keys]
+        order = [together.index(key) for key in self.profile.action]
+        return actions_of(numpy.concatenate(list(chunks.values()), axis=1)[:, order], self.profile.action)
 
     def begin(self, connection: Any) -> None:
         self._language = connection.language

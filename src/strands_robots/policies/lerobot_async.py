@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from strands_robots.policies.base import Action
-from strands_robots.policies.pickled import UnreadablePickleError, pickled, read_actions
+from strands_robots.policies.pickled import ANSWER_MAX, UnreadablePickleError, pickled, read_actions
 from strands_robots.policies.policy_server import (
     PolicyServerError,
     ServedPolicy,
@@ -45,9 +45,6 @@ CHUNK = 100
 
 TASK = "task"
 STATE, IMAGES = "observation.state", "observation.images."
-
-ANSWER_MAX = 4 * 2**20
-"""Longest answer, in bytes: each action brings the numbers of its whole chunk, 1.3 MB for a hundred of 32 joints."""
 
 _BEGIN, _MIDDLE, _END = 1, 2, 3
 _serving: dict[str, LeRobotAsyncConnection] = {}

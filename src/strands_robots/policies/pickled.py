@@ -24,11 +24,14 @@ HELPERS = "lerobot.async_inference.helpers"
 SIZE_MAX = 4096
 """Most numbers of one action."""
 
-OPERATIONS_MAX = 20_000
-"""Most operations of one answer, which take 20 ms; a chunk of a hundred actions has about ten thousand."""
+ANSWER_MAX = 4 * 2**20
+"""Longest answer, in bytes: each action brings the numbers of its whole chunk, 1.3 MB for a hundred of 32 joints."""
 
-NUMBERS_MAX = 65_536
-"""Most numbers of one answer: 1,000 actions of 64 joints."""
+OPERATIONS_MAX = 15_000
+"""Most operations of one answer, of which a thousand take a millisecond; a chunk of a hundred actions has 9,000."""
+
+NUMBERS_MAX = 32_768
+"""Most numbers of one answer: 1,000 actions of 32 joints."""
 
 HEADER_MAX = 4096
 """Longest part of a tensor's file before its numbers, in bytes; torch writes about 400."""
@@ -94,6 +97,8 @@ def read_actions(data: bytes) -> list[PickledAction]:
         UnreadablePickleError: anything else than a list of actions whose numbers are a flat tensor of float32 or
             float64.
     """
+    if len(data) > ANSWER_MAX:
+        raise UnreadablePickleError(f"it has {len(data):,} bytes, and may have {ANSWER_MAX:,}")
     # All actions are counted together: one piece of bytes may stand for many of them.
     left = _Left()
     answer = _read(io.BytesIO(data), left)
@@ -109,8 +114,8 @@ class _Left:
     operations: int = OPERATIONS_MAX
     numbers: int = NUMBERS_MAX
 
-    def take_operation(self) -> None:
-        self.operations -= 1
+    def take_operations(self, count: int = 1) -> None:
+        self.operations -= count
         if self.operations < 0:
             raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX:,} operations")
 
@@ -150,23 +155,22 @@ class _Reader:
         self._memo: dict[int, Any] = {}
 
     def take(self, name: str, argument: Any) -> None:
-        self._left.take_operation()
-        if name in _IGNORED:
-            return
+        self._left.take_operations()
         if name in _VALUES:
             self._stack.append(argument)
-        elif name in _CONSTANTS:
-            self._stack.append(_CONSTANTS[name]())
-        elif name in _STEPS:
-            _STEPS[name](self, argument)
-        else:
+            return
+        step = _STEPS.get(name)
+        if step is None:
             raise UnreadablePickleError(f"the operation {name} is not read")
+        step(self, argument)
 
     def result(self) -> Any:
         (result,) = self._stack
         return result
 
     def push_name(self, full: str) -> None:
+        # A name takes as long as four operations.
+        self._left.take_operations(3)
         if full not in _NAMES:
             raise UnreadablePickleError(f"it names {shown(full)}, which is not read")
         self._stack.append(PickledName(full))
@@ -228,20 +232,19 @@ class _Reader:
         self._stack.append(PickledObject("stored", _tuple(self._stack.pop())))
 
 
-_IGNORED = frozenset({"PROTO", "FRAME"})
 _VALUES = frozenset(
     {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"}
     | {"BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES"}
 )
-_CONSTANTS: dict[str, Callable[[], Any]] = {
-    "NONE": lambda: None,
-    "NEWTRUE": lambda: True,
-    "NEWFALSE": lambda: False,
-    "EMPTY_LIST": list,
-    "EMPTY_DICT": dict,
-    "EMPTY_TUPLE": tuple,
-}
 _STEPS: dict[str, Callable[[_Reader, Any], None]] = {
+    "PROTO": lambda reader, _: None,
+    "FRAME": lambda reader, _: None,
+    "NONE": lambda reader, _: reader._stack.append(None),
+    "NEWTRUE": lambda reader, _: reader._stack.append(True),
+    "NEWFALSE": lambda reader, _: reader._stack.append(False),
+    "EMPTY_LIST": lambda reader, _: reader._stack.append([]),
+    "EMPTY_DICT": lambda reader, _: reader._stack.append({}),
+    "EMPTY_TUPLE": lambda reader, _: reader._stack.append(()),
     "MARK": lambda reader, _: reader.mark(),
     "GLOBAL": lambda reader, name: reader.push_name(str(name).replace(" ", ".", 1)),
     "STACK_GLOBAL": lambda reader, _: reader.name_of_stack(),

@@ -16,16 +16,17 @@ from strands_robots.utils import ValidationError, choice, shown
 CHUNK_MAX = 10_000
 """Longest accepted chunk of actions."""
 
-VALUES_MAX = 65_536
-"""Most numbers of a chunk: 1,000 actions of 64 joints."""
+VALUES_MAX = 32_768
+"""Most numbers of a chunk: 1,000 actions of 32 joints."""
 
 PICTURE = (224, 224)
 """Size of pictures in the first inference where the profile states none; servers resize to it."""
 
+_NUMBERS = frozenset({int, float})
 _AXES_MAX = 3
 """Batch, step and dimension."""
 
-SLICE_S = 0.05
+SLICE_S = 0.01
 """Seconds between two looks at whether an answer is still wanted."""
 
 
@@ -204,18 +205,24 @@ def actions_of(rows: Any, keys: tuple[str, ...]) -> list[Action]:
         PolicyServerError: another shape, no step, more than CHUNK_MAX or VALUES_MAX, or something that is no finite
             number.
     """
+    chunk = checked_chunk(rows, len(keys))
+    return [dict(zip(keys, row, strict=True)) for row in chunk.astype(float).tolist()]
+
+
+def checked_chunk(rows: Any, dimension: int) -> Any:
+    """Return an array (horizon, dimension) of finite numbers; raises as :func:`actions_of`."""
     import numpy  # noqa: PLC0415 - loaded where a policy is used
 
     chunk = numbers_of(rows)
-    if chunk.ndim != 2 or not 1 <= chunk.shape[0] <= CHUNK_MAX or chunk.shape[1] != len(keys):
+    if chunk.ndim != 2 or not 1 <= chunk.shape[0] <= CHUNK_MAX or chunk.shape[1] != dimension:
         raise PolicyServerError(
-            f"the policy server answered actions of the shape {chunk.shape}, and the profile has {len(keys)} keys"
+            f"the policy server answered actions of the shape {chunk.shape}, and the profile has {dimension} keys"
         )
     if chunk.size > VALUES_MAX:
         raise PolicyServerError(f"the policy server answered {chunk.size:,} numbers, and may answer {VALUES_MAX:,}")
     if chunk.dtype.kind not in "iuf" or not numpy.isfinite(chunk).all():
         raise PolicyServerError("the policy server answered actions that are no finite numbers")
-    return [dict(zip(keys, row, strict=True)) for row in chunk.astype(float).tolist()]
+    return chunk
 
 
 def numbers_of(found: Any) -> Any:
@@ -239,9 +246,11 @@ def numbers_of(found: Any) -> Any:
 
 
 def _plain_numbers(found: Any, axes: int) -> bool:
-    if isinstance(found, list | tuple):
-        return axes > 0 and all(_plain_numbers(each, axes - 1) for each in found)
-    return type(found) in (int, float)
+    if not isinstance(found, list | tuple):
+        return type(found) in _NUMBERS
+    if axes and _NUMBERS.issuperset(map(type, found)):
+        return True
+    return axes > 1 and all(_plain_numbers(each, axes - 1) for each in found)
 
 
 def compare(name: str, states: object, profile: object) -> None:
