@@ -52,7 +52,7 @@ def _bombed(kind: str, stops: int) -> Row:
     what = f"a hostile {kind} server, {sent} bombs of 24 and 1 MB" if kind else "the same two robots without an attack"
     return Row(
         f"{what}: the last write of two robots",
-        f"{still_of.text()}; the verdicts p99 {verdict_of.quantile(0.99) * 1e3:.0f} ms; memory + {grown:.0f} MB at most",
+        f"{still_of.text()}; verdicts p99 {verdict_of.quantile(0.99) * 1e3:.0f} ms; memory + {grown:.0f} MB at most",
         "",
         None,
         f"p99 ≤ {STOP_MAX_MS:.0f} ms, memory + ≤ {MEMORY_MAX_MB:.0f} MB",

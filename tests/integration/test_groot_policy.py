@@ -244,10 +244,10 @@ def test_a_stop_ends_the_wait_for_an_answer(make: Make) -> None:
     assert time.monotonic() - began < 10
 
 
-def test_no_server_is_told_although_connecting_to_nobody_succeeds() -> None:
+def test_no_server_is_told_with_its_address() -> None:
     url = f"tcp://127.0.0.1:{free_port()}"
     profile = Profile("gr", "groot", KEYS, KEYS, url=url, parts=PARTS, first_deadline_s=0.3)
-    with pytest.raises(PolicyServerError, match=f"{url} did not answer in time"):
+    with pytest.raises(PolicyServerError, match=f"no policy server answers at {url}"):
         GrootPolicy(profile).reset("pick up the cube", RANGES)
 
 

@@ -5,7 +5,7 @@ format, and an error ``{error: text}``. N1.5 takes a flat observation without a 
 ``video``, ``state`` and ``language`` with one, or, behind their wrapper for simulations, flat keys with one. Source:
 Isaac-GR00T, ``gr00t/eval/service.py`` (N1.5) and ``gr00t/policy/server_client.py`` (N1.6, N1.7).
 
-A socket that missed an answer cannot ask again, so it is closed and another one opened. Nothing is encrypted: use
+There are no ids: after a missed answer the connection is closed and another one opened. Nothing is encrypted: use
 loopback or a tunnel.
 """
 
@@ -33,6 +33,7 @@ from strands_robots.policies.policy_server import (
 )
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
+from strands_robots.policies.zmtp import RequestSocket, ZmtpError
 from strands_robots.utils import ValidationError, optional_module, shown
 
 _module = partial(optional_module, what="The groot policy", extra="groot")
@@ -55,7 +56,7 @@ class GrootConnection:
     def __init__(self, url: str, token: str) -> None:
         self._url = url
         self._token = token
-        self._socket: Any = None
+        self._socket = RequestSocket(url, MESSAGE_MAX)
         self.language = LANGUAGE
 
     def infer(self, observation: Any, deadline: float, interrupted: threading.Event) -> Any:
@@ -72,9 +73,23 @@ class GrootConnection:
             question["data"] = data
         if self._token:
             question["api_token"] = self._token
-        self._open().send(_module("msgpack").packb(question, default=_encoded))
-        frame = wait_for_answer(self._url, self._receive, deadline, interrupted, self.close)
-        return self.read(frame)
+        frame = _module("msgpack").packb(question, default=_encoded)
+        try:
+            try:
+                answer = self._asked(frame, deadline, interrupted)
+            except OSError:
+                # The server may have been started anew.
+                self.close()
+                answer = self._asked(frame, deadline, interrupted)
+        except (OSError, ZmtpError) as exc:
+            self.close()
+            raise PolicyServerError(f"no policy server answers at {self._url}: {exc}") from exc
+        return self.read(answer)
+
+    def _asked(self, frame: bytes, deadline: float, interrupted: threading.Event) -> bytes:
+        self._socket.send(frame, deadline)
+        answer: bytes = wait_for_answer(self._url, self._socket.receive, deadline, interrupted, self.close)
+        return answer
 
     def read(self, frame: bytes) -> Any:
         """Return what an answer holds.
@@ -91,24 +106,8 @@ class GrootConnection:
         return answer
 
     def close(self) -> None:
-        socket, self._socket = self._socket, None
-        if socket is not None:
-            socket.close(linger=0)
-
-    def _open(self) -> Any:
-        zmq = _module("zmq")
-        if self._socket is None:
-            self._socket = zmq.Context.instance().socket(zmq.REQ)
-            self._socket.setsockopt(zmq.LINGER, 0)
-            self._socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_MAX)
-            self._socket.connect(self._url)
-        return self._socket
-
-    def _receive(self, seconds: float) -> bytes:
-        if not self._socket.poll(max(1, round(seconds * 1000))):
-            raise TimeoutError
-        frame: bytes = self._socket.recv()
-        return frame
+        """Drop the connection; a late answer goes with it."""
+        self._socket.close()
 
 
 class GrootPolicy(ServedPolicy):
@@ -127,7 +126,7 @@ class GrootPolicy(ServedPolicy):
         self._language = LANGUAGE
         self._state = _parts_of(self.profile, "state", self.profile.state)
         self._action = _parts_of(self.profile, "action", self.profile.action)
-        for module in ("zmq", "msgpack", "numpy"):
+        for module in ("msgpack", "numpy"):
             _module(module)
 
     def connect(self, token: str, deadline: float) -> GrootConnection:

@@ -107,7 +107,7 @@ class OpenPiConnection:
 
 
 class OpenPiPolicy(ServedPolicy):
-    """Policy on an openpi server; the profile's ``layout`` names the keys of the observation.
+    """Policy on an openpi server; the profile's ``layout`` names its keys.
 
     Raises:
         ValidationError: also a layout that the profile's state does not fit.

@@ -210,7 +210,7 @@ def actions_of(rows: Any, keys: tuple[str, ...]) -> list[Action]:
 
 
 def checked_chunk(rows: Any, dimension: int) -> Any:
-    """Return an array (horizon, dimension) of finite numbers; raises as :func:`actions_of`."""
+    """Return a chunk as an array of finite numbers; raises as :func:`actions_of`."""
     import numpy  # noqa: PLC0415 - loaded where a policy is used
 
     chunk = numbers_of(rows)
