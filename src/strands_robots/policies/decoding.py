@@ -8,6 +8,7 @@ What is beyond a bound is refused before an object is made of it.
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 from strands_robots.utils import ValidationError
@@ -57,6 +58,17 @@ def decode_json(data: str | bytes, *, bytes_max: int = MESSAGE_MAX, elements_max
         return json.loads(data)
     except (ValueError, RecursionError) as exc:
         raise ForeignDataError(f"it is malformed: {type(exc).__name__}: {exc!s:.200}") from None
+
+
+def read_json(path: Path, *, bytes_max: int = MESSAGE_MAX, elements_max: int = ELEMENTS_MAX) -> Any:
+    """Return what a JSON file holds; no more of it is read than it may have.
+
+    Raises:
+        ForeignDataError: it is beyond a bound, or no JSON.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return decode_json(file.read(bytes_max + 1), bytes_max=bytes_max, elements_max=elements_max)
 
 
 def _within(what: str, count: int, most: int) -> None:

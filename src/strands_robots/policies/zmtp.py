@@ -116,7 +116,7 @@ class RequestSocket:
         return flags, self._taken(start + length)[start:]
 
     def _fill(self, size: int, deadline: float) -> None:
-        """Read until so many bytes wait; what came before the deadline stays for the next call."""
+        """Read until so many bytes wait; what came in time stays for the next call."""
         assert self._socket is not None
         while len(self._received) < size:
             if time.monotonic() > deadline:
