@@ -164,7 +164,7 @@ def test_an_answer_with_any_byte_changed_is_read_or_refused(make: Make) -> None:
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        ([{"single_arm": numpy.zeros((1, 4, 2), numpy.float32)}, {}], "answered no gripper; it has single_arm"),
+        ([{"single_arm": numpy.zeros((1, 4, 2), numpy.float32)}, {}], r"answered no gripper; it has \['single_arm'\]"),
         ([{"single_arm": numpy.zeros((1, 4, 3), numpy.float32), "gripper": numpy.zeros((1, 4, 1))}, {}], "shape"),
         ([{"single_arm": numpy.zeros((1, 4, 2)), "gripper": numpy.zeros((1, 5, 1))}, {}], "different lengths"),
         ([{"single_arm": numpy.full((1, 4, 2), numpy.nan), "gripper": numpy.zeros((1, 4, 1))}, {}], "no finite"),
@@ -172,12 +172,12 @@ def test_an_answer_with_any_byte_changed_is_read_or_refused(make: Make) -> None:
         (b"\xc1", "unreadable answer"),
         ([], "without actions"),
         ("fine", "without actions"),
-        ([{"single_arm": numpy.array([[[None, 1]]]), "gripper": numpy.zeros((1, 1, 1))}, {}], "unreadable answer"),
-        (in_place_of_an_array(archive()), "unreadable answer"),
-        (in_place_of_an_array(stating((10**12,))), "unreadable answer"),
-        (in_place_of_an_array(stating((1, -1, 2)) + bytes(32)), "of the shape"),
-        (in_place_of_an_array(b"\x93NUMPY\x01\x00\x20\x03" + 800 * b"("), "unreadable answer"),
-        (in_place_of_an_array(7), "unreadable answer"),
+        ([{"single_arm": numpy.array([[[None, 1]]]), "gripper": numpy.zeros((1, 1, 1))}, {}], "cannot be read"),
+        (in_place_of_an_array(archive()), "cannot be read"),
+        (in_place_of_an_array(stating((10**12,))), "cannot be read"),
+        (in_place_of_an_array(stating((1, -1, 2)) + bytes(32)), "cannot be read"),
+        (in_place_of_an_array(b"\x93NUMPY\x01\x00\x20\x03" + 800 * b"("), "cannot be read"),
+        (in_place_of_an_array(7), "cannot be read"),
     ],
     ids=lambda value: str(value)[:40],
 )
@@ -244,10 +244,10 @@ def test_a_stop_ends_the_wait_for_an_answer(make: Make) -> None:
     assert time.monotonic() - began < 10
 
 
-def test_no_server_is_told_although_connecting_to_nobody_succeeds() -> None:
+def test_no_server_is_told_with_its_address() -> None:
     url = f"tcp://127.0.0.1:{free_port()}"
     profile = Profile("gr", "groot", KEYS, KEYS, url=url, parts=PARTS, first_deadline_s=0.3)
-    with pytest.raises(PolicyServerError, match=f"{url} did not answer in time"):
+    with pytest.raises(PolicyServerError, match=f"no policy server answers at {url}"):
         GrootPolicy(profile).reset("pick up the cube", RANGES)
 
 

@@ -156,12 +156,12 @@ def test_a_strange_pickle_is_refused(what: str) -> None:
 
 
 def test_an_answer_of_endless_operations_is_given_up() -> None:
-    with pytest.raises(UnreadablePickleError, match="more than 500000 operations and numbers"):
-        read_actions(b"\x80\x02" + b"N" * 600_000 + b".")
+    with pytest.raises(UnreadablePickleError, match="more than 15,000 operations"):
+        read_actions(b"\x80\x02" + b"N" * 30_000 + b".")
 
 
 def test_bytes_that_stand_for_many_tensors_are_counted_each_time() -> None:
-    slow = StorageBytes(b"\x80\x02" + b"N" * 20_000 + b"].")
+    slow = StorageBytes(b"\x80\x02" + b"N" * 2_000 + b"].")
     many = wired([TimedAction(0.0, index, Tensor(slow, 0, (3,))) for index in range(1000)])
     assert len(many) < 200_000
     with pytest.raises(UnreadablePickleError):
@@ -246,9 +246,9 @@ def test_one_action_that_stands_in_the_list_many_times_is_counted_each_time() ->
     one = TimedAction(0.0, 0, tensor(numbers, size=(module.SIZE_MAX,)))
     many = wired([one] * 1000)
     assert len(many) < 25_000
-    with pytest.raises(UnreadablePickleError, match="more than 500000 operations and numbers"):
+    with pytest.raises(UnreadablePickleError, match="more than 32,768 numbers"):
         read_actions(many)
-    assert len(read_actions(wired([one] * 100))) == 100
+    assert len(read_actions(wired([one] * 8))) == 8
 
 
 def test_a_tensors_file_holds_no_bytes_before_its_numbers() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import struct
+import time
 import tracemalloc
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import zstandard
 from lz4 import frame as lz4
 from mcap.writer import CompressionType, Writer
 
-from strands_robots.recording import unpacking
+from strands_robots.recording import schemas, unpacking
 from strands_robots.recording.file import read_items, recorded_actions
 from strands_robots.utils import ValidationError
 
@@ -71,6 +72,60 @@ def test_many_small_chunks_that_unpack_to_gigabytes_are_refused(tmp_path: Path) 
     assert path.stat().st_size < 500_000
     with pytest.raises(ValidationError, match="unpacks to more than"):
         recorded_actions(path)
+
+
+def recording(path: Path, schema: str, encoding: str, messages: list[bytes]) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        made = writer.register_schema(schema, "x", b"{}")
+        channel = writer.register_channel("/arm-1/streamStep", encoding, made)
+        for at, data in enumerate(messages):
+            writer.add_message(channel, at, data, at)
+        writer.finish()
+    return path
+
+
+MESSAGES = {
+    "an event of empty lists": ("event", "json", b"[" + b"[]," * 300_000 + b"[]]"),
+    "an event that is no object": ("event", "json", b"[1]"),
+    "an event of megabytes": ("event", "json", b'{"action": "' + b"x" * 2**21 + b'"}'),
+    "the deepest event": ("event", "json", b"[" * 100_000),
+    "a million joints": (
+        schemas.JOINT_STATE.name,
+        "cdr",
+        b"\0\1\0\0" + bytes(12) + struct.pack("<I", 10**6) + bytes(4 * 10**6),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", MESSAGES)
+def test_message_that_would_take_the_memory_is_refused(tmp_path: Path, what: str) -> None:
+    schema, encoding, data = MESSAGES[what]
+    path = recording(tmp_path / "bomb.mcap", schema, encoding, [data])
+    tracemalloc.start()
+    with pytest.raises(ValidationError, match="no recording of robots"):
+        recorded_actions(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < unpacking.CHUNK_MAX_BYTES + 4 * len(data) + 2**20
+
+
+def test_number_of_a_megabyte_in_a_picture_ends_at_64_bits(tmp_path: Path) -> None:
+    bomb = b"\x80" * 2**20
+    began = time.thread_time()
+    list(read_items(recording(tmp_path / "bomb.mcap", schemas.IMAGE.name, "protobuf", [bomb])))
+    assert time.thread_time() - began < 5.0
+
+
+def test_chunk_of_many_records_is_never_held_as_objects(tmp_path: Path) -> None:
+    packed = zstandard.ZstdCompressor().compress(record(0x03, struct.pack("<H", 1) + text("") * 2 + bytes(4)) * 100_000)
+    path = mcap_file(tmp_path / "many.mcap", chunk("zstd", packed, 0))
+    tracemalloc.start()
+    assert list(read_items(path)) == []
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < unpacking.CHUNK_MAX_BYTES + 8 * 2**20
 
 
 def test_record_that_claims_gigabytes_is_refused(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "mcp": ("mcp", "starlette", "uvicorn"),
     "bridge": ("fastmcp",),
     "dashboard": ("starlette", "uvicorn", "websockets", "segno"),
-    "groot": ("pyzmq", "msgpack"),
+    "groot": ("msgpack",),
     "lerobot-async": ("grpcio",),
     "record": ("mcap", "pillow"),
     "dataset": ("pyarrow",),

@@ -7,7 +7,6 @@ the dataset's ``meta/info.json`` alone. Format: LeRobot 0.4 to 0.6.
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from collections.abc import Mapping
@@ -15,10 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from strands_robots.policies.decoding import ForeignDataError, decode_json, read_json
 from strands_robots.utils import ValidationError, shown
 
 STATE, ACTION, ENVIRONMENT = "observation.state", "action", "observation.environment_state"
-HEADER_MAX = 100 * 2**20
+HEADER_MAX, HEADER_ELEMENTS_MAX = 4 * 2**20, 200_000
+"""Longest header of a weights file, in bytes and elements: some ten thousand tensors."""
 
 Size = tuple[int, int, int]
 """Height, width and channels of a picture."""
@@ -157,8 +158,8 @@ def _header(path: Path) -> dict[str, Any]:
             (length,) = struct.unpack("<Q", file.read(8))
             if length > HEADER_MAX:
                 raise ValidationError(f"{path.name} has a header of {length} bytes")
-            header = json.loads(file.read(length))
-    except (OSError, struct.error, UnicodeDecodeError, json.JSONDecodeError) as exc:
+            header = decode_json(file.read(length), bytes_max=HEADER_MAX, elements_max=HEADER_ELEMENTS_MAX)
+    except (OSError, struct.error, ForeignDataError) as exc:
         raise ValidationError(f"{path.name} cannot be read: {exc}") from None
     if not isinstance(header, dict):
         raise ValidationError(f"{path.name} has no header")
@@ -167,7 +168,7 @@ def _header(path: Path) -> dict[str, Any]:
 
 def _object(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except (OSError, ValueError) as exc:
         raise ValidationError(f"it cannot be read: {exc}") from None
     if not isinstance(content, dict):

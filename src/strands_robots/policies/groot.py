@@ -5,33 +5,35 @@ format, and an error ``{error: text}``. N1.5 takes a flat observation without a 
 ``video``, ``state`` and ``language`` with one, or, behind their wrapper for simulations, flat keys with one. Source:
 Isaac-GR00T, ``gr00t/eval/service.py`` (N1.5) and ``gr00t/policy/server_client.py`` (N1.6, N1.7).
 
-A socket that missed an answer cannot ask again, so it is closed and another one opened. Nothing is encrypted: use
+There are no ids: after a missed answer the connection is closed and another one opened. Nothing is encrypted: use
 loopback or a tunnel.
 """
 
 from __future__ import annotations
 
 import io
-import json
+import re
 import threading
 import time
-import tokenize
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from strands_robots.policies.base import Action
+from strands_robots.policies.decoding import MESSAGE_MAX, ForeignDataError, decode_json, decode_msgpack
 from strands_robots.policies.policy_server import (
-    ANSWER_MAX,
     PolicyServerError,
     ServedPolicy,
     actions_of,
+    checked_chunk,
     compare,
+    numbers_of,
     picture_key,
     wait_for_answer,
 )
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
+from strands_robots.policies.zmtp import RequestSocket, ZmtpError
 from strands_robots.utils import ValidationError, optional_module, shown
 
 _module = partial(optional_module, what="The groot policy", extra="groot")
@@ -40,8 +42,12 @@ LAYOUTS = ("n1.6", "n1.6-flat", "n1.5")
 LANGUAGE = "annotation.human.task_description"
 """Key of the instruction where the server states none."""
 
-_KINDS = "biuf"
-"""Kinds of numpy arrays that are decoded."""
+_HEADER = re.compile(
+    rb"\x93NUMPY[\1-\3]\0..(?:\0\0)?"
+    rb"\{'descr': '([<>|=][biuf][1248])', 'fortran_order': (True|False), 'shape': \(([0-9, ]{0,100})\), \} *\n",
+    re.DOTALL,
+)
+"""Header of an array of plain numbers as numpy writes it. Source: NEP 1."""
 
 
 class GrootConnection:
@@ -50,7 +56,7 @@ class GrootConnection:
     def __init__(self, url: str, token: str) -> None:
         self._url = url
         self._token = token
-        self._socket: Any = None
+        self._socket = RequestSocket(url, MESSAGE_MAX)
         self.language = LANGUAGE
 
     def infer(self, observation: Any, deadline: float, interrupted: threading.Event) -> Any:
@@ -67,35 +73,41 @@ class GrootConnection:
             question["data"] = data
         if self._token:
             question["api_token"] = self._token
-        self._open().send(_module("msgpack").packb(question, default=_encoded))
-        frame = wait_for_answer(self._url, self._receive, deadline, interrupted, self.close)
+        frame = _module("msgpack").packb(question, default=_encoded)
         try:
-            answer = _module("msgpack").unpackb(frame, object_hook=_decoded, strict_map_key=False)
-        except (ValueError, TypeError, OverflowError, RecursionError) as exc:
+            try:
+                answer = self._asked(frame, deadline, interrupted)
+            except OSError:
+                # The server may have been started anew.
+                self.close()
+                answer = self._asked(frame, deadline, interrupted)
+        except (OSError, ZmtpError) as exc:
+            self.close()
+            raise PolicyServerError(f"no policy server answers at {self._url}: {exc}") from exc
+        return self.read(answer)
+
+    def _asked(self, frame: bytes, deadline: float, interrupted: threading.Event) -> bytes:
+        self._socket.send(frame, deadline)
+        answer: bytes = wait_for_answer(self._url, self._socket.receive, deadline, interrupted, self.close)
+        return answer
+
+    def read(self, frame: bytes) -> Any:
+        """Return what an answer holds.
+
+        Raises:
+            PolicyServerError: it cannot be read, or is the server's error.
+        """
+        try:
+            answer = decode_msgpack(frame)
+        except ForeignDataError as exc:
             raise PolicyServerError(f"the policy server at {self._url} sent an unreadable answer: {exc}") from exc
         if isinstance(answer, Mapping) and "error" in answer:
             raise PolicyServerError(f"the policy server at {self._url} failed: {shown(answer['error'])}")
         return answer
 
     def close(self) -> None:
-        socket, self._socket = self._socket, None
-        if socket is not None:
-            socket.close(linger=0)
-
-    def _open(self) -> Any:
-        zmq = _module("zmq")
-        if self._socket is None:
-            self._socket = zmq.Context.instance().socket(zmq.REQ)
-            self._socket.setsockopt(zmq.LINGER, 0)
-            self._socket.setsockopt(zmq.MAXMSGSIZE, ANSWER_MAX)
-            self._socket.connect(self._url)
-        return self._socket
-
-    def _receive(self, seconds: float) -> bytes:
-        if not self._socket.poll(max(1, round(seconds * 1000))):
-            raise TimeoutError
-        frame: bytes = self._socket.recv()
-        return frame
+        """Drop the connection; a late answer goes with it."""
+        self._socket.close()
 
 
 class GrootPolicy(ServedPolicy):
@@ -114,7 +126,7 @@ class GrootPolicy(ServedPolicy):
         self._language = LANGUAGE
         self._state = _parts_of(self.profile, "state", self.profile.state)
         self._action = _parts_of(self.profile, "action", self.profile.action)
-        for module in ("zmq", "msgpack", "numpy"):
+        for module in ("msgpack", "numpy"):
             _module(module)
 
     def connect(self, token: str, deadline: float) -> GrootConnection:
@@ -142,29 +154,26 @@ class GrootPolicy(ServedPolicy):
         return told if self._layout == "n1.5" else {"observation": told, "options": None}
 
     def actions(self, answer: Any) -> list[Action]:
-        numpy = _module("numpy")
         if isinstance(answer, Sequence) and not isinstance(answer, str | bytes) and answer:
             answer = answer[0]
         if not isinstance(answer, Mapping):
             raise PolicyServerError(f"the server at {self.profile.url} answered without actions: {shown(answer)}")
         given = {str(part).removeprefix("action."): each for part, each in answer.items()}
         if missing := sorted(self._action.keys() - given.keys()):
-            raise PolicyServerError(
-                f"the server answered no {', '.join(missing)}; it has {', '.join(sorted(given)) or 'nothing'}"
-            )
-        rows = {}
+            raise PolicyServerError(f"the server answered no {', '.join(missing)}; it has {shown(sorted(given))}")
+        numpy, chunks = _module("numpy"), {}
         for part, keys in self._action.items():
-            chunk = numpy.asarray(given[part])
+            chunk = _array(given[part])
             if chunk.ndim == 3 and chunk.shape[0] == 1:
                 chunk = chunk[0]
-            rows[part] = actions_of(chunk[:, None] if chunk.ndim == 1 and len(keys) == 1 else chunk, keys)
-        lengths = {part: len(each) for part, each in rows.items()}
+            chunk = chunk[:, None] if chunk.ndim == 1 and len(keys) == 1 else chunk
+            chunks[part] = checked_chunk(chunk, len(keys))
+        lengths = {part: len(each) for part, each in chunks.items()}
         if len(set(lengths.values())) != 1:
             raise PolicyServerError(f"the server answered parts of different lengths: {lengths}")
-        together = [
-            {key: value for part in step for key, value in part.items()} for step in zip(*rows.values(), strict=True)
-        ]
-        return [{key: step[key] for key in self.profile.action} for step in together]
+        together = [key for keys in self._action.values() for key in keys]
+        order = [together.index(key) for key in self.profile.action]
+        return actions_of(numpy.concatenate(list(chunks.values()), axis=1)[:, order], self.profile.action)
 
     def begin(self, connection: Any) -> None:
         self._language = connection.language
@@ -193,7 +202,7 @@ class GrootPolicy(ServedPolicy):
                     compare("horizon", len(deltas), profile.chunk)
             elif deltas not in (None, [0]):
                 raise PolicyServerError(
-                    f"the server wants {modality} of the steps {deltas}, and gets the present alone"
+                    f"the server wants {modality} of the steps {shown(deltas)}, and gets the present alone"
                 )
         names, _ = _modality(config, "language")
         self._language = connection.language = names[0] if names else LANGUAGE
@@ -202,6 +211,12 @@ class GrootPolicy(ServedPolicy):
 def _modality(config: Any, modality: str) -> tuple[list[str] | None, list[int] | None]:
     """Return the keys and the steps of a modality, None where none are stated."""
     stated = config.get(modality) if isinstance(config, Mapping) else None
+    if isinstance(stated, Mapping) and "__ModalityConfig_class__" in stated:
+        stated = stated.get("as_json", stated.get("as_dict"))
+        try:
+            stated = decode_json(stated) if isinstance(stated, str) else stated
+        except ForeignDataError as exc:
+            raise PolicyServerError(f"the server's modality {modality} cannot be read: {exc}") from exc
     if not isinstance(stated, Mapping):
         return None, None
     names, deltas = stated.get("modality_keys"), stated.get("delta_indices")
@@ -239,40 +254,24 @@ def _encoded(value: Any) -> Any:
     return {"__ndarray_class__": True, "as_npy": file.getvalue()}
 
 
-def _decoded(found: dict[Any, Any]) -> Any:
-    """Decode GR00T's arrays and modalities.
+def _array(found: Any) -> Any:
+    """Decode an array in numpy's own format without a copy, or lists of numbers.
+
+    ``numpy.load`` also opens archives, evaluates the header, and makes room for whatever shape it states.
 
     Raises:
-        ValueError: bytes that are no array of numbers.
+        PolicyServerError: no such array, an array of objects, or one whose bytes do not fill its shape.
     """
-    if "__ndarray_class__" in found:
-        return _array(found.get("as_npy"))
-    if "__ModalityConfig_class__" in found:
-        stated = found.get("as_json", found.get("as_dict"))
-        return json.loads(stated) if isinstance(stated, str) else stated
-    return found
-
-
-def _array(file: Any) -> Any:
-    """Decode an array in numpy's own format; it takes no more memory than its bytes.
-
-    ``numpy.load`` also opens archives, and makes room for whatever shape a header states. Source of the format: NEP 1.
-
-    Raises:
-        ValueError: no such array, an array of objects, or one whose bytes do not fill its shape.
-    """
-    numpy = _module("numpy")
-    if not isinstance(file, bytes):
-        raise ValidationError(f"an array of {shown(file)}")
-    reader = io.BytesIO(file)
-    version = numpy.lib.format.read_magic(reader)
-    header = numpy.lib.format.read_array_header_1_0 if version == (1, 0) else numpy.lib.format.read_array_header_2_0
+    if not (isinstance(found, Mapping) and "__ndarray_class__" in found):
+        return numbers_of(found)
+    file = found.get("as_npy")
+    header = _HEADER.match(file) if isinstance(file, bytes) else None
+    if header is None or not isinstance(file, bytes):
+        raise PolicyServerError(f"the policy server sent an array that cannot be read: {shown(file)}")
+    dtype, fortran, shape = (each.decode() for each in header.groups())
     try:
-        shape, fortran, dtype = header(reader)
-    except (SyntaxError, tokenize.TokenError) as exc:
-        raise ValidationError(f"an array whose header cannot be read: {exc}") from exc
-    if dtype.kind not in _KINDS:
-        raise ValidationError(f"an array of the kind {dtype.kind}")
-    if any(length < 0 for length in shape):
-        raise ValidationError(f"an array of the shape {shape}")
-    return numpy.frombuffer(file, dtype, offset=reader.tell()).reshape(shape, order="F" if fortran else "C")
+        lengths = tuple(int(each) for each in shape.split(",") if each.strip())
+        flat = _module("numpy").frombuffer(file, dtype, offset=header.end())
+        return flat.reshape(lengths, order="F" if fortran == "True" else "C")
+    except (ValueError, TypeError) as exc:
+        raise PolicyServerError(f"the policy server sent an array that cannot be read: {exc!s:.200}") from exc

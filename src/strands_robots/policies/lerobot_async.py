@@ -20,9 +20,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from strands_robots.policies.base import Action
-from strands_robots.policies.pickled import UnreadablePickleError, pickled, read_actions
+from strands_robots.policies.pickled import ANSWER_MAX, UnreadablePickleError, pickled, read_actions
 from strands_robots.policies.policy_server import (
-    ANSWER_MAX,
     PolicyServerError,
     ServedPolicy,
     actions_of,
@@ -152,7 +151,12 @@ class LeRobotAsyncConnection:
         if self._channel is None:
             address = urlsplit(self._url)
             host = f"[{address.hostname}]" if ":" in str(address.hostname) else address.hostname
-            options = [("grpc.max_receive_message_length", ANSWER_MAX), ("grpc.enable_http_proxy", 0)]
+            # An answer that claims to be packed is handed on as it is, and refused: it might unpack to gigabytes.
+            options = [
+                ("grpc.max_receive_message_length", ANSWER_MAX),
+                ("grpc.per_message_decompression", 0),
+                ("grpc.enable_http_proxy", 0),
+            ]
             target = f"{host}:{address.port or PORT}"
             self._channel = _module("grpc").insecure_channel(target, options=options)
         return self._channel

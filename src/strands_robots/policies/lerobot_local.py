@@ -6,13 +6,13 @@ does not say which joints it moves, so it is used through a profile alone.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from strands_robots.policies.base import Action, PolicyError, Ranges
+from strands_robots.policies.decoding import read_json
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, missing_extra, shown
@@ -178,9 +178,11 @@ def _feature(key: str) -> str:
 def _needs_every_tick(directory: Path) -> bool:
     """Return True for a policy with a history, or with an average over chunks."""
     try:
-        config = json.loads((directory / "config.json").read_text(encoding="utf-8"))
+        config = read_json(directory / "config.json")
     except (OSError, ValueError):
         # The check refuses it, with the reason.
         return False
-    steps = config.get("n_obs_steps", 1) if isinstance(config, dict) else 1
+    if not isinstance(config, dict):
+        return False
+    steps = config.get("n_obs_steps", 1)
     return (isinstance(steps, int) and steps > 1) or config.get("temporal_ensemble_coeff") is not None

@@ -2,9 +2,9 @@
 
 The server speaks first, with a map of metadata that may be empty. Then each observation, one map, is answered by one
 map with ``actions``: (horizon, dimension), in the policy's units. An error is a text frame, and the server closes.
-Arrays are maps with the binary keys ``__ndarray__``, ``data``, ``dtype`` and ``shape``, scalars of numpy maps with
-``__npgeneric__``, ``dtype`` and a plain number as ``data``. Source: openpi's
-``msgpack_numpy.py`` and ``websocket_policy_server.py``; vLLM-Omni's variant adds a batch axis and errors as maps.
+Arrays are maps with the binary keys ``__ndarray__``, ``data``, ``dtype`` and ``shape``; only the actions are decoded.
+Source: openpi's ``msgpack_numpy.py`` and ``websocket_policy_server.py``; vLLM-Omni's variant adds a batch axis and
+errors as maps.
 
 There are no ids: after a missed deadline the connection is dropped, or the late answer would be taken for the next one.
 An inference blocks the server, pings too, so this client sends none.
@@ -12,46 +12,46 @@ An inference blocks the server, pings too, so this client sends none.
 
 from __future__ import annotations
 
-import contextlib
+import re
 import threading
-import time
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 from strands_robots.policies.base import Action
+from strands_robots.policies.decoding import ForeignDataError, decode_msgpack
 from strands_robots.policies.policy_server import (
-    ANSWER_MAX,
     PolicyServerError,
     ServedPolicy,
     actions_of,
     compare,
+    numbers_of,
     picture_key,
     wait_for_answer,
 )
 from strands_robots.policies.profiles import Profile
+from strands_robots.policies.server_socket import ServerSocket
 from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, optional_module, shown
 
 _module = partial(optional_module, what="The openpi policy", extra="remote")
 
+_SHOWN = 400
+"""Characters of a server's error that are looked at."""
+
 LAYOUTS = ("libero", "droid", "aloha")
 DROID_JOINTS = 7
 
-_CLOSE_S = 0.5
-_KINDS = "biuf"
-"""Kinds of numpy arrays that are decoded; objects, records and complex numbers are refused."""
+_DTYPE = re.compile(r"[<>|=]?[biuf][1248]")
+"""Types of numpy that are decoded; objects, texts, records and complex numbers are refused."""
 
 
 class OpenPiConnection:
     """One connection to a server; used by one policy at a time."""
 
     def __init__(self, profile: Profile, token: str) -> None:
-        self._profile = profile
-        self._token = token
-        self._socket: Any = None
-        self._open_socket = contextlib.ExitStack()
-        self._gone = (_module("websockets.exceptions").WebSocketException, OSError)
+        self._url = profile.url
+        self._socket = ServerSocket(profile.url, {"Authorization": f"Api-Key {token}"} if token else {})
         self.metadata: Mapping[str, Any] = {}
 
     def open(self, deadline: float, interrupted: threading.Event) -> None:
@@ -60,63 +60,54 @@ class OpenPiConnection:
         Raises:
             PolicyServerError: no server answers.
         """
-        self.close()
-        headers = {"Authorization": f"Api-Key {self._token}"} if self._token else {}
         try:
-            self._socket = self._open_socket.enter_context(
-                _module("websockets.sync.client").connect(
-                    self._profile.url,
-                    additional_headers=headers,
-                    open_timeout=max(0.01, deadline - time.monotonic()),
-                    close_timeout=_CLOSE_S,
-                    ping_interval=None,
-                    compression=None,
-                    proxy=None,
-                    max_size=ANSWER_MAX,
-                )
-            )
+            self._socket.open(deadline)
             self.metadata = self._receive(deadline, interrupted)
-        except self._gone as exc:
-            raise PolicyServerError(f"no policy server answers at {self._profile.url}: {exc}") from exc
+        except self._socket.lost as exc:
+            raise PolicyServerError(f"no policy server answers at {self._url}: {exc!s:.200}") from exc
 
     def infer(self, observation: Mapping[str, Any], deadline: float, interrupted: threading.Event) -> dict[str, Any]:
         """Return the answer to an observation, on a new connection if need be."""
         frame = _module("msgpack").packb(observation, default=_encoded)
-        if self._socket is None:
+        if not self._socket.is_open:
             self.open(deadline, interrupted)
         try:
             return self._asked(frame, deadline, interrupted)
-        except self._gone:
+        except self._socket.lost:
             self.open(deadline, interrupted)
         try:
             return self._asked(frame, deadline, interrupted)
-        except self._gone as exc:
-            raise PolicyServerError(f"the policy server at {self._profile.url} was lost: {exc}") from exc
+        except self._socket.lost as exc:
+            raise PolicyServerError(f"the policy server at {self._url} was lost: {exc!s:.200}") from exc
 
     def close(self) -> None:
         """Drop the connection; a late answer goes with it."""
-        self._socket = None
-        with contextlib.suppress(*self._gone):
-            self._open_socket.close()
+        self._socket.close()
 
     def _asked(self, frame: bytes, deadline: float, interrupted: threading.Event) -> dict[str, Any]:
-        self._socket.send(frame)
+        self._socket.send(frame, deadline)
         return self._receive(deadline, interrupted)
 
     def _receive(self, deadline: float, interrupted: threading.Event) -> dict[str, Any]:
-        socket = self._socket
-        frame = wait_for_answer(
-            self._profile.url, lambda left: socket.recv(timeout=left), deadline, interrupted, self.close
-        )
+        frame = wait_for_answer(self._url, self._socket.receive, deadline, interrupted, self.close)
+        where = f"the policy server at {self._url}"
         if isinstance(frame, str):
             self.close()
-            last = frame.strip().splitlines()[-1] if frame.strip() else "an empty error"
-            raise PolicyServerError(f"the policy server at {self._profile.url} failed: {last}")
-        return _decoded(frame)
+            last = frame[-_SHOWN:].strip().splitlines()[-1:] or ["an empty error"]
+            raise PolicyServerError(f"{where} failed: {last[0]}")
+        try:
+            answer = decode_msgpack(frame)
+        except ForeignDataError as exc:
+            raise PolicyServerError(f"{where} sent a frame that cannot be read: {exc}") from exc
+        if not isinstance(answer, dict):
+            raise PolicyServerError(f"{where} answered {shown(answer)}")
+        return {
+            key.decode("utf-8", "replace") if isinstance(key, bytes) else str(key): each for key, each in answer.items()
+        }
 
 
 class OpenPiPolicy(ServedPolicy):
-    """Policy on an openpi server; the profile's ``layout`` names the keys of the observation.
+    """Policy on an openpi server; the profile's ``layout`` names its keys.
 
     Raises:
         ValidationError: also a layout that the profile's state does not fit.
@@ -168,7 +159,7 @@ class OpenPiPolicy(ServedPolicy):
             raise PolicyServerError(
                 f"the policy server at {self.profile.url} answered without actions: {shown(problem)}"
             )
-        chunk = _module("numpy").asarray(answer["actions"])
+        chunk = _array(answer["actions"])
         batched = chunk.ndim == 3 and chunk.shape[0] == 1
         return actions_of(chunk[0] if batched else chunk, self.profile.action)
 
@@ -180,31 +171,21 @@ def _encoded(value: Any) -> Any:
     raise TypeError(f"an observation cannot have {shown(value)}")
 
 
-def _decoded(frame: bytes) -> dict[str, Any]:
-    try:
-        answer = _module("msgpack").unpackb(frame, object_hook=_array, strict_map_key=False)
-    except (ValueError, TypeError, KeyError, OverflowError, SyntaxError, RecursionError) as exc:
-        # numpy.dtype raises SyntaxError for some texts that are no type.
-        raise PolicyServerError(f"the policy server sent a frame that cannot be read: {exc}") from exc
-    if not isinstance(answer, dict):
-        raise PolicyServerError(f"the policy server answered {shown(answer)}")
-    return {
-        key.decode("utf-8", "replace") if isinstance(key, bytes) else str(key): each for key, each in answer.items()
-    }
-
-
-def _array(found: dict[Any, Any]) -> Any:
-    """Decode openpi's arrays and scalars.
+def _array(found: Any) -> Any:
+    """Decode an array of openpi's, or lists of numbers.
 
     Raises:
-        ValueError: an array of objects, or one whose bytes do not fill its shape.
+        PolicyServerError: it is neither, or its bytes do not fill its shape.
     """
-    numpy = _module("numpy")
-    if not (b"__ndarray__" in found or b"__npgeneric__" in found):
-        return found
-    dtype = numpy.dtype(found[b"dtype"])
-    if dtype.kind not in _KINDS:
-        raise ValidationError(f"an array of the kind {dtype.kind}")
-    if b"__npgeneric__" in found:
-        return dtype.type(found[b"data"]).item()
-    return numpy.frombuffer(found[b"data"], dtype).reshape(tuple(int(each) for each in found[b"shape"]))
+    if not (isinstance(found, dict) and b"__ndarray__" in found):
+        return numbers_of(found)
+    dtype, shape, data = (found.get(part) for part in (b"dtype", b"shape", b"data"))
+    dtype = dtype.decode("latin-1") if isinstance(dtype, bytes) else dtype
+    try:
+        if not (isinstance(dtype, str) and _DTYPE.fullmatch(dtype)):
+            raise ValidationError(f"the type {shown(dtype)}")
+        if not (isinstance(data, bytes) and isinstance(shape, list) and all(type(each) is int for each in shape)):
+            raise ValidationError(f"the shape {shown(shape)}")
+        return _module("numpy").frombuffer(data, dtype).reshape(shape)
+    except (ValueError, TypeError, OverflowError) as exc:
+        raise PolicyServerError(f"the policy server sent an array that cannot be read: {exc!s:.200}") from exc

@@ -9,11 +9,10 @@ reading. ``pickle.loads`` is never used. Format: ``pickletools`` of the standard
 from __future__ import annotations
 
 import io
-import itertools
 import pickle
 import pickletools
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -25,8 +24,14 @@ HELPERS = "lerobot.async_inference.helpers"
 SIZE_MAX = 4096
 """Most numbers of one action."""
 
-OPERATIONS_MAX = 500_000
-"""Most operations and numbers of one answer; a chunk of a hundred actions has about ten thousand operations."""
+ANSWER_MAX = 4 * 2**20
+"""Longest answer, in bytes: each action brings the numbers of its whole chunk, 1.3 MB for a hundred of 32 joints."""
+
+OPERATIONS_MAX = 15_000
+"""Most operations of one answer, of which a thousand take a millisecond; a chunk of a hundred actions has 9,000."""
+
+NUMBERS_MAX = 32_768
+"""Most numbers of one answer: 1,000 actions of 32 joints."""
 
 HEADER_MAX = 4096
 """Longest part of a tensor's file before its numbers, in bytes; torch writes about 400."""
@@ -92,22 +97,42 @@ def read_actions(data: bytes) -> list[PickledAction]:
         UnreadablePickleError: anything else than a list of actions whose numbers are a flat tensor of float32 or
             float64.
     """
-    # The numbers of all actions are counted together: one piece of bytes may stand for many of them.
-    operations = iter(range(OPERATIONS_MAX))
-    answer = _read(io.BytesIO(data), operations)
+    if len(data) > ANSWER_MAX:
+        raise UnreadablePickleError(f"it has {len(data):,} bytes, and may have {ANSWER_MAX:,}")
+    # All actions are counted together: one piece of bytes may stand for many of them.
+    left = _Left()
+    answer = _read(io.BytesIO(data), left)
     if not isinstance(answer, list):
         raise UnreadablePickleError(f"a list of actions was expected, not {_shown(answer)}")
-    return [_action(each, operations) for each in answer]
+    return [_action(each, left) for each in answer]
 
 
-def _read(stream: BinaryIO, operations: Iterator[int]) -> Any:
+@dataclass
+class _Left:
+    """Operations and numbers that the rest of an answer may have."""
+
+    operations: int = OPERATIONS_MAX
+    numbers: int = NUMBERS_MAX
+
+    def take_operations(self, count: int = 1) -> None:
+        self.operations -= count
+        if self.operations < 0:
+            raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX:,} operations")
+
+    def take_numbers(self, count: int) -> None:
+        self.numbers -= count
+        if self.numbers < 0:
+            raise UnreadablePickleError(f"it has more than {NUMBERS_MAX:,} numbers")
+
+
+def _read(stream: BinaryIO, left: _Left) -> Any:
     """Return the next pickle of a stream as lists, maps and objects.
 
     Raises:
         UnreadablePickleError: an operation or a name that is not read here, more operations than are left, or a pickle
             that is cut off or malformed.
     """
-    reader = _Reader(operations)
+    reader = _Reader(left)
     try:
         for opcode, argument, _ in pickletools.genops(stream):
             if opcode.name == "STOP":
@@ -123,31 +148,29 @@ def _read(stream: BinaryIO, operations: Iterator[int]) -> Any:
 class _Reader:
     """Stack and memo of one pickle."""
 
-    def __init__(self, operations: Iterator[int]) -> None:
-        self._operations = operations
+    def __init__(self, left: _Left) -> None:
+        self._left = left
         self._stack: list[Any] = []
         self._marks: list[int] = []
         self._memo: dict[int, Any] = {}
 
     def take(self, name: str, argument: Any) -> None:
-        if next(self._operations, None) is None:
-            raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX} operations and numbers")
-        if name in _IGNORED:
-            return
+        self._left.take_operations()
         if name in _VALUES:
             self._stack.append(argument)
-        elif name in _CONSTANTS:
-            self._stack.append(_CONSTANTS[name]())
-        elif name in _STEPS:
-            _STEPS[name](self, argument)
-        else:
+            return
+        step = _STEPS.get(name)
+        if step is None:
             raise UnreadablePickleError(f"the operation {name} is not read")
+        step(self, argument)
 
     def result(self) -> Any:
         (result,) = self._stack
         return result
 
     def push_name(self, full: str) -> None:
+        # A name takes as long as four operations.
+        self._left.take_operations(3)
         if full not in _NAMES:
             raise UnreadablePickleError(f"it names {shown(full)}, which is not read")
         self._stack.append(PickledName(full))
@@ -209,20 +232,19 @@ class _Reader:
         self._stack.append(PickledObject("stored", _tuple(self._stack.pop())))
 
 
-_IGNORED = frozenset({"PROTO", "FRAME"})
 _VALUES = frozenset(
     {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"}
     | {"BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES"}
 )
-_CONSTANTS: dict[str, Callable[[], Any]] = {
-    "NONE": lambda: None,
-    "NEWTRUE": lambda: True,
-    "NEWFALSE": lambda: False,
-    "EMPTY_LIST": list,
-    "EMPTY_DICT": dict,
-    "EMPTY_TUPLE": tuple,
-}
 _STEPS: dict[str, Callable[[_Reader, Any], None]] = {
+    "PROTO": lambda reader, _: None,
+    "FRAME": lambda reader, _: None,
+    "NONE": lambda reader, _: reader._stack.append(None),
+    "NEWTRUE": lambda reader, _: reader._stack.append(True),
+    "NEWFALSE": lambda reader, _: reader._stack.append(False),
+    "EMPTY_LIST": lambda reader, _: reader._stack.append([]),
+    "EMPTY_DICT": lambda reader, _: reader._stack.append({}),
+    "EMPTY_TUPLE": lambda reader, _: reader._stack.append(()),
     "MARK": lambda reader, _: reader.mark(),
     "GLOBAL": lambda reader, name: reader.push_name(str(name).replace(" ", ".", 1)),
     "STACK_GLOBAL": lambda reader, _: reader.name_of_stack(),
@@ -247,23 +269,23 @@ _STEPS: dict[str, Callable[[_Reader, Any], None]] = {
 """Operations by name; all others end the reading."""
 
 
-def _action(found: Any, operations: Iterator[int]) -> PickledAction:
+def _action(found: Any, left: _Left) -> PickledAction:
     if not isinstance(found, PickledObject) or found.name != _ACTION or not isinstance(found.state, dict):
         raise UnreadablePickleError(f"an action was expected, not {_shown(found)}")
     timestamp, timestep = found.state.get("timestamp"), found.state.get("timestep")
     if type(timestamp) is not float or type(timestep) is not int:
         raise UnreadablePickleError(f"an action has the step {_shown(timestep)} at {_shown(timestamp)}")
-    return PickledAction(timestamp, timestep, _tensor(found.state.get("action"), operations))
+    return PickledAction(timestamp, timestep, _tensor(found.state.get("action"), left))
 
 
-def _tensor(found: Any, operations: Iterator[int]) -> tuple[float, ...]:
+def _tensor(found: Any, left: _Left) -> tuple[float, ...]:
     """Return the numbers of a flat tensor."""
     if not isinstance(found, PickledObject) or found.name != _TENSOR or len(found.args) < 4:
         raise UnreadablePickleError(f"an action must be a tensor, not {_shown(found)}")
     storage, offset, size, stride = found.args[:4]
     if not isinstance(storage, PickledObject) or storage.name != _STORAGE or len(storage.args) != 1:
         raise UnreadablePickleError("a tensor must have its numbers as bytes")
-    kind, numbers = _storage(storage.args[0], operations)
+    kind, numbers = _storage(storage.args[0], left)
     if not (_flat(size) and _flat(stride) and _is_count(offset) and 1 <= size[0] <= SIZE_MAX and stride[0] == 1):
         raise UnreadablePickleError(f"an action must be a flat tensor, not one of the size {_shown(size)}")
     code, width = kind
@@ -271,20 +293,19 @@ def _tensor(found: Any, operations: Iterator[int]) -> tuple[float, ...]:
     if last > len(numbers):
         raise UnreadablePickleError("a tensor has more numbers than its bytes")
     # One action may stand in the list many times, and each time its numbers are copied.
-    if sum(1 for _ in itertools.islice(operations, size[0])) < size[0]:
-        raise UnreadablePickleError(f"it has more than {OPERATIONS_MAX} operations and numbers")
+    left.take_numbers(size[0])
     return struct.unpack(f"<{size[0]}{code}", numbers[first:last])
 
 
-def _storage(data: Any, operations: Iterator[int]) -> tuple[tuple[str, int], memoryview]:
+def _storage(data: Any, left: _Left) -> tuple[tuple[str, int], memoryview]:
     """Return the kind and the bytes of the numbers in a file of torch's older format."""
     if not isinstance(data, bytes):
         raise UnreadablePickleError("a tensor must have its numbers as bytes")
     stream = io.BytesIO(memoryview(data)[:HEADER_MAX])
-    magic, version, _ = (_read(stream, operations) for _ in range(3))
+    magic, version, _ = (_read(stream, left) for _ in range(3))
     if type(magic) is not int or type(version) is not int or (magic, version) != (_MAGIC, _VERSION):
         raise UnreadablePickleError("a tensor's file is of another format")
-    stored, keys = _read(stream, operations), _read(stream, operations)
+    stored, keys = _read(stream, left), _read(stream, left)
     parts = stored.args if isinstance(stored, PickledObject) and stored.name == "stored" else ()
     kind = parts[1].name if len(parts) >= 5 and isinstance(parts[1], PickledName) else ""
     if kind not in _KINDS or not _is_text(parts[0]) or parts[0] != "storage" or not _is_count(parts[4]):

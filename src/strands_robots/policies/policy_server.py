@@ -16,13 +16,17 @@ from strands_robots.utils import ValidationError, choice, shown
 CHUNK_MAX = 10_000
 """Longest accepted chunk of actions."""
 
-ANSWER_MAX = 64 * 2**20
-"""Longest accepted answer, in bytes."""
+VALUES_MAX = 32_768
+"""Most numbers of a chunk: 1,000 actions of 32 joints."""
 
 PICTURE = (224, 224)
 """Size of pictures in the first inference where the profile states none; servers resize to it."""
 
-SLICE_S = 0.05
+_NUMBERS = frozenset({int, float})
+_AXES_MAX = 3
+"""Batch, step and dimension."""
+
+SLICE_S = 0.01
 """Seconds between two looks at whether an answer is still wanted."""
 
 
@@ -198,18 +202,55 @@ def actions_of(rows: Any, keys: tuple[str, ...]) -> list[Action]:
     """Return an array (horizon, dimension) as a chunk of actions.
 
     Raises:
-        PolicyServerError: another shape, no step, more than CHUNK_MAX, or something that is no finite number.
+        PolicyServerError: another shape, no step, more than CHUNK_MAX or VALUES_MAX, or something that is no finite
+            number.
+    """
+    chunk = checked_chunk(rows, len(keys))
+    return [dict(zip(keys, row, strict=True)) for row in chunk.astype(float).tolist()]
+
+
+def checked_chunk(rows: Any, dimension: int) -> Any:
+    """Return a chunk as an array of finite numbers; raises as :func:`actions_of`."""
+    import numpy  # noqa: PLC0415 - loaded where a policy is used
+
+    chunk = numbers_of(rows)
+    if chunk.ndim != 2 or not 1 <= chunk.shape[0] <= CHUNK_MAX or chunk.shape[1] != dimension:
+        raise PolicyServerError(
+            f"the policy server answered actions of the shape {chunk.shape}, and the profile has {dimension} keys"
+        )
+    if chunk.size > VALUES_MAX:
+        raise PolicyServerError(f"the policy server answered {chunk.size:,} numbers, and may answer {VALUES_MAX:,}")
+    if chunk.dtype.kind not in "iuf" or not numpy.isfinite(chunk).all():
+        raise PolicyServerError("the policy server answered actions that are no finite numbers")
+    return chunk
+
+
+def numbers_of(found: Any) -> Any:
+    """Return an array as it is, and a number or lists of numbers as one.
+
+    Texts are refused before numpy sees them: it makes room in every element for the longest one.
+
+    Raises:
+        PolicyServerError: anything else.
     """
     import numpy  # noqa: PLC0415 - loaded where a policy is used
 
-    chunk = numpy.asarray(rows)
-    if chunk.ndim != 2 or not 1 <= chunk.shape[0] <= CHUNK_MAX or chunk.shape[1] != len(keys):
-        raise PolicyServerError(
-            f"the policy server answered actions of the shape {chunk.shape}, and the profile has {len(keys)} keys"
-        )
-    if chunk.dtype.kind not in "iuf" or not numpy.isfinite(chunk).all():
-        raise PolicyServerError("the policy server answered actions that are no finite numbers")
-    return [dict(zip(keys, map(float, row), strict=True)) for row in chunk]
+    if isinstance(found, numpy.ndarray):
+        return found
+    if not _plain_numbers(found, _AXES_MAX):
+        raise PolicyServerError(f"the policy server answered {shown(found)} in place of numbers")
+    try:
+        return numpy.array(found, float)
+    except (ValueError, OverflowError) as exc:
+        raise PolicyServerError(f"the policy server answered numbers that are no array: {exc!s:.200}") from exc
+
+
+def _plain_numbers(found: Any, axes: int) -> bool:
+    if not isinstance(found, list | tuple):
+        return type(found) in _NUMBERS
+    if axes and _NUMBERS.issuperset(map(type, found)):
+        return True
+    return axes > 1 and all(_plain_numbers(each, axes - 1) for each in found)
 
 
 def compare(name: str, states: object, profile: object) -> None:

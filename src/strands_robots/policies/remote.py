@@ -15,7 +15,6 @@ The connection is neither encrypted nor authenticated: use a tunnel to a server 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import threading
@@ -25,13 +24,14 @@ from functools import partial
 from typing import Any, NoReturn
 
 from strands_robots.policies.base import Action, Ranges, checked_action, numbers
+from strands_robots.policies.decoding import ForeignDataError, decode_json, decode_msgpack
 from strands_robots.policies.policy_server import CHUNK_MAX, SLICE_S, PolicyServerError
+from strands_robots.policies.server_socket import ServerSocket
 from strands_robots.utils import ValidationError, choice, dial_host_error, flag, number, optional_module, shown, whole
 
 _module = partial(optional_module, what="The remote policy", extra="remote")
 
 DEFAULT_PORT = 8765
-_CLOSE_S = 0.5
 
 
 class RemotePolicy:
@@ -73,11 +73,9 @@ class RemotePolicy:
             raise ValidationError("frames must be msgpack for images, not 'json'.")
         self._deadline_s = number("deadline_s", deadline_s, low=0.01, high=60)
         self._reset_s = number("reset_deadline_s", reset_deadline_s, low=0.1, high=600)
-        self._client = _module("websockets.sync.client")
-        self._connection_errors = (_module("websockets.exceptions").WebSocketException, OSError)
-        self._msgpack = _module("msgpack") if packed else None
-        self._connection: Any = None
-        self._open_connection = contextlib.ExitStack()
+        self._socket = ServerSocket(self.url)
+        self._msgpack = _module("msgpack")
+        self._packed = packed
         self._task: dict[str, Any] = {}
         self._ranges: Ranges = {}
         self._last_id = 0
@@ -91,8 +89,8 @@ class RemotePolicy:
         self._task = {"type": "reset", "instruction": instruction, "action_keys": list(ranges), "ranges": finite}
         try:
             self._open(time.monotonic() + self._reset_s)
-        except self._connection_errors as exc:
-            raise PolicyServerError(f"no policy server answers at {self.url}: {exc}") from exc
+        except self._socket.lost as exc:
+            raise PolicyServerError(f"no policy server answers at {self.url}: {exc!s:.200}") from exc
 
     def act(self, observation: Mapping[str, Any]) -> list[Action] | None:
         if self._done:
@@ -101,42 +99,29 @@ class RemotePolicy:
         request = {"type": "act", "observation": self._encoded_observation(observation)}
         try:
             answer = self._request(request, deadline)
-        except self._connection_errors:
+        except self._socket.lost:
             try:
                 self._open(deadline)
                 answer = self._request(request, deadline)
-            except self._connection_errors as exc:
-                raise PolicyServerError(f"the policy server at {self.url} was lost: {exc}") from exc
+            except self._socket.lost as exc:
+                raise PolicyServerError(f"the policy server at {self.url} was lost: {exc!s:.200}") from exc
         return self._actions(answer)
 
     def interrupt(self) -> None:
         self._interrupted.set()
 
     def close(self) -> None:
-        self._connection = None
-        with contextlib.suppress(*self._connection_errors):  # a lost connection is closed already
-            self._open_connection.close()
+        self._socket.close()
 
     def _open(self, deadline: float) -> None:
-        self.close()
-        opening = self._client.connect(
-            self.url,
-            open_timeout=max(0.01, deadline - time.monotonic()),
-            close_timeout=_CLOSE_S,
-            compression=None,
-            proxy=None,
-            max_size=8 * 2**20,
-        )
-        self._connection = self._open_connection.enter_context(opening)
+        self._socket.open(deadline)
         answer = self._request(self._task, deadline)
         if answer.get("type") != "ready":
             self._refuse(answer)
 
     def _request(self, message: Mapping[str, Any], deadline: float) -> dict[str, Any]:
-        if self._connection is None:
-            raise ConnectionError("not connected")
         self._last_id += 1
-        self._connection.send(self._encoded({"id": self._last_id, **message}))
+        self._socket.send(self._encoded({"id": self._last_id, **message}), deadline)
         while True:
             left = deadline - time.monotonic()
             if self._interrupted.is_set():
@@ -144,7 +129,7 @@ class RemotePolicy:
             if left <= 0:
                 raise PolicyServerError(f"the policy server at {self.url} did not answer {message['type']} in time")
             try:
-                frame = self._connection.recv(timeout=min(left, SLICE_S))
+                frame = self._socket.receive(min(left, SLICE_S))
             except TimeoutError:
                 continue
             answer = self._decoded(frame)
@@ -178,15 +163,15 @@ class RemotePolicy:
         return encoded
 
     def _encoded(self, message: Mapping[str, Any]) -> str | bytes:
-        if self._msgpack is None:
+        if not self._packed:
             return json.dumps(message, allow_nan=False)
         packed: bytes = self._msgpack.packb(message)
         return packed
 
     def _decoded(self, frame: str | bytes) -> dict[str, Any]:
         try:
-            answer = json.loads(frame) if isinstance(frame, str) else _module("msgpack").unpackb(frame)
-        except (ValueError, RecursionError) as exc:
+            answer = decode_json(frame) if isinstance(frame, str) else decode_msgpack(frame)
+        except ForeignDataError as exc:
             raise PolicyServerError(f"the policy server at {self.url} sent a frame that cannot be read: {exc}") from exc
         if not isinstance(answer, dict):
             self._refuse(answer)

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, Self
 
 from strands_robots.policies.base import Action, numbers
+from strands_robots.policies.decoding import decode_json
 from strands_robots.recording import schemas
 from strands_robots.recording._compat import close_chunk
 from strands_robots.recording.schemas import Schema
 from strands_robots.recording.unpacking import read_messages
-from strands_robots.teleoperators.recorded import Frame
+from strands_robots.teleoperators.recorded import Frame, check_length
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 CHUNK_BYTES = 16_384
@@ -278,11 +279,18 @@ def recorded_actions(path: Path, device: str | None = None) -> list[Frame]:
     """
     actions: dict[str, list[Frame]] = {}
     joints: dict[str, list[Frame]] = {}
+    rows = values = 0
     for item in read_items(path):
         if isinstance(item, RecordedJoints):
-            _append(joints.setdefault(item.device, []), item.at, dict(item.joints))
+            frames, action = joints.setdefault(item.device, []), dict(item.joints)
         elif isinstance(item, RecordedEvent) and item.event == STEP:
-            _append(actions.setdefault(item.robot, []), item.at, numbers(item.payload.get("action") or {}))
+            given = item.payload.get("action")
+            frames, action = actions.setdefault(item.robot, []), numbers(given if isinstance(given, Mapping) else {})
+        else:
+            continue
+        _append(frames, item.at, action)
+        rows, values = rows + 1, values + len(action)
+        check_length(rows, values)
     usable = {**joints, **{robot: frames for robot, frames in actions.items() if frames}}
     if not usable:
         raise ValidationError(f"{path.name} has neither actions nor joints: nothing in it can lead.")
@@ -311,7 +319,10 @@ def _item(schema: str, channel: Any, message: Any) -> RecordedItem | None:
         return RecordedPicture(at, device.removesuffix(f"/{CAMERA}"), last, schemas.read_compressed_image(message.data))
     if channel.message_encoding != schemas.EVENT.messages:
         return None
-    return RecordedEvent(at, device, last, json.loads(message.data))
+    payload = decode_json(message.data)
+    if not isinstance(payload, Mapping):
+        raise ValidationError(f"an event has {shown(payload)}")
+    return RecordedEvent(at, device, last, payload)
 
 
 def _level(item: RecordedEvent) -> int:

@@ -12,6 +12,8 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from strands_robots.utils import ValidationError
+
 JOINT_STATE_TEXT = """std_msgs/Header header
 string[] name
 float64[] position
@@ -29,6 +31,9 @@ uint32 nanosec
 
 INFO, WARNING, ERROR = 2, 3, 4
 """Levels of ``foxglove.Log``."""
+
+JOINTS_MAX = 10_000
+"""Most joints of one message."""
 
 _NS = 1_000_000_000
 _CDR_LITTLE_ENDIAN = b"\0\1\0\0"
@@ -65,7 +70,12 @@ def joint_state(at_ns: int, joints: Mapping[str, float]) -> bytes:
 
 
 def read_joint_state(data: bytes) -> dict[str, float]:
-    """Decode a message of :func:`joint_state`; raises ``struct.error`` otherwise."""
+    """Decode a message of :func:`joint_state`.
+
+    Raises:
+        struct.error: it is another message.
+        ValidationError: it has more than JOINTS_MAX joints.
+    """
     body, at = data[len(_CDR_LITTLE_ENDIAN) :], 8
 
     def length(here: int) -> tuple[int, int]:
@@ -75,6 +85,8 @@ def read_joint_state(data: bytes) -> dict[str, float]:
 
     size, at = length(at)
     count, at = length(at + size)
+    if count > JOINTS_MAX:
+        raise ValidationError(f"a joint state has {count:,} joints, and may have {JOINTS_MAX:,}")
     names = []
     for _ in range(count):
         size, at = length(at)
@@ -135,7 +147,8 @@ def _varint(value: int) -> bytes:
 
 def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     value = shift = 0
-    while at < len(data):
+    # A longer number would be computed anew, in full, with each of its bytes.
+    while at < len(data) and shift < 64:
         byte = data[at]
         at += 1
         value |= (byte & 0x7F) << shift

@@ -6,6 +6,7 @@ A few kilobytes can unpack to gigabytes. A chunk may unpack to :data:`CHUNK_MAX_
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from typing import Any, BinaryIO
@@ -25,7 +26,7 @@ def read_messages(file: BinaryIO) -> Iterator[tuple[Any, Any, Any]]:
     """
     from mcap.exceptions import McapError  # noqa: PLC0415 - an extra
     from mcap.records import Channel, Chunk, Message, Schema  # noqa: PLC0415
-    from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415
+    from mcap.stream_reader import StreamReader  # noqa: PLC0415
 
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
@@ -36,7 +37,7 @@ def read_messages(file: BinaryIO) -> Iterator[tuple[Any, Any, Any]]:
             each.data = _unpacked(each, min(left, CHUNK_MAX_BYTES))
             each.compression = ""
             left -= len(each.data)
-        for record in breakup_chunk(each) if isinstance(each, Chunk) else [each]:
+        for record in _records(each.data) if isinstance(each, Chunk) else [each]:
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -46,6 +47,25 @@ def read_messages(file: BinaryIO) -> Iterator[tuple[Any, Any, Any]]:
                 if channel is None:
                     raise McapError(f"no channel record found with id {record.channel_id}")
                 yield schemas.get(channel.schema_id), channel, record
+
+
+def _records(data: bytes) -> Iterator[Any]:
+    """Yield the records of a chunk one at a time; it may have millions."""
+    from mcap.data_stream import ReadDataStream  # noqa: PLC0415 - an extra
+    from mcap.opcode import Opcode  # noqa: PLC0415 - likewise
+    from mcap.records import Channel, Message, Schema  # noqa: PLC0415 - likewise
+
+    stream = ReadDataStream(io.BytesIO(data))
+    while stream.count < len(data):
+        opcode, length = stream.read1(), stream.read8()
+        if opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        else:
+            stream.read(length)
 
 
 def _unpacked(chunk: Any, limit: int) -> bytes:

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import bisect
 import csv
-import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from strands_robots.policies.base import Action
+from strands_robots.policies.decoding import read_json
 from strands_robots.teleoperators.leader import LeaderFinished
 from strands_robots.utils import ValidationError, missing_extra, number, shown
 
@@ -33,6 +33,8 @@ ROWS_MAX = 1_000_000
 VALUES_MAX = 64_000_000
 BYTES_MAX = 2**30
 BATCH_ROWS = 1024
+LINE_MAX = 64 * 1024
+"""Longest line of a .csv file, in characters."""
 
 
 class RecordedLeader:
@@ -90,13 +92,35 @@ def read_frames(path: Path) -> list[Frame]:
         raise ValidationError(f"a recording must be a .csv, .parquet or .mcap file, not {shown(str(path))}.")
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = csv.reader(file)
+            rows = csv.reader(_lines(file, path.name))
             names = next(rows, [])
             if _TIME not in names or len(set(names)) != len(names) or len(names) < 2:
                 raise ValidationError(f"the first line of {path.name} must name t and action keys, each once.")
-            return [_frame(names, row, f"line {line} of {path.name}") for line, row in enumerate(rows, start=2) if row]
+            frames: list[Frame] = []
+            for line, row in enumerate(rows, start=2):
+                if row:
+                    frames.append(_frame(names, row, f"line {line} of {path.name}"))
+                check_length(len(frames), len(frames) * len(names))
+            return frames
     except OSError as exc:
         raise ValidationError(f"the recording {shown(str(path))} cannot be read: {exc.strerror}.") from exc
+
+
+def _lines(file: TextIO, name: str) -> Iterator[str]:
+    while line := file.readline(LINE_MAX):
+        if len(line) == LINE_MAX:
+            raise ValidationError(f"a line of {name} has {LINE_MAX:,} characters or more.")
+        yield line
+
+
+def check_length(rows: int, values: int) -> None:
+    """Refuse a recording of more frames or values than a robot's has.
+
+    Raises:
+        ValidationError: naming the bound.
+    """
+    _within("rows", rows, ROWS_MAX)
+    _within("values", values, VALUES_MAX)
 
 
 def _frame(names: list[str], row: list[str], place: str) -> Frame:
@@ -199,7 +223,7 @@ def _episode(path: Path, column: list[Any], requested: str | None) -> int:
 def _names(path: Path) -> list[str]:
     info = next((each / "meta" / "info.json" for each in path.resolve().parents if (each / "meta").is_dir()), None)
     try:
-        content = json.loads(info.read_text(encoding="utf-8")) if info is not None else {}
+        content = read_json(info) if info is not None else {}
         names = content["features"]["action"]["names"]
     except (OSError, ValueError, KeyError, TypeError) as exc:
         raise ValidationError(f"{path.name} needs meta/info.json of its dataset, which names the actions.") from exc
