@@ -19,10 +19,10 @@ from typing import Any
 from device_connect_edge.messaging.exceptions import MessagingError
 
 from strands_robots import settings
+from strands_robots.bounded_json import json_object
 from strands_robots.device_connect.backends.base import Backend, NoResponderError
 from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.utils import json_object
 
 logger = logging.getLogger(__name__)
 

@@ -23,9 +23,10 @@ from device_connect_edge.messaging.exceptions import (
     SubscribeError,
 )
 
+from ...bounded_json import LONG_MAX
 from ...utils import redacted
 from . import jsonrpc, zenoh_session
-from .base import Backend, NoResponderError, Undo
+from .base import Backend, NoResponderError, Undo, too_long
 from .config import LinkConfig
 from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
 
@@ -155,7 +156,7 @@ class ZenohBackend(Backend):
         """Return the first reply to ``data``, asking the devices that are linked now.
 
         Raises:
-            PublishError: the subject is malformed, or the other side refused.
+            PublishError: the subject is malformed, the other side refused, or its reply is out of bounds.
         """
         session, loop, wait_s = self._connected().session, asyncio.get_running_loop(), max(within, 0.001)
         request, key = _Request(loop, self._outcomes), key_of(subject)
@@ -266,23 +267,20 @@ class ZenohBackend(Backend):
     def _on_message(feed: OrderedFeed, with_subject: bool, sample: Any) -> None:
         """Take a put. On Zenoh's thread."""
         key = (str(sample.key_expr),) if with_subject else ()
-        feed.accept(sample.payload.to_bytes(), *key, None)
+        feed.accept(_payload(sample, feed.longest), *key, None)
 
     def _on_question(self, feed: OrderedFeed, with_subject: bool, query: Any) -> None:
         """Take a query that is no command. On Zenoh's thread."""
-        if self._replies.full:
+        data = _payload(query, feed.longest)
+        if self._replies.full or isinstance(data, int):
             query.drop()
             return
         key = (str(query.key_expr),) if with_subject else ()
-        data = b"" if query.payload is None else query.payload.to_bytes()
         feed.accept(data, *key, self._replies.expect(partial(self._answer, query), REPLY_TTL_S))
 
     @staticmethod
     def _read(message: Any) -> tuple[bytes | int, Any]:
-        payload = message.payload
-        size = 0 if payload is None else len(payload)
-        data = size if size > jsonrpc.MAX_COMMAND_BYTES else payload.to_bytes() if size else b""
-        return data, message if isinstance(message, zenoh.Query) else None
+        return _payload(message, jsonrpc.MAX_COMMAND_BYTES), message if isinstance(message, zenoh.Query) else None
 
     def _answer(self, reply: Any, data: bytes) -> Awaitable[None] | None:
         if len(data) < LARGE_BYTES:
@@ -331,8 +329,10 @@ class _Request:
         if ok is None:
             self.failure = reply.err.payload.to_bytes()[:200].decode(errors="replace")
         elif not self.answered:
+            data = _payload(ok, LONG_MAX)
+            self.failure = too_long(data)
             self.answered = True
-            self._outcomes.offer((self, ok.payload.to_bytes()))
+            self._outcomes.offer((self, None if self.failure else data))
 
     def on_end(self) -> None:
         """Settle a request that ended without a reply. On Zenoh's thread."""
@@ -349,6 +349,13 @@ class _Request:
         """Set the outcome, unless there is one. On the loop."""
         if not self.future.done():
             self.future.set_result(value)
+
+
+def _payload(message: Any, longest: int) -> bytes | int:
+    """Return the bytes of a message, or their number where there are more."""
+    size = 0 if message.payload is None else len(message.payload)
+    data: bytes = message.payload.to_bytes() if 0 < size <= longest else b""
+    return size if size > longest else data
 
 
 def _reply_to(query: Any, data: bytes) -> None:
