@@ -40,8 +40,8 @@ def test_a_json_object_is_read_from_text_and_bytes() -> None:
     "value",
     [
         {"jpeg": PICTURE[:700_000], "width": 640},
-        {"ranges": [round(0.1 + i / 7, 12) for i in range(20_000)]},
-        {"joints": {f"joint_{i}": i / 7 for i in range(20_000)}},
+        {"ranges": [round(0.1 + i / 7, 12) for i in range(15_000)]},
+        {"joints": {f"joint_{i}": i / 7 for i in range(15_000)}},
         {"text": "ä" * 100_000},
         {"text": "12345 " * 100_000},
     ],
@@ -69,8 +69,8 @@ KEYS = json.dumps({f"{i:x}": 0 for i in range(ELEMENTS_MAX + 2)})
     ("text", "longest", "why"),
     [
         ("x" * 101, 100, "101 bytes, and at most 100 are read"),
-        (LISTS + " " * SMALL_BYTES, MESSAGE_MAX, "more than 30000 values"),
-        (KEYS, MESSAGE_MAX, "more than 30000 values"),
+        (LISTS + " " * SMALL_BYTES, MESSAGE_MAX, "more than 20000 values"),
+        (KEYS, MESSAGE_MAX, "more than 20000 values"),
         ('["' + "ä" * 300_000 + '"]', MESSAGE_MAX, "outside ASCII"),
         ("[1" + " " * SMALL_BYTES + "9" * 500 + "]", MESSAGE_MAX, "hundreds of digits"),
         ('["' + PICTURE + '", ' + "1, " * 2000 + "1]", LONG_MAX, "more than 1000 values or escapes"),

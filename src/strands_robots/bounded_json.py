@@ -22,7 +22,7 @@ LONG_MAX = 4 * MESSAGE_MAX
 SMALL_BYTES = 64 * 2**10
 """A message of this length may hold anything: it is parsed in 5 ms and 3 MB at most."""
 
-ELEMENTS_MAX = 30_000
+ELEMENTS_MAX = 20_000
 """Commas and opening brackets of a longer message."""
 
 PICTURE_ELEMENTS_MAX = 1000
