@@ -6,12 +6,14 @@ import time
 from contextlib import ExitStack
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.decoders import MEMORY_MAX, TIME_MAX_S, worst_of
 from fixtures.nats_server import NatsServer
 
 from benchmarks.safety import Figures, Fleet
 from benchmarks.table import Row
 
 STOPS, STOPS_QUICK = 500, 60
+INPUTS, INPUTS_QUICK = 10_000, 1000
 BULK, BULK_HZ, BULK_S = 8 * 2**20, 5.0, 5.0
 BOUND_S, MEMORY_MB = 0.04, 100.0
 
@@ -20,7 +22,23 @@ def rows(quick: bool = False) -> list[Row]:
     """Measure and give the rows of the table."""
     stops = STOPS_QUICK if quick else STOPS
     with NatsServer(max_payload=2 * BULK) as server:
-        return [_bulk("zenoh", "", "Zenoh D2D", stops), _bulk("nats", server.url, "NATS", stops)]
+        bulks = [_bulk("zenoh", "", "Zenoh D2D", stops), _bulk("nats", server.url, "NATS", stops)]
+    return [*bulks, _fuzz(INPUTS_QUICK if quick else INPUTS)]
+
+
+def _fuzz(count: int) -> Row:
+    """Hostile messages at every decoder of the package."""
+    worst, over, done = worst_of(count)
+    slowest = max(worst, key=lambda name: worst[name].seconds)
+    largest = max(worst, key=lambda name: worst[name].memory)
+    return Row(
+        f"{count:,} hostile messages of up to 16 MB, {done:,} decodings by {len(worst)} decoders",
+        f"at most {worst[slowest].seconds * 1e3:.1f} ms ({slowest}) and {worst[largest].memory / 1e6:.1f} MB ({largest})",
+        "",
+        None,
+        f"{TIME_MAX_S * 1e3:.0f} ms and {MEMORY_MAX / 1e6:.0f} MB at most",
+        not over,
+    )
 
 
 def _bulk(transport: str, url: str, name: str, stops: int) -> Row:

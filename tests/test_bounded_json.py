@@ -11,9 +11,9 @@ import pytest
 from strands_robots.bounded_json import (
     DEPTH_MAX,
     ELEMENTS_MAX,
+    FREE_BYTES,
     LONG_MAX,
     MESSAGE_MAX,
-    SMALL_BYTES,
     OutOfBoundsError,
     json_object,
     parsed,
@@ -69,10 +69,10 @@ KEYS = json.dumps({f"{i:x}": 0 for i in range(ELEMENTS_MAX + 2)})
     ("text", "longest", "why"),
     [
         ("x" * 101, 100, "101 bytes, and at most 100 are read"),
-        (LISTS + " " * SMALL_BYTES, MESSAGE_MAX, "more than 20000 values"),
+        (LISTS + " " * FREE_BYTES, MESSAGE_MAX, "more than 20000 values"),
         (KEYS, MESSAGE_MAX, "more than 20000 values"),
         ('["' + "ä" * 300_000 + '"]', MESSAGE_MAX, "outside ASCII"),
-        ("[1" + " " * SMALL_BYTES + "9" * 500 + "]", MESSAGE_MAX, "hundreds of digits"),
+        ("[1" + " " * FREE_BYTES + "9" * 500 + "]", MESSAGE_MAX, "hundreds of digits"),
         ('["' + PICTURE + '", ' + "1, " * 2000 + "1]", LONG_MAX, "more than 1000 values or escapes"),
         ('["' + PICTURE + "\\n" * 2000 + '"]', LONG_MAX, "more than 1000 values or escapes"),
         ('["' + PICTURE + '", ' + "9" * 2000 + "]", LONG_MAX, "hundreds of digits"),

@@ -71,7 +71,7 @@ BEATS_MAX = 4096
 DESCRIBE_S = 1.0
 """Seconds in which a device describes itself when asked."""
 
-PAGE = 15
+PAGE = 10
 """Devices of one answer of the registry; NATS carries 1 MiB by default and a simulation's description takes 25 kB."""
 
 PAGES_MAX = 1000

@@ -24,7 +24,7 @@ from secrets import token_hex
 from socket import SHUT_RDWR, SO_LINGER, SOL_SOCKET
 from typing import Any
 
-from strands_robots.bounded_json import MESSAGE_MAX, OutOfBoundsError, parsed
+from strands_robots.bounded_json import LONG_MAX, MESSAGE_MAX, OutOfBoundsError, parsed
 from strands_robots.ros.link import Message, NoReceiptError, RosError
 from strands_robots.ros.names import bare_kind
 from strands_robots.utils import ValidationError, dial_host_error, mapping, missing_extra, port, shown, text
@@ -44,7 +44,7 @@ _PING_S = 2.0
 _CLOSE_S = 0.5
 
 FRAME_MAX = 8 * 2**20
-"""Longest frame, and all unfinished messages together, in bytes: a raw 1080p image in base64 fits."""
+"""Longest frame in bytes: a raw 1080p image in base64 fits."""
 
 FRAGMENTS_MAX = 10_000
 PARTIAL_MAX = 8
@@ -119,12 +119,12 @@ class Fragments:
         parts = self._partial.setdefault(key, {})
         self._size += len(data) - len(parts.get(number, ""))
         parts[number] = data
-        while len(self._partial) > PARTIAL_MAX or (self._size > FRAME_MAX and len(self._partial) > 1):
+        while len(self._partial) > PARTIAL_MAX or (self._size > LONG_MAX and len(self._partial) > 1):
             # The oldest gives way, this one last.
             self._drop(next(each for each in self._partial if each != key))
-        if self._size > FRAME_MAX:
+        if self._size > LONG_MAX:
             self._drop(key)
-            raise RosError(f"the fragments of a message are longer than {FRAME_MAX} characters")
+            raise RosError(f"the fragments of a message are longer than {LONG_MAX} characters")
         if len(parts) != total:
             return None
         self._drop(key)
