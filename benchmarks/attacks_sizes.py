@@ -31,9 +31,10 @@ def _fuzz(count: int) -> Row:
     worst, over, done = worst_of(count)
     slowest = max(worst, key=lambda name: worst[name].seconds)
     largest = max(worst, key=lambda name: worst[name].memory)
+    seconds, memory = worst[slowest].seconds * 1e3, worst[largest].memory / 1e6
     return Row(
         f"{count:,} hostile messages of up to 16 MB, {done:,} decodings by {len(worst)} decoders",
-        f"at most {worst[slowest].seconds * 1e3:.1f} ms ({slowest}) and {worst[largest].memory / 1e6:.1f} MB ({largest})",
+        f"at most {seconds:.1f} ms ({slowest}) and {memory:.1f} MB ({largest})",
         "",
         None,
         f"{TIME_MAX_S * 1e3:.0f} ms and {MEMORY_MAX / 1e6:.0f} MB at most",

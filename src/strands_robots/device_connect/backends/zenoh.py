@@ -23,7 +23,7 @@ from device_connect_edge.messaging.exceptions import (
     SubscribeError,
 )
 
-from ...bounded_json import LONG_MAX
+from ...bounded_json import LONG_MAX, SMALL_BYTES
 from ...utils import redacted
 from . import jsonrpc, zenoh_session
 from .base import Backend, NoResponderError, Undo, too_long
@@ -327,7 +327,8 @@ class _Request:
         """Take a reply. On Zenoh's thread."""
         ok = reply.ok
         if ok is None:
-            self.failure = reply.err.payload.to_bytes()[:200].decode(errors="replace")
+            why = _payload(reply.err, SMALL_BYTES)
+            self.failure = "a long error" if isinstance(why, int) else why[:200].decode(errors="replace")
         elif not self.answered:
             data = _payload(ok, LONG_MAX)
             self.failure = too_long(data)

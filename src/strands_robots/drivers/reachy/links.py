@@ -290,7 +290,11 @@ class ClientSession:
         self._zenoh_error = zenoh.ZError
 
     def subscribe(self, key: str, on_payload: Callable[[bytes], None], /) -> Callable[[], None]:
-        subscriber = self._session.declare_subscriber(key, lambda sample: on_payload(sample.payload.to_bytes()))
+        def deliver(sample: Any) -> None:
+            if len(sample.payload) <= SMALL_BYTES:
+                on_payload(sample.payload.to_bytes())
+
+        subscriber = self._session.declare_subscriber(key, deliver)
 
         def unsubscribe() -> None:
             # A session that has ended has dropped its subscribers with it.
