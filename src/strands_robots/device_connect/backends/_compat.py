@@ -24,8 +24,6 @@ HEADERS_MAX = 4096
 """Longest headers that nats-py reads, in bytes: what it puts into them itself is far shorter."""
 
 CRLF = b"\r\n"
-_REPLIED = {b"MSG": 5, b"HMSG": 6}
-"""Words of a message's line that names a subject for the reply."""
 
 
 @dataclass
@@ -112,11 +110,11 @@ class DirectParser(Parser):
         if sink is None or not _is_text(line):
             logger.debug("a message was dropped, it is too long or its subject is no text: %r", line[:200])
             return
-        subject, reply = words[1].decode(), words[3].decode() if len(words) == _REPLIED[words[0]] else ""
+        reply = words[3].decode() if len(words) == (5 if words[0] == b"MSG" else 6) else ""
         if isinstance(payload, int):
-            message: Msg = UnreadMsg(self._client, subject, reply, length=payload)
+            message: Msg = UnreadMsg(self._client, words[1].decode(), reply, length=payload)
         else:
-            message = Msg(self._client, subject, reply, payload)
+            message = Msg(self._client, words[1].decode(), reply, payload)
         try:
             sink(message)
         except Exception:
@@ -131,13 +129,14 @@ def _lengths(words: list[bytes]) -> tuple[int, int]:
         nats.errors.ProtocolError: the line does not state them.
     """
     headed = words[0] == b"HMSG"
-    lengths = words[-2:] if headed else words[-1:]
-    if len(words) not in (_REPLIED[words[0]], _REPLIED[words[0]] - 1) or not all(each.isdigit() for each in lengths):
+    if len(words) - headed not in (4, 5) or not words[-1].isdigit():
         raise nats.errors.ProtocolError
-    size, headers = int(lengths[-1]), int(lengths[0]) if headed else 0
-    if headers > size:
+    size = int(words[-1])
+    if not headed:
+        return size, 0
+    if not words[-2].isdigit() or int(words[-2]) > size:
         raise nats.errors.ProtocolError
-    return size, headers
+    return size, int(words[-2])
 
 
 def _is_text(line: bytes) -> bool:
