@@ -43,7 +43,11 @@ def too_long(reply: bytes | int) -> str:
         reply: its bytes, or their number where there are too many.
     """
     why = f"it has {reply} bytes" if isinstance(reply, int) else refusal(reply, LONG_MAX)
-    return f"the reply cannot be read: {why}" if why else ""
+    return f"the reply is not read: {why}" if why else ""
+
+
+class UnreadableReplyError(StrandsRobotsError, PublishError):  # type: ignore[misc]  # untyped
+    """A reply came that is out of bounds, and was not parsed."""
 
 
 class ServedSubscription(Subscription):  # type: ignore[misc]  # the framework has no type information

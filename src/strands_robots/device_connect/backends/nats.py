@@ -19,7 +19,7 @@ from nats.aio.msg import Msg
 
 from . import jsonrpc
 from ._compat import payload_of
-from .base import Backend, NoResponderError, Undo, too_long
+from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
 from .dispatch import REPLY_SUBJECT, CommandServer, OrderedFeed
 from .nats_connection import NatsConnection, connection_for
@@ -85,7 +85,8 @@ class NatsBackend(Backend):
         Raises:
             NoResponderError: no device serves ``subject``.
             RequestTimeoutError: a device does, but gave no reply within ``timeout`` seconds.
-            PublishError: the server would refuse the request, or the reply is out of bounds.
+            PublishError: the server would refuse the request.
+            UnreadableReplyError: the reply is out of bounds.
             NotConnectedError: no server at this moment.
         """
         client = self._connected
@@ -99,7 +100,7 @@ class NatsBackend(Backend):
             raise PublishError(f"cannot ask {subject}: {error}") from error
         why = too_long(answer.data)
         if why:
-            raise PublishError(f"{subject}: {why}")
+            raise UnreadableReplyError(f"{subject}: {why}")
         payload: bytes = answer.data
         return payload
 

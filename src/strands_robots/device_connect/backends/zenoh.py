@@ -26,7 +26,7 @@ from device_connect_edge.messaging.exceptions import (
 from ...bounded_json import LONG_MAX, SMALL_BYTES
 from ...utils import redacted
 from . import jsonrpc, zenoh_session
-from .base import Backend, NoResponderError, Undo, too_long
+from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
 from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
 
@@ -156,7 +156,8 @@ class ZenohBackend(Backend):
         """Return the first reply to ``data``, asking the devices that are linked now.
 
         Raises:
-            PublishError: the subject is malformed, the other side refused, or its reply is out of bounds.
+            PublishError: the subject is malformed, or the other side refused.
+            UnreadableReplyError: the reply is out of bounds.
         """
         session, loop, wait_s = self._connected().session, asyncio.get_running_loop(), max(within, 0.001)
         request, key = _Request(loop, self._outcomes), key_of(subject)
@@ -180,6 +181,8 @@ class ZenohBackend(Backend):
             return answer
         if request.failure == "Timeout":
             raise RequestTimeoutError(f"no reply on {key} in time")
+        if request.unread:
+            raise UnreadableReplyError(f"{key}: {request.unread}")
         if request.failure:
             raise PublishError(f"{key} refused: {request.failure}")
         raise NoResponderError(f"no device answers on {subject}")
@@ -315,11 +318,11 @@ class ZenohBackend(Backend):
 class _Request:
     """A pending query: replies come on Zenoh's thread, its future is settled once."""
 
-    __slots__ = ("_outcomes", "answered", "failure", "future")
+    __slots__ = ("_outcomes", "answered", "failure", "future", "unread")
 
     def __init__(self, loop: asyncio.AbstractEventLoop, outcomes: Backlog) -> None:
         self._outcomes = outcomes
-        self.failure = ""
+        self.failure = self.unread = ""
         self.future: asyncio.Future[bytes | None] = loop.create_future()
         self.answered = False
 
@@ -331,9 +334,8 @@ class _Request:
             self.failure = "a long error" if isinstance(why, int) else why[:200].decode(errors="replace")
         elif not self.answered:
             data = _payload(ok, LONG_MAX)
-            self.failure = too_long(data)
-            self.answered = True
-            self._outcomes.offer((self, None if self.failure else data))
+            self.unread, self.answered = too_long(data), True
+            self._outcomes.offer((self, None if self.unread else data))
 
     def on_end(self) -> None:
         """Settle a request that ended without a reply. On Zenoh's thread."""
