@@ -220,14 +220,3 @@ def test_credentials_of_urls_are_left_out(text: str) -> None:
 
 def test_text_without_credentials_stays() -> None:
     assert redacted("nats://host:4222, mail ada@host") == "nats://host:4222, mail ada@host"
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"[1]", b"7", b"null", b"\xff", b"{", "{'a': 1}", b"[" * 200_000, '{"a":' * 200_000]
-)
-def test_what_is_no_json_object_is_read_as_an_empty_one(data: str | bytes) -> None:
-    assert utils.json_object(data) == {}
-
-
-def test_a_json_object_is_read_from_text_and_bytes() -> None:
-    assert utils.json_object('{"a": [1]}') == utils.json_object(b'{"a": [1]}') == {"a": [1]}

@@ -8,7 +8,6 @@ types. Booleans are not numbers, and NaN is not a number.
 from __future__ import annotations
 
 import ipaddress
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -176,18 +175,6 @@ def mapping(name: str, value: object) -> dict[str, Any]:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise ValidationError(f"{name} must be an object with string keys, not {shown(value)}.")
     return value
-
-
-def json_object(data: str | bytes) -> dict[str, Any]:
-    """Return the JSON object in ``data``, empty for anything else.
-
-    What nests too deep for the parser counts as no object.
-    """
-    try:
-        found = json.loads(data)
-    except (ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def identifier(name: str, value: object) -> str:

@@ -23,7 +23,7 @@ class Messaging:
         self.refuses = refuses
         self.callbacks: list[Any] = []
 
-    async def subscribe_with_subject(self, subject: str, callback: Any, **_options: Any) -> Any:
+    async def subscribe_to_stops(self, subject: str, callback: Any) -> Any:
         if self.refuses:
             raise SubscribeError("refused")
         self.callbacks.append(callback)
@@ -40,9 +40,11 @@ class Device:
     def __init__(self, messaging: Messaging) -> None:
         self.runtime = SimpleNamespace(messaging=messaging)
         self.stops: list[tuple[object, object]] = []
+        self.raw: list[bytes | int | None] = []
 
-    async def on_estop(self, device_id: object, payload: object) -> None:
+    async def on_estop(self, device_id: object, payload: object, raw: bytes | int | None = None) -> None:
         self.stops.append((device_id, payload))
+        self.raw.append(raw)
 
 
 async def test_devices_of_a_link_share_one_subscription_that_outlives_its_holder() -> None:
@@ -64,25 +66,26 @@ async def test_stop_that_comes_while_the_subscription_changes_hands_is_taken() -
     old, new = Device(Messaging()), Device(Messaging())
     for each in (old, new):
         await stops_of(LINK).join(each)
-    subscribe = new.runtime.messaging.subscribe_with_subject
+    subscribe = new.runtime.messaging.subscribe_to_stops
 
     async def slow(*args: Any, **options: Any) -> Any:
         await old.runtime.messaging.callbacks[0](json.dumps({"params": {"reason": "x"}}).encode(), SUBJECT, None)
         return await subscribe(*args, **options)
 
-    new.runtime.messaging.subscribe_with_subject = slow
+    new.runtime.messaging.subscribe_to_stops = slow
     await stops_of(LINK).leave(old)
     assert new.stops == [("safety-1", {"reason": "x"})]
     await stops_of(LINK).leave(new)
 
 
-@pytest.mark.parametrize("data", [b"no JSON", b"[1]", b"{}", b'"params"'])
-async def test_stop_that_cannot_be_read_is_left_to_the_listener(data: bytes) -> None:
+@pytest.mark.parametrize("data", [b"no JSON", b"[1]", b"{}", b'"params"', b"[" * 60_000, 8_000_000])
+async def test_stop_that_cannot_be_read_is_passed_on_with_its_bytes_or_their_number(data: bytes | int) -> None:
     client = Messaging()
     device = Device(client)
     await stops_of(LINK).join(device)
     await client.callbacks[0](data, SUBJECT, None)
-    assert device.stops == []
+    assert device.stops == [("safety-1", {})]
+    assert device.raw == [data]
     await stops_of(LINK).leave(device)
 
 

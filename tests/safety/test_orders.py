@@ -202,3 +202,22 @@ def test_a_mistyped_key_leaves_the_fleet_stoppable_and_says_so(
     monkeypatch.setenv("DEVICE_CONNECT_ESTOP_PUBLIC_KEYS", "oops")
     assert isinstance(order_of(StopRules(), "safety-1", event()), StopOrder)
     assert "oops" in caplog.text
+
+
+def test_stop_that_is_too_long_to_be_read_stops_with_a_fresh_epoch_each_quarter_of_a_second() -> None:
+    rules = StopRules(allow=["safety-*"], keys=())
+    orders = [rules.order("safety-1", {}, "lane", 8_000_000, received=10.0 + after) for after in (0.0, 0.2, 0.3)]
+    other = rules.order("safety-2", {}, "runtime", 8_000_000, received=10.0)
+    assert all(isinstance(each, StopOrder) for each in (*orders, other))
+    epochs = [each.epoch for each in (*orders, other) if isinstance(each, StopOrder)]
+    assert epochs[0] == epochs[1]
+    assert len(set(epochs)) == 3
+    assert orders[0].reason == "an emergency stop of 8000000 bytes, which was not read"
+    for number in range(1000):
+        rules.order(f"safety-{number}", {}, "lane", 8_000_000)
+
+
+def test_stop_that_is_too_long_to_be_read_is_refused_where_it_has_to_be_signed() -> None:
+    public = ed25519.public_half(Ed25519PrivateKey.generate())
+    for rules in (StopRules(allow=(), keys=[public]), StopRules(allow=["other"], keys=())):
+        assert isinstance(rules.order("safety-1", {}, "lane", 8_000_000), StopRefused)

@@ -14,6 +14,7 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from strands_robots.arm_mixin import WAIT_S
+from strands_robots.bounded_json import json_object
 from strands_robots.dashboard.access import OPERATOR
 from strands_robots.dashboard.driving import HandControl
 from strands_robots.dashboard.feed import FleetFeed
@@ -23,7 +24,7 @@ from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
 from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
 from strands_robots.recording.cameras import OVERVIEW
-from strands_robots.utils import ValidationError, json_object, shown, text
+from strands_robots.utils import ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
 

@@ -300,10 +300,13 @@ class RobotDriver(CollectedOnce):
         found = super()._collect_event_subscriptions()
         return [each for each in found if not (self._stops_are_shared and each["handler"] == self.onEmergencyStop)]
 
-    async def on_estop(self, device_id: object, payload: object) -> None:
-        """Act on an emergency stop of the runtime, in the safety plane if registered."""
+    async def on_estop(self, device_id: object, payload: object, raw: bytes | int | None = None) -> None:
+        """Act on an emergency stop of the runtime, in the safety plane if registered.
+
+        ``raw`` is its message, or the number of bytes of one that is too long to be read.
+        """
         if self.registration is not None:
-            self.registration.runtime_estop(device_id, payload)
+            self.registration.runtime_estop(device_id, payload, raw)
             return
         halting = self._begin_estop(device_id, payload)
         if halting is not None:

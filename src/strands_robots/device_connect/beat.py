@@ -16,8 +16,8 @@ from typing import Any
 
 from device_connect_edge.messaging.exceptions import MessagingError
 
+from strands_robots.bounded_json import json_object
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.utils import json_object
 
 logger = logging.getLogger(__name__)
 

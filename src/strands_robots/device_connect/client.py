@@ -19,6 +19,7 @@ from typing import Any, Self, TypeVar
 
 from device_connect_edge.messaging.exceptions import MessagingError, RequestTimeoutError
 
+from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.discovery import HEARTBEATS_S, Discovery, Peer, parts
@@ -26,7 +27,7 @@ from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.stopping import Outcome, explain, grade
-from strands_robots.utils import ValidationError, device_id, json_object, shown, text
+from strands_robots.utils import ValidationError, device_id, shown, text
 
 T = TypeVar("T")
 
@@ -375,7 +376,7 @@ def _push(arrived: queue.Queue[DeviceEvent], event: DeviceEvent) -> None:
 
 
 def _answer(device: str, function: str, data: bytes) -> Envelope:
-    reply = json_object(data)
+    reply = json_object(data, LONG_MAX)
     if not reply:
         raise CallRefusedError(f"{device} answered {function} with {shown(data)}, which is no JSON-RPC.")
     problem = reply.get("error")

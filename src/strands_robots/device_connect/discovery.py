@@ -19,10 +19,10 @@ from typing import Any
 from device_connect_edge.messaging.exceptions import MessagingError
 
 from strands_robots import settings
-from strands_robots.device_connect.backends.base import Backend, NoResponderError
+from strands_robots.bounded_json import json_object
+from strands_robots.device_connect.backends.base import Backend, NoResponderError, UnreadableReplyError
 from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.utils import json_object
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ DESCRIBE_S = 1.0
 """Seconds in which a device describes itself when asked."""
 
 PAGE = 100
-"""Devices of one answer of the registry; NATS carries 1 MiB by default and a rich description takes 10 kB."""
+"""Devices of one answer of the registry; fewer are asked for where their descriptions are too long for it."""
 
 PAGES_MAX = 1000
 
@@ -311,8 +311,16 @@ class Discovery:
 
     async def _rows(self, within: float) -> AsyncIterator[Mapping[str, Any]]:
         offset: Any = 0
+        limit = PAGE
         for _ in range(PAGES_MAX):
-            answer = await self._ask("discovery", "discovery/listDevices", {"offset": offset, "limit": PAGE}, within)
+            params = {"offset": offset, "limit": limit}
+            try:
+                answer = await self._ask("discovery", "discovery/listDevices", params, within)
+            except UnreadableReplyError:
+                if limit == 1:
+                    raise
+                limit = max(1, limit // 4)
+                continue
             rows = answer.get("devices")
             for row in rows if isinstance(rows, list) else ():
                 if isinstance(row, Mapping) and row.get("device_id"):

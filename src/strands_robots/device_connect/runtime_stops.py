@@ -7,7 +7,6 @@ them. The e-stop listener's own connection carries the same stops.
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import Any, Protocol
 
 from device_connect_edge.messaging.exceptions import MessagingError
@@ -15,6 +14,7 @@ from device_connect_edge.messaging.exceptions import MessagingError
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.discovery import parts
 from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.orders import params_of
 from strands_robots.safety.stop_log import stop_logger
 
 logger = stop_logger(__name__)
@@ -25,7 +25,7 @@ class RegisteredDevice(Protocol):
 
     runtime: Any
 
-    async def on_estop(self, device_id: object, payload: object) -> None:
+    async def on_estop(self, device_id: object, payload: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of ``device_id``."""
 
 
@@ -70,9 +70,7 @@ class RuntimeStops:
             device = self._devices[0]
             subject = f"device-connect.{self._link.tenant}.*.event.{ESTOP}"
             try:
-                self._subscription = await device.runtime.messaging.subscribe_with_subject(
-                    subject, self._on_stop, subscribe_only=True
-                )
+                self._subscription = await device.runtime.messaging.subscribe_to_stops(subject, self._on_stop)
             except MessagingError as exc:
                 self._devices.remove(device)
                 if not self._devices:
@@ -81,15 +79,11 @@ class RuntimeStops:
             else:
                 self._holder = device
 
-    async def _on_stop(self, data: bytes, subject: str, reply: str | None) -> None:
-        try:
-            payload = json.loads(data)["params"]
-        except (ValueError, KeyError, TypeError, RecursionError):
-            logger.warning("An emergency stop on %s is not to be read; the e-stop listener judges it.", subject)
-            return
+    async def _on_stop(self, data: bytes | int, subject: str, reply: str | None) -> None:
+        params = params_of(data)
         # Not the holder: while the subscription passes from one device to the next there is none.
         for device in self._devices[:1]:
-            await device.on_estop(parts(subject)[2], payload)
+            await device.on_estop(parts(subject)[2], params, data)
 
 
 _STOPS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], RuntimeStops] = {}

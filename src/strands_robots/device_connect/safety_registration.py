@@ -98,10 +98,10 @@ class SafetyRegistration:
         """True while the e-stop link of this device is connected."""
         return self._listener.link.up
 
-    def runtime_estop(self, source: object, params: object) -> None:
+    def runtime_estop(self, source: object, params: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
-            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime")
+            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime", raw)
 
     def raise_estop(self, params: Mapping[str, Any]) -> None:
         """Lock and halt on this device's own emergency stop; return at once.

@@ -18,6 +18,7 @@ from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, VERDICT, OnEvent, OnState, StopLink
+from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.stop_log import stop_logger
 
 if TYPE_CHECKING:
@@ -190,8 +191,9 @@ class ZenohStopLink:
 
         def on_sample(sample: Any) -> None:
             parts = str(sample.key_expr).split("/")
+            size = len(sample.payload)
             if len(parts) == 5:
-                on_event(parts[4], parts[2], sample.payload.to_bytes())
+                on_event(parts[4], parts[2], size if size > PARSED_MAX_BYTES else sample.payload.to_bytes())
 
         for event in events:
             session.subscribe(f"{self._root}/*/event/{event}", on_sample)
@@ -271,7 +273,7 @@ class NatsStopLink:
     async def _serve(self, events: Collection[str], on_event: OnEvent, end: asyncio.Event) -> None:
         from strands_robots.device_connect.backends.nats import NatsBackend  # noqa: PLC0415 - loaded with the first link
 
-        def on_message(data: bytes, subject: str) -> None:
+        def on_message(data: bytes | int, subject: str) -> None:
             parts = subject.split(".")
             if len(parts) == 5:
                 on_event(parts[4], parts[2], data)

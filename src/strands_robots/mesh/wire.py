@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from strands_robots.bounded_json import OutOfBoundsError, parsed
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.resume import is_epoch
 from strands_robots.utils import ValidationError, identifier, shown
@@ -53,13 +54,15 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
     """Return the JSON object in ``data``.
 
     Raises:
-        WireError: too long, not UTF-8, not JSON, not an object, or a number that is not finite.
+        WireError: out of bounds, not UTF-8, not JSON, not an object, or a number that is not finite.
     """
     if len(data) > limit:
         raise TooLargeError(f"a message of {len(data)} bytes is above the topic's {limit}.")
     try:
-        value = _DECODER.decode(data.decode())
-    except (ValueError, RecursionError) as exc:
+        value = parsed(data, limit, _parse)
+    except OutOfBoundsError as exc:
+        raise WireError(f"cannot be read: {exc}") from None
+    except ValueError as exc:
         raise WireError(f"not JSON: {type(exc).__name__}") from None
     if not isinstance(value, dict):
         raise WireError(f"not an object but a {type(value).__name__}")
@@ -101,6 +104,10 @@ def _scrubbed(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_scrubbed(entry) for entry in value]
     return value
+
+
+def _parse(data: bytes) -> Any:
+    return _DECODER.decode(data.decode())
 
 
 # Made once: a coder with options is otherwise made anew for every message.

@@ -7,6 +7,8 @@ from typing import Any
 
 from cyclonedds.idl._machinery import BytesMachine
 
+from strands_robots.bounded_json import OutOfBoundsError
+
 # The version decides whether there is a v0 or a v1 machine.
 _MACHINES = ("v0_machine", "v1_machine", "v2_machine")
 
@@ -24,6 +26,18 @@ def pack_as_bytes(struct: Any, *members: str) -> None:
         members_machines = getattr(getattr(idl, version, None), "members_machines", {})
         for member in members:
             members_machines[member] = machine()
+
+
+def bound_samples(struct: Any, longest: int) -> None:
+    """Refuse to decode samples of a struct that are longer, in bytes."""
+    decode = struct.deserialize
+
+    def deserialize(data: bytes, *arguments: Any, **options: Any) -> Any:
+        if len(data) > longest:
+            raise OutOfBoundsError(f"it has {len(data)} bytes, and at most {longest} are read")
+        return decode(data, *arguments, **options)
+
+    struct.deserialize = deserialize
 
 
 def subscribed(writer: Any) -> bool:

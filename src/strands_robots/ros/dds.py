@@ -375,4 +375,7 @@ def _bytes(value: Any, place: str) -> bytes:
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         return plain(value)
-    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
+    if not isinstance(value, list | tuple):
+        return value
+    # A sequence has one type, and a scan or a map has many values.
+    return list(value) if value and isinstance(value[0], int | float | str) else [_plain(each) for each in value]

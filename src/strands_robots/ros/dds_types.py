@@ -11,12 +11,24 @@ from typing import TYPE_CHECKING, Any
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float32, float64, int8, int32, sequence, uint32
 
-from strands_robots.ros._compat import pack_as_bytes
+from strands_robots.ros._compat import bound_samples, pack_as_bytes
 
 try:
     from cyclonedds.idl.types import byte
 except ImportError:  # Cyclone DDS 0.10 means by uint8 what 11 means by byte
     from cyclonedds.idl.types import uint8 as byte
+
+SAMPLE_MAX = 16 * 2**10
+"""Longest sample that is decoded, in bytes: 200 transforms, or 300 joints."""
+
+TEXT_MAX = 2**20
+"""The same of a text, such as a robot's description."""
+
+ARRAY_MAX = 256 * 2**10
+"""The same of scans and maps, whose numbers are decoded at once: 65,000 ranges, or 500 by 500 cells."""
+
+PICTURE_MAX = 3 * 2**20
+"""The same of pictures, whose bytes are copied thrice: a raw one of 1280 by 720 fits."""
 
 KINDS: dict[str, type[Any]] = {}
 """The IDL type of each ``pkg/Name`` that this bundle carries."""
@@ -261,7 +273,16 @@ class BatteryState(IdlStruct, **_typed("sensor_msgs/BatteryState")):
 pack_as_bytes(Image, "data")
 pack_as_bytes(CompressedImage, "data")
 
+_LONGEST = {
+    Image: PICTURE_MAX,
+    CompressedImage: PICTURE_MAX,
+    LaserScan: ARRAY_MAX,
+    OccupancyGrid: ARRAY_MAX,
+    String: TEXT_MAX,
+}
+
 for _struct in IdlStruct.__subclasses__():
     if _struct.__module__ == __name__:
         _package, _, _, _name = _struct.__idl_typename__.split("::")
         KINDS[f"{_package}/{_name.removesuffix('_')}"] = _struct
+        bound_samples(_struct, _LONGEST.get(_struct, SAMPLE_MAX))

@@ -24,6 +24,7 @@ from secrets import token_hex
 from socket import SHUT_RDWR, SO_LINGER, SOL_SOCKET
 from typing import Any
 
+from strands_robots.bounded_json import LONG_MAX, MESSAGE_MAX, OutOfBoundsError, parsed
 from strands_robots.ros.link import Message, NoReceiptError, RosError
 from strands_robots.ros.names import bare_kind
 from strands_robots.utils import ValidationError, dial_host_error, mapping, missing_extra, port, shown, text
@@ -42,8 +43,8 @@ CONFIRM_S = 0.5
 _PING_S = 2.0
 _CLOSE_S = 0.5
 
-FRAME_MAX = 16 * 2**20
-"""Longest frame and longest reassembled message in bytes: a raw 1080p image in base64 fits."""
+FRAME_MAX = 8 * 2**20
+"""Longest frame in bytes: a raw 1080p image in base64 fits."""
 
 FRAGMENTS_MAX = 10_000
 PARTIAL_MAX = 8
@@ -69,8 +70,11 @@ def encoded(op: str, **fields: Any) -> str:
 def decoded(frame: str | bytes) -> dict[str, Any]:
     """Decode a frame; :class:`RosError` where it is no object with an ``op``."""
     try:
-        found = json.loads(frame)
-    except (ValueError, RecursionError) as exc:
+        # A text is that of a frame already; bytes are copied to read them.
+        found = parsed(frame, FRAME_MAX if isinstance(frame, str) else MESSAGE_MAX)
+    except OutOfBoundsError as exc:
+        raise RosError(f"a frame cannot be read: {exc}") from exc
+    except ValueError as exc:
         raise RosError(f"a frame is no JSON: {exc}") from exc
     if not isinstance(found, dict) or not isinstance(found.get("op"), str):
         raise RosError("a frame is no object with an op")
@@ -103,6 +107,7 @@ class Fragments:
 
     def __init__(self) -> None:
         self._partial: dict[str, dict[int, str]] = {}
+        self._size = 0
 
     def add(self, frame: Mapping[str, Any]) -> dict[str, Any] | None:
         """Add a fragment; return the whole message once it is complete."""
@@ -112,16 +117,21 @@ class Fragments:
             raise RosError("a fragment lacks its id, number, total or data")
         assert isinstance(number, int)
         parts = self._partial.setdefault(key, {})
+        self._size += len(data) - len(parts.get(number, ""))
         parts[number] = data
-        if len(self._partial) > PARTIAL_MAX:
-            del self._partial[next(iter(self._partial))]
-        if sum(map(len, parts.values())) > FRAME_MAX:
-            del self._partial[key]
-            raise RosError(f"the fragments of a message are longer than {FRAME_MAX} characters")
+        while len(self._partial) > PARTIAL_MAX or (self._size > LONG_MAX and len(self._partial) > 1):
+            # The oldest gives way, this one last.
+            self._drop(next(each for each in self._partial if each != key))
+        if self._size > LONG_MAX:
+            self._drop(key)
+            raise RosError(f"the fragments of a message are longer than {LONG_MAX} characters")
         if len(parts) != total:
             return None
-        del self._partial[key]
+        self._drop(key)
         return decoded("".join(parts[index] for index in sorted(parts)))
+
+    def _drop(self, key: str) -> None:
+        self._size -= sum(map(len, self._partial.pop(key).values()))
 
 
 def _plain(value: Any) -> Any:

@@ -6,7 +6,6 @@ and no telemetry of its process stands before a stop.
 
 from __future__ import annotations
 
-import json
 import secrets
 import threading
 import time
@@ -30,11 +29,11 @@ from strands_robots.safety.estop_listener import (
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, signed_bytes
+from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_bytes
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
-from strands_robots.utils import ValidationError, device_id, number
+from strands_robots.utils import ValidationError, device_id, number, shown
 
 logger = stop_logger(__name__)
 
@@ -373,14 +372,13 @@ class SafetyController:
                 log_witness(self.controller_id, name, each.facts.get("audit"), signed=signed)
         return report
 
-    def _receive(self, event: str, source: str, payload: bytes) -> None:
+    def _receive(self, event: str, source: str, payload: bytes | int) -> None:
         at, wall = time.monotonic(), time.time()
-        try:
-            params = json.loads(payload)["params"]
-            estop_id = params["estop_id"]
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            logger.warning("An answer of %s is not to be read; it counts as none.", source)
+        params = params_of(payload)
+        if "estop_id" not in params:
+            logger.warning("An answer of %s is not to be read; it counts as none.", shown(source))
             return
+        estop_id = params["estop_id"]
         if event == CHECK_IN_ANSWER:
             self._witness_head(source, params)
             return

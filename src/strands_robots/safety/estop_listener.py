@@ -20,7 +20,15 @@ from strands_robots.audit import audit_head, log_safety_event, own_log_id
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.safety.orders import LISTENER, RobotReport, StopOrder, StopRefused, StopRules, params_of
+from strands_robots.safety.orders import (
+    LISTENER,
+    PARSED_MAX_BYTES,
+    RobotReport,
+    StopOrder,
+    StopRefused,
+    StopRules,
+    params_of,
+)
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
@@ -60,8 +68,11 @@ REFUSED_PAUSE_S = 0.0005
 LATCH_ANSWERS_PER_S = 200
 LATCH_ANSWERS_REMEMBERED = 4096
 
-OnEvent = Callable[[str, str, bytes], None]
-"""Called with event, source and bytes on a thread of the link; it must return at once and may not raise."""
+OnEvent = Callable[[str, str, bytes | int], None]
+"""Called with event, source and bytes on a thread of the link; it must return at once and may not raise.
+
+In place of more than :data:`~.orders.PARSED_MAX_BYTES` a link gives their number.
+"""
 
 OnState = Callable[[bool], None]
 """Called with the link's state, True for up, on a thread of the link, at each change."""
@@ -106,7 +117,7 @@ class StopEvent(NamedTuple):
 
     event: str
     source: str
-    payload: bytes
+    payload: bytes | int
     at: float
 
 
@@ -170,7 +181,7 @@ class FairQueue:
         """Return True when this source has a bucket of its own."""
         return source in self._vouched
 
-    def put(self, event: str, source: str, payload: bytes, *, urgent: bool = True) -> None:
+    def put(self, event: str, source: str, payload: bytes | int, *, urgent: bool = True) -> None:
         """Add an event; of those that are not urgent, a full bucket drops the new."""
         received = StopEvent(event, source, payload, time.monotonic())
         bucket = self._vouched.get(source)
@@ -420,17 +431,23 @@ class EstopListener:
         """True when a stop needs a signature; else its source is what it says it is."""
         return self._rules.signed
 
-    def accept_params(self, source: str, params: Mapping[str, Any], path: str) -> None:
+    def accept_params(self, source: str, params: Mapping[str, Any], path: str, raw: bytes | int | None = None) -> None:
         """Act on a parsed emergency stop of another path; return at once.
 
         A source whose signatures keep failing is not checked again here for up to a second: its stops arrive at the
         listener's own link as well.
+
+        Args:
+            source: who stops, as declared.
+            params: its parameters, as far as it has any.
+            path: how it arrived.
+            raw: the message, or its number of bytes where it was too long to be read.
         """
         if self._plane.under_way(params.get("estop_id")):
             return
         if self._rules.signed and not self._budget.allows(source, time.monotonic()):
             return
-        order = self._rules.order(source, params, path)
+        order = self._rules.order(source, params, path, raw)
         if isinstance(order, StopRefused):
             self._budget.record(source, time.monotonic())
             self._refusals.record(order, ESTOP)
@@ -441,11 +458,13 @@ class EstopListener:
         """Act on a stop that a device of this process raises; return at once."""
         self._plane.begin(order, self._answer)
 
-    def receive(self, event: str, source: str, payload: bytes) -> None:
+    def receive(self, event: str, source: str, payload: bytes | int) -> None:
         """Take an event from a link's thread; returns at once."""
         events = self._queue
         if events is None:
             return
+        if not isinstance(payload, int) and len(payload) > PARSED_MAX_BYTES:
+            payload = len(payload)
         if event == CHECK_IN_ANSWER:
             # Robots send these; so many a second, which a flood of them does not exceed.
             now = time.monotonic()

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots import settings
+from strands_robots.bounded_json import SMALL_BYTES, json_object
 from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import caller_name, entries, estop_refusal, matcher
 from strands_robots.safety.clocks import ObservedClocks, seconds_of
@@ -21,7 +22,7 @@ from strands_robots.safety.lockout import OVERFLOW
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, covered
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import ValidationError, json_object
+from strands_robots.utils import ValidationError
 
 LATE_S = 1.0
 """Time from the press to its receipt, above which a stop is late."""
@@ -31,8 +32,13 @@ UNTIMED_LATE_S = 60.0
 
 AHEAD_S = 5.0
 
-PARSED_MAX_BYTES = 64 * 2**10
+PARSED_MAX_BYTES = SMALL_BYTES
 """A message longer than this is not read; from a source that may stop, it stops all the same."""
+
+UNREAD_AGAIN_S = 0.25
+"""Seconds in which stops of one source that are too long to be read count as one."""
+
+UNREAD_SOURCES_MAX = 64
 
 REASON_MAX = 200
 
@@ -230,6 +236,7 @@ class StopRules:
         self._keys = tuple(estop_keys() if keys is None else keys)
         self._clock = clock
         self._clocks = ObservedClocks()
+        self._unread: dict[str, tuple[float, str]] = {}
         self.required = settings.boolean(REQUIRE_SIGNED)
 
     def require_keys(self) -> None:
@@ -268,18 +275,23 @@ class StopRules:
         source: str,
         params: Mapping[str, Any],
         path: str,
-        raw: bytes | None = None,
+        raw: bytes | int | None = None,
         received: float | None = None,
     ) -> StopOrder | StopRefused:
         """Decide on the parameters of an ``emergencyStop``.
 
-        ``raw`` are the bytes that they were read from; they identify a message without parameters.
+        ``raw`` are the bytes that they were read from, or their number where there are too many to be read. The bytes
+        identify a message without parameters; one that is not read has a fresh epoch.
         """
         why = self.source_refusal(source) or self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
         if why is not None:
             return StopRefused(source, why)
+        received = time.monotonic() if received is None else received
+        if isinstance(raw, int):
+            epoch, why = self._unread_epoch(source, received), f"an emergency stop of {raw} bytes, which was not read"
+            return StopOrder(epoch, source, why, path, remote=True, received=received)
         distinct = raw if raw is not None and not params else _text(params)
-        reason, received = params.get("reason"), time.monotonic() if received is None else received
+        reason = params.get("reason")
         received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
         ahead = self._clocks.note(source, received_at - issued, received) if issued is not None else None
         return StopOrder(
@@ -295,6 +307,17 @@ class StopRules:
             clock_ahead_s=ahead,
             answered=_names(params.get(ANSWERED)),
         )
+
+    def _unread_epoch(self, source: str, received: float) -> str:
+        """Return the epoch of a stop that is not read, the same for repetitions."""
+        since, epoch = self._unread.get(source, (float("-inf"), ""))
+        if received - since >= UNREAD_AGAIN_S:
+            since, epoch = received, new_epoch()
+            self._unread.pop(source, None)
+            self._unread[source] = since, epoch
+            while len(self._unread) > UNREAD_SOURCES_MAX:
+                del self._unread[next(iter(self._unread))]
+        return epoch
 
     def signature_refusal(self, source: str, params: Mapping[str, Any], purpose: Purpose) -> str | None:
         """Return the reason why the signature is not valid, or None; None without keys."""
@@ -315,11 +338,13 @@ class StopRules:
             self._clocks.note(source, self._clock() - (time.monotonic() - received) - sent, received)
 
 
-def params_of(payload: bytes) -> dict[str, Any]:
-    """Return the parameters of a JSON-RPC notification; empty for anything else."""
-    if len(payload) > PARSED_MAX_BYTES:
-        return {}
-    params = json_object(payload).get("params")
+def params_of(payload: bytes | int) -> dict[str, Any]:
+    """Return the parameters of a JSON-RPC notification; empty for anything else.
+
+    Args:
+        payload: the message, or its number of bytes where there are too many to be read.
+    """
+    params = {} if isinstance(payload, int) else json_object(payload, PARSED_MAX_BYTES).get("params")
     return params if isinstance(params, dict) else {}
 
 

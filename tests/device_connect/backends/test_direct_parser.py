@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from nats.aio.client import Client
 from nats.errors import ProtocolError
 
-from strands_robots.device_connect.backends._compat import DirectParser
+from strands_robots.bounded_json import LONG_MAX, MESSAGE_MAX
+from strands_robots.device_connect.backends._compat import HEADERS_MAX, DirectParser, payload_of
 
 OWN, OTHER = 1, 2
 
@@ -48,7 +49,7 @@ def parser() -> tuple[DirectParser, RecordingClient, list[Any]]:
     client, received = RecordingClient(), list[Any]()
     made = client.parser = DirectParser(client)
     subscription: Any = FakeSubscription(OWN)
-    made.hand_over(subscription, lambda message: received.append((message.subject, message.reply, message.data)))
+    made.hand_over(subscription, lambda message: received.append((message.subject, message.reply, payload_of(message))))
     return made, client, received
 
 
@@ -67,7 +68,8 @@ FRAMES = (
     + b"PING\r\n"
     + framed(OWN, "a.c", b"MSG x 1 3\r\nabc\r\n", "_INBOX.1")
     + framed(OTHER, "_INBOX.2", b"answer")
-    + b"HMSG a.b 1 12 17\r\nNATS/1.0\r\n\r\nhello\r\n"
+    + b"HMSG a.b 1 _INBOX.3 12 17\r\nNATS/1.0\r\n\r\nhello\r\n"
+    + b"HMSG _INBOX.2 2 12 17\r\nNATS/1.0\r\n\r\nhello\r\n"
     + framed(OWN, "a.b", b"")
     + b"+OK\r\nPONG\r\n"
     + framed(OWN, "a.b", bytes(70_000))
@@ -80,10 +82,28 @@ async def test_frames_cut_anywhere_are_handed_over_whole_and_in_order(cuts: list
     ends = [*sorted(set(cuts)), len(FRAMES)]
     for begin, end in zip([0, *ends], ends, strict=False):
         await made.parse(FRAMES[begin:end])
-    big = ("a.b", "", bytes(70_000))
-    assert received == [("a.b", "", b"one"), ("a.c", "_INBOX.1", b"MSG x 1 3\r\nabc\r\n"), ("a.b", "", b""), big]
+    texts = [("a.b", "", b"one"), ("a.c", "_INBOX.1", b"MSG x 1 3\r\nabc\r\n"), ("a.b", "_INBOX.3", b"hello")]
+    assert received == [*texts, ("a.b", "", b""), ("a.b", "", bytes(70_000))]
     answer = (OTHER, "_INBOX.2", "", b"answer", None)
-    assert client.taken == ["ping", answer, (OWN, "a.b", "", b"hello", b"NATS/1.0\r\n\r\n"), "pong"]
+    assert client.taken == ["ping", answer, (OTHER, "_INBOX.2", "", b"hello", b"NATS/1.0\r\n\r\n"), "pong"]
+
+
+@pytest.mark.parametrize("chunk", [1000, 32_768, 10_000_000])
+async def test_message_that_is_too_long_is_dropped_as_it_arrives_and_its_length_is_told(chunk: int) -> None:
+    made, client, received = parser()
+    long = bytes(MESSAGE_MAX + 1)
+    headers = b"NATS/1.0\r\n" + b"a:b\r\n" * HEADERS_MAX + b"\r\n"
+    frames = framed(OWN, "a.b", long, "_INBOX.1") + framed(OWN, "a.b", b"next")
+    frames += framed(OTHER, "_INBOX.2", bytes(LONG_MAX + 1)) + framed(OTHER, "_INBOX.2", long)
+    frames += b"HMSG _INBOX.2 2 %d %d\r\n%sx\r\n" % (len(headers), len(headers) + 1, headers)
+    frames += b"HMSG a.b 1 %d %d\r\n%sx\r\nPING\r\n" % (len(headers), len(headers) + 1, headers)
+    most = 0
+    for at in range(0, len(frames), chunk):
+        await made.parse(frames[at : at + chunk])
+        most = max(most, len(made._unread))
+    assert received == [("a.b", "_INBOX.1", MESSAGE_MAX + 1), ("a.b", "", b"next"), ("a.b", "", b"x")]
+    assert client.taken == [(OTHER, "_INBOX.2", "", long, None), "ping"]
+    assert most < MESSAGE_MAX + 2 * chunk
 
 
 async def test_sink_that_raises_loses_no_message_behind_it(caplog: pytest.LogCaptureFixture) -> None:

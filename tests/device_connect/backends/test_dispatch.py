@@ -11,7 +11,8 @@ import time
 import pytest
 from fixtures.waiting import until
 
-from strands_robots.device_connect.backends import dispatch, jsonrpc
+from strands_robots.device_connect.backends import LinkConfig, dispatch, jsonrpc
+from strands_robots.device_connect.backends.base import Backend
 from strands_robots.device_connect.backends.dispatch import start_now
 
 
@@ -248,6 +249,61 @@ async def test_feed_keeps_no_more_bytes_than_it_may(monkeypatch):
     await until(lambda: seen)
     await feed.close()
     assert seen == [5_000]
+
+
+@pytest.mark.parametrize(
+    "data", [2_000, b"x" * 1_001, b"[" + b"[]," * 30_000 + b"0]"], ids=["number", "length", "lists"]
+)
+async def test_feed_drops_what_is_out_of_bounds_or_gives_what_stands_for_it(data, caplog):
+    seen, stood = [], []
+
+    async def handler(message):
+        seen.append(message)
+
+    async def other(message):
+        stood.append(message)
+
+    longest = 1_000 if not isinstance(data, bytes) or len(data) < 2_000 else 2**20
+    feed = dispatch.OrderedFeed("s", handler, call_soon, longest=longest)
+    standing = dispatch.OrderedFeed("s", other, call_soon, longest=longest, unread=lambda size: size)
+    for message in (data, b"x" * 1_000):
+        feed.accept(message)
+        standing.accept(message)
+    await until(lambda: seen and len(stood) == 2)
+    await feed.close()
+    await standing.close()
+    assert seen == [b"x" * 1_000]
+    assert stood == [data if isinstance(data, int) else len(data), b"x" * 1_000]
+    assert "refused a message on s" in caplog.text
+
+
+async def test_foreign_handler_of_stops_gets_a_short_one_for_one_that_is_too_long():
+    seen = []
+
+    async def handler(data, reply):
+        seen.append(json.loads(data))
+
+    class Loopback(Backend):
+        def _call_soon(self, function):
+            call_soon(function)
+
+        async def _declare(self, subject, queue, consumer, **options):
+            consumer.accept(8_000_000, None)
+            consumer.accept(b"x" * 70_000, None)
+
+            async def undo():
+                pass
+
+            return undo
+
+    Loopback.__abstractmethods__ = frozenset()  # the others are not called
+    client = Loopback(LinkConfig())
+    subscription = await client.subscribe("device-connect.default.*.event.emergencyStop", handler, subscribe_only=True)
+    await until(lambda: len(seen) == 2)
+    await subscription.unsubscribe()
+    assert [each["method"] for each in seen] == ["emergencyStop"] * 2
+    assert "8000000 bytes" in seen[0]["params"]["reason"]
+    assert seen[0]["params"]["event_id"] != seen[1]["params"]["event_id"]
 
 
 async def test_feed_takes_messages_from_threads_in_their_order():

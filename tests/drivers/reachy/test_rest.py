@@ -24,6 +24,7 @@ from strands_robots.drivers.reachy.rest import (
 )
 from strands_robots.utils import ValidationError
 
+LONG = b"[" + b"0," * 1_000_000 + b"0]"
 HERE = "http://127.0.0.1:8000"
 RECORDED = [each for each in recorded("daemon_1.13.0_lite.json")["rest"] if each["status"] >= 400]
 KINDS = {
@@ -141,3 +142,13 @@ def test_api_returns_errors_and_never_raises() -> None:
 
 def test_every_error_kind_is_a_daemon_error() -> None:
     assert all(issubclass(kind, DaemonError) for kind in (*KINDS.values(), DaemonUnreachableError))
+
+
+@respx.mock
+@pytest.mark.parametrize(
+    ("size", "why"), [(len(LONG), "longer than 1048576 bytes"), (200_000, "more than 20000 values")]
+)
+def test_answer_out_of_bounds_is_a_fault_and_not_parsed(size: int, why: str) -> None:
+    respx.get(f"{HERE}/x").mock(return_value=httpx.Response(200, content=LONG[:size]))
+    with pytest.raises(DaemonFaultError, match=why):
+        RestClient("127.0.0.1").get("/x")

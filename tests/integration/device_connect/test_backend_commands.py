@@ -28,7 +28,7 @@ MALFORMED = {
     "params null": (b'{"id":1,"method":"getStatus","params":null}', -32602),
     "params text": (b'{"id":1,"method":"getStatus","params":"x"}', -32602),
     "meta": (b'{"id":1,"method":"getStatus","params":{"_dc_meta":[]}}', -32602),
-    "deep": (b'{"id":1,"method":"getStatus","params":{"value":' + b"[" * 10_000 + b"]" * 10_000 + b"}}", -32700),
+    "deep": (b'{"id":1,"method":"getStatus","params":{"value":' + b"[" * 10_000 + b"]" * 10_000 + b"}}", -32600),
     "huge integer": (b'{"id":1,"method":"getStatus","params":{"value":' + b"9" * 5_000 + b"}}", -32700),
     "NaN": (b'{"id":1,"method":"getStatus","params":{"value":NaN}}', -32700),
     "unknown": (b'{"id":1,"method":"nope"}', -32601),

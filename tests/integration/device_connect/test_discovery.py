@@ -91,6 +91,23 @@ async def test_devices_that_only_the_registry_lists_are_found_over_all_its_pages
         assert not discovery.stale
 
 
+async def test_registry_of_long_descriptions_is_asked_for_fewer_at_a_time(link):
+    names = [f"arm-{number:03}" for number in range(60)]
+    events = [{"name": f"event_{number}"} for number in range(500)]
+
+    def answer(params):
+        result = page_of(names)(params)
+        for row in result["result"]["devices"]:
+            row["capabilities"] = {"events": events}
+        return result
+
+    async with registry(link, answer) as asked, discovery_on(link) as discovery:
+        peers = await discovery.collect(5.0)
+        assert [peer.id for peer in peers] == names
+        assert [params["limit"] for params in asked] == [100, 25, *[6] * 10]
+        assert not discovery.stale
+
+
 async def test_device_that_answers_a_probe_is_described_by_its_own_word(link):
     with EchoDevice("echo-1", link):
         async with registry(link, page_of(["arm-1", "echo-1"])), discovery_on(link) as discovery:

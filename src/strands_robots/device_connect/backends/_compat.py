@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import nats.errors
 from nats.aio.client import Client
@@ -15,17 +16,36 @@ from nats.aio.subscription import Subscription
 from nats.aio.transport import TcpTransport
 from nats.protocol.parser import Parser
 
+from ...bounded_json import LONG_MAX, MESSAGE_MAX
+
 logger = logging.getLogger(__name__)
 
+HEADERS_MAX = 4096
+"""Longest headers that nats-py reads, in bytes: what it puts into them itself is far shorter."""
+
 CRLF = b"\r\n"
+
+
+@dataclass
+class UnreadMsg(Msg):
+    """A message without its bytes: there are too many, ``length`` of them."""
+
+    length: int = 0
+
+
+def payload_of(message: Msg) -> bytes | int:
+    """Return the bytes of a message, or their number where they were not read."""
+    return message.length if isinstance(message, UnreadMsg) else message.data
 
 
 class DirectParser(Parser):
     """A parser that hands the messages of some subscriptions over at once.
 
     nats-py puts each message into a queue and wakes a task for it, which takes a tenth of a millisecond under load: a
-    flood fills that queue faster than it empties, and a stop waits behind it. All other frames, and messages with
-    headers, go nats-py's way, one at a time.
+    flood fills that queue faster than it empties, and a stop waits behind it. All other frames go nats-py's way, one
+    at a time. Headers of messages that are handed over are not read.
+
+    A message that is too long is dropped as it arrives: a sink gets an :class:`UnreadMsg` in its place.
 
     The server forwards a subject of any bytes but space, tab and line ends. nats-py ends its reading at one that is no
     text, so whoever may publish could silence a connection; such a message is dropped here.
@@ -40,6 +60,7 @@ class DirectParser(Parser):
         """Forget what was read of a connection that is gone."""
         super().reset()
         self._unread = bytearray()
+        self._skip = 0
 
     def hand_over(self, subscription: Subscription, sink: Callable[[Msg], None]) -> None:
         """Have ``sink`` called on the loop for each message; it returns at once."""
@@ -56,36 +77,66 @@ class DirectParser(Parser):
             nats.errors.ProtocolError: the server speaks another protocol.
         """
         unread = self._unread
-        unread += data
+        skipped = min(self._skip, len(data))
+        self._skip -= skipped
+        unread += data[skipped:] if skipped else data
         at = 0
         while (end := unread.find(CRLF, at)) >= 0:
             line = bytes(unread[at:end])
             words = line.split(b" ") if line.startswith((b"MSG ", b"HMSG ")) else line.split()
-            body = end + len(CRLF)
-            after = body
+            body = after = end + len(CRLF)
             if words and words[0] in (b"MSG", b"HMSG"):
-                if len(words) not in (4, 5, 6) or not words[-1].isdigit():
-                    raise nats.errors.ProtocolError
-                after = body + int(words[-1]) + len(CRLF)
-                if len(unread) < after:
+                size, headers = _lengths(words)
+                after += size + len(CRLF)
+                sink = self._sinks.get(words[2])
+                if too_long := size > MESSAGE_MAX if sink else size > LONG_MAX or headers > HEADERS_MAX:
+                    self._skip = max(after - len(unread), 0)
+                    after = min(after, len(unread))
+                elif len(unread) < after:
                     break
-            sink = self._sinks.get(words[2]) if words and words[0] == b"MSG" else None
-            if after > body and not _is_text(line):
-                logger.debug("a message was dropped, its subject is no text: %r", line[:200])
-            elif sink is not None:
-                reply = words[3].decode() if len(words) == 5 else ""
-                message = Msg(self._client, words[1].decode(), reply, bytes(unread[body : after - len(CRLF)]))
-                try:
-                    sink(message)
-                except Exception:
-                    # The messages behind this one must still be read.
-                    logger.exception("a message on %s was lost", message.subject)
+                if too_long or sink or not _is_text(line):
+                    self._take(sink, line, words, size if too_long else bytes(unread[body + headers : body + size]))
+                else:
+                    await super().parse(bytes(unread[at:after]))
             else:
                 await super().parse(bytes(unread[at:after]))
             at = after
             if self._unread is not unread:
                 return
         del unread[:at]
+
+    def _take(self, sink: Callable[[Msg], None] | None, line: bytes, words: list[bytes], payload: bytes | int) -> None:
+        """Hand a message over, unless its subject is no text or it has no sink."""
+        if sink is None or not _is_text(line):
+            logger.debug("a message was dropped, it is too long or its subject is no text: %r", line[:200])
+            return
+        reply = words[3].decode() if len(words) == (5 if words[0] == b"MSG" else 6) else ""
+        if isinstance(payload, int):
+            message: Msg = UnreadMsg(self._client, words[1].decode(), reply, length=payload)
+        else:
+            message = Msg(self._client, words[1].decode(), reply, payload)
+        try:
+            sink(message)
+        except Exception:
+            # The messages behind this one must still be read.
+            logger.exception("a message on %s was lost", message.subject)
+
+
+def _lengths(words: list[bytes]) -> tuple[int, int]:
+    """Return the bytes of a message, headers included, and those of its headers.
+
+    Raises:
+        nats.errors.ProtocolError: the line does not state them.
+    """
+    headed = words[0] == b"HMSG"
+    if len(words) - headed not in (4, 5) or not words[-1].isdigit():
+        raise nats.errors.ProtocolError
+    size = int(words[-1])
+    if not headed:
+        return size, 0
+    if not words[-2].isdigit() or int(words[-2]) > size:
+        raise nats.errors.ProtocolError
+    return size, int(words[-2])
 
 
 def _is_text(line: bytes) -> bool:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import math
+import json
+import uuid
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 from device_connect_edge.messaging.base import MessagingClient, Subscription
 from device_connect_edge.messaging.exceptions import PublishError, RequestTimeoutError
 
+from ...bounded_json import LONG_MAX, MESSAGE_MAX, SMALL_BYTES, refusal
 from ...errors import StrandsRobotsError
 from . import jsonrpc
 from .config import LinkConfig
@@ -26,6 +28,26 @@ class NoResponderError(StrandsRobotsError, RequestTimeoutError, PublishError):  
 
     The framework raises ``RequestTimeoutError`` for this over Zenoh and ``PublishError`` over NATS; this is both.
     """
+
+
+def _short_stop(size: int) -> bytes:
+    """Encode a stop for foreign handlers, in place of one of ``size`` bytes."""
+    params = {"event_id": uuid.uuid4().hex, "reason": f"an emergency stop of {size} bytes, which was not read"}
+    return json.dumps({"jsonrpc": "2.0", "method": "emergencyStop", "params": params}).encode()
+
+
+def too_long(reply: bytes | int) -> str:
+    """Return the reason why a reply is not given to who asked, or nothing.
+
+    Args:
+        reply: its bytes, or their number where there are too many.
+    """
+    why = f"it has {reply} bytes" if isinstance(reply, int) else refusal(reply, LONG_MAX)
+    return f"the reply is not read: {why}" if why else ""
+
+
+class UnreadableReplyError(StrandsRobotsError, PublishError):  # type: ignore[misc]  # untyped
+    """A reply came that is out of bounds, and was not parsed."""
 
 
 class ServedSubscription(Subscription):  # type: ignore[misc]  # the framework has no type information
@@ -119,10 +141,26 @@ class Backend(MessagingClient):  # type: ignore[misc]  # the framework has no ty
         feed = self._feed(subject, callback)
         return await self._consumed(subject, queue, feed, answers=not subscribe_only, with_subject=True)
 
-    def _feed(self, subject: str, callback: Callable[..., Awaitable[None]]) -> OrderedFeed:
+    async def subscribe_to_stops(
+        self, subject: str, callback: Callable[[bytes | int, str, str | None], Awaitable[None]]
+    ) -> Subscription:
+        """Have ``callback(data, subject, reply)`` called with emergency stops.
+
+        ``data`` is the number of bytes of a stop that is too long to be read.
+        """
+        feed = self._feed(subject, callback, lambda size: size)
+        return await self._consumed(subject, None, feed, answers=False, with_subject=True)
+
+    def _feed(
+        self,
+        subject: str,
+        callback: Callable[..., Awaitable[None]],
+        unread: Callable[[int], bytes | int | None] = _short_stop,
+    ) -> OrderedFeed:
+        if not subject.endswith("emergencyStop"):
+            return OrderedFeed(subject, callback, self._call_soon, longest=MESSAGE_MAX)
         # The e-stop listener has every stop by a link of its own; here a flood of them would take its computing time.
-        per_s = STOPS_PER_S if subject.endswith("emergencyStop") else math.inf
-        return OrderedFeed(subject, callback, self._call_soon, per_s)
+        return OrderedFeed(subject, callback, self._call_soon, per_s=STOPS_PER_S, longest=SMALL_BYTES, unread=unread)
 
     async def _serve(self, subject: str, queue: str | None, serve: Serve) -> Subscription:
         server = CommandServer(subject, serve, self._read, self._answer, self._call_soon)

@@ -21,6 +21,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Generator
 from functools import partial
 from typing import Any
 
+from ... import bounded_json
 from ...serving.rate_limiter import RateLimiter
 from . import jsonrpc
 
@@ -311,24 +312,47 @@ class OrderedFeed:
         handler: called with what ``accept`` was given.
         call_soon: has a function called on the feed's loop; ``accept`` may be called from the threads that it may.
         per_s: how many messages are taken in a second; those beyond are dropped at once.
+        longest: the longest message that is taken, in bytes.
+        unread: gives what the handler is called with in place of a message of so many bytes; None drops it.
     """
 
     def __init__(
-        self, subject: str, handler: Callable[..., Awaitable[None]], call_soon: CallSoon, per_s: float = math.inf
+        self,
+        subject: str,
+        handler: Callable[..., Awaitable[None]],
+        call_soon: CallSoon,
+        *,
+        per_s: float = math.inf,
+        longest: int = bounded_json.MESSAGE_MAX,
+        unread: Callable[[int], bytes | int | None] = lambda size: None,
     ) -> None:
         self._subject = subject
         self._handler = handler
+        self.longest = longest
+        self._unread = unread
         self._arrived = asyncio.Event()
         self._backlog = Backlog(partial(call_soon, self._arrived.set), MAX_EVENTS, MAX_WAITING_BYTES)
         self._limit = RateLimiter(per_s, burst=per_s) if per_s < math.inf else None
         self._log = Throttled(logger)
         self._task = asyncio.ensure_future(self._work())
 
-    def accept(self, *message: Any) -> None:
-        """Take a message, whose bytes come first, for the handler."""
+    def accept(self, data: bytes | int, *about: Any) -> None:
+        """Take a message for the handler, with what is known about it.
+
+        Args:
+            data: its bytes, or their number where there are more than :attr:`longest`.
+            about: further arguments of the handler.
+        """
         if self._limit is not None and not self._limit.admit():
             self._log.warning("too many messages on %s; dropped the latest", self._subject)
-        elif self._backlog.push(message, len(message[0])):
+            return
+        # A handler may parse it whatever it is, and that holds the interpreter.
+        size = data if isinstance(data, int) else len(data)
+        why = f"it has {size} bytes" if isinstance(data, int) else bounded_json.refusal(data, self.longest)
+        taken = self._unread(size) if why else data
+        if taken is None:
+            self._log.warning("refused a message on %s: %s", self._subject, why)
+        elif self._backlog.push((taken, *about), 0 if why else size):
             self._log.warning("the handler of %s does not keep up; dropped the oldest messages", self._subject)
 
     async def close(self) -> None:

@@ -5,12 +5,14 @@ Codes are those of the JSON-RPC 2.0 specification, section 5.1; -32000 to -32099
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
-from ...utils import json_object, shown
+from ...bounded_json import MESSAGE_MAX, SMALL_BYTES, OutOfBoundsError, json_object, parsed
+from ...utils import shown
 
 PARSE_ERROR = -32700
 INVALID_REQUEST = -32600
@@ -20,11 +22,8 @@ INTERNAL_ERROR = -32603
 FUNCTION_FAILED = -32000
 BUSY = -32001
 
-MAX_COMMAND_BYTES = 2**20
-"""Largest command that is read, in bytes: what a NATS server accepts by default, parsed in some 10 ms."""
-
-MAX_DEPTH = 64
-"""Deepest nesting of a command; no robot's argument comes near."""
+MAX_COMMAND_BYTES = MESSAGE_MAX
+"""Largest command that is read, in bytes."""
 
 # The framework hands params to ``invoke(function_name, **params)``; these would collide with its own arguments.
 _TAKEN = ("self", "function_name")
@@ -90,13 +89,13 @@ def check(data: bytes) -> RpcRequest | Refusal:
     if len(data) > MAX_COMMAND_BYTES:
         return too_large(len(data))
     try:
-        request = _DECODER.decode(data.decode())
-    except (ValueError, RecursionError) as problem:
-        return Refusal(PARSE_ERROR, f"no JSON: {_short(problem)}")
+        request = parsed(data, MAX_COMMAND_BYTES, _parse)
+    except OutOfBoundsError as problem:
+        return Refusal(INVALID_REQUEST, f"a command cannot be read: {problem}")
+    except ValueError as problem:
+        return Refusal(PARSE_ERROR, f"no JSON: {str(problem)[:120]}")
     if not isinstance(request, dict):
         return Refusal(INVALID_REQUEST, f"a command is a JSON object, not {_kind(request)}")
-    if data.count(b"[") + data.count(b"{") > MAX_DEPTH and _deeper_than(request, MAX_DEPTH):
-        return Refusal(INVALID_REQUEST, f"nested deeper than {MAX_DEPTH}")
     return _check_request(request, data)
 
 
@@ -118,6 +117,13 @@ def valid_json(data: bytes) -> bool:
 
 def _id_of(data: bytes) -> RpcId:
     """The id of an encoded reply, as far as it is readable."""
+    # It stands before the result, and no result of any size is parsed for it.
+    at = data.find(_ID, 0, SMALL_BYTES)
+    if at >= 0 and len(data) > SMALL_BYTES:
+        with contextlib.suppress(ValueError, RecursionError):
+            text = data[at + len(_ID) : at + SMALL_BYTES].decode(errors="ignore")
+            rpc_id, _ = _DECODER.raw_decode(text.lstrip())
+            return rpc_id if isinstance(rpc_id, _SCALARS) else None
     rpc_id = json_object(data).get("id")
     return rpc_id if isinstance(rpc_id, _SCALARS) else None
 
@@ -158,32 +164,18 @@ def _params_problem(params: object) -> str:
     return ""
 
 
-def _deeper_than(value: object, limit: int) -> bool:
-    """Return True when ``value`` nests deeper; uses no stack."""
-    level: list[object] = [value]
-    for _ in range(limit):
-        level = [
-            child
-            for node in level
-            for child in (node.values() if isinstance(node, dict) else node if isinstance(node, list) else ())
-            if isinstance(child, dict | list)
-        ]
-        if not level:
-            return False
-    return True
-
-
 def _kind(value: object) -> str:
     names = {dict: "an object", list: "an array", str: "a string", bool: "a boolean", type(None): "null"}
     return names.get(type(value), "a number")
-
-
-def _short(problem: BaseException) -> str:
-    return "nested too deep" if isinstance(problem, RecursionError) else str(problem)[:120]
 
 
 def _no_constant(token: str) -> NoReturn:
     raise ValueError(f"{token} is no JSON number")
 
 
+def _parse(data: bytes) -> Any:
+    return _DECODER.decode(data.decode())
+
+
 _DECODER = json.JSONDecoder(parse_constant=_no_constant)
+_ID = b'"id":'

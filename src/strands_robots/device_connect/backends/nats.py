@@ -18,7 +18,8 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from . import jsonrpc
-from .base import Backend, NoResponderError, Undo
+from ._compat import payload_of
+from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
 from .dispatch import REPLY_SUBJECT, CommandServer, OrderedFeed
 from .nats_connection import NatsConnection, connection_for
@@ -85,6 +86,7 @@ class NatsBackend(Backend):
             NoResponderError: no device serves ``subject``.
             RequestTimeoutError: a device does, but gave no reply within ``timeout`` seconds.
             PublishError: the server would refuse the request.
+            UnreadableReplyError: the reply is out of bounds.
             NotConnectedError: no server at this moment.
         """
         client = self._connected
@@ -96,13 +98,17 @@ class NatsBackend(Backend):
             raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
         except nats.errors.Error as error:
             raise PublishError(f"cannot ask {subject}: {error}") from error
+        why = too_long(answer.data)
+        if why:
+            raise UnreadableReplyError(f"{subject}: {why}")
         payload: bytes = answer.data
         return payload
 
-    async def listen(self, subject: str, sink: Callable[[bytes, str], None]) -> None:
+    async def listen(self, subject: str, sink: Callable[[bytes | int, str], None]) -> None:
         """Have ``sink(data, subject)`` called on the loop as each message arrives.
 
-        It lasts until ``close``, and ``sink`` returns at once. Unlike ``subscribe`` it keeps no backlog.
+        ``data`` is the number of its bytes where there are too many to be read. It lasts until ``close``, and ``sink``
+        returns at once. Unlike ``subscribe`` it keeps no backlog.
 
         Raises:
             NotConnectedError: not connected.
@@ -110,7 +116,7 @@ class NatsBackend(Backend):
         """
 
         def take(message: Msg) -> None:
-            sink(message.data, message.subject)
+            sink(payload_of(message), message.subject)
 
         self._listening.append(await self._subscribed(subject, "", take))
 
@@ -169,7 +175,7 @@ class NatsBackend(Backend):
                 consumer.receive(message)
             else:
                 matched = (message.subject,) if with_subject else ()
-                consumer.accept(message.data, *matched, message.reply or None)
+                consumer.accept(payload_of(message), *matched, message.reply or None)
 
         return await self._subscribed(subject, queue or "", feed)
 
@@ -184,7 +190,7 @@ class NatsBackend(Backend):
 
     @staticmethod
     def _read(message: Msg) -> tuple[bytes | int, str | None]:
-        return message.data, message.reply or None
+        return payload_of(message), message.reply or None
 
     async def _answer(self, reply: str, data: bytes) -> None:
         with contextlib.suppress(PublishError, NotConnectedError):  # the caller is out of reach

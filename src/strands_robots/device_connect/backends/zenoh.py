@@ -23,9 +23,10 @@ from device_connect_edge.messaging.exceptions import (
     SubscribeError,
 )
 
+from ...bounded_json import LONG_MAX, SMALL_BYTES
 from ...utils import redacted
 from . import jsonrpc, zenoh_session
-from .base import Backend, NoResponderError, Undo
+from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
 from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
 
@@ -156,6 +157,7 @@ class ZenohBackend(Backend):
 
         Raises:
             PublishError: the subject is malformed, or the other side refused.
+            UnreadableReplyError: the reply is out of bounds.
         """
         session, loop, wait_s = self._connected().session, asyncio.get_running_loop(), max(within, 0.001)
         request, key = _Request(loop, self._outcomes), key_of(subject)
@@ -179,6 +181,8 @@ class ZenohBackend(Backend):
             return answer
         if request.failure == "Timeout":
             raise RequestTimeoutError(f"no reply on {key} in time")
+        if request.unread:
+            raise UnreadableReplyError(f"{key}: {request.unread}")
         if request.failure:
             raise PublishError(f"{key} refused: {request.failure}")
         raise NoResponderError(f"no device answers on {subject}")
@@ -266,23 +270,20 @@ class ZenohBackend(Backend):
     def _on_message(feed: OrderedFeed, with_subject: bool, sample: Any) -> None:
         """Take a put. On Zenoh's thread."""
         key = (str(sample.key_expr),) if with_subject else ()
-        feed.accept(sample.payload.to_bytes(), *key, None)
+        feed.accept(_payload(sample, feed.longest), *key, None)
 
     def _on_question(self, feed: OrderedFeed, with_subject: bool, query: Any) -> None:
         """Take a query that is no command. On Zenoh's thread."""
-        if self._replies.full:
+        data = _payload(query, feed.longest)
+        if self._replies.full or isinstance(data, int):
             query.drop()
             return
         key = (str(query.key_expr),) if with_subject else ()
-        data = b"" if query.payload is None else query.payload.to_bytes()
         feed.accept(data, *key, self._replies.expect(partial(self._answer, query), REPLY_TTL_S))
 
     @staticmethod
     def _read(message: Any) -> tuple[bytes | int, Any]:
-        payload = message.payload
-        size = 0 if payload is None else len(payload)
-        data = size if size > jsonrpc.MAX_COMMAND_BYTES else payload.to_bytes() if size else b""
-        return data, message if isinstance(message, zenoh.Query) else None
+        return _payload(message, jsonrpc.MAX_COMMAND_BYTES), message if isinstance(message, zenoh.Query) else None
 
     def _answer(self, reply: Any, data: bytes) -> Awaitable[None] | None:
         if len(data) < LARGE_BYTES:
@@ -317,11 +318,11 @@ class ZenohBackend(Backend):
 class _Request:
     """A pending query: replies come on Zenoh's thread, its future is settled once."""
 
-    __slots__ = ("_outcomes", "answered", "failure", "future")
+    __slots__ = ("_outcomes", "answered", "failure", "future", "unread")
 
     def __init__(self, loop: asyncio.AbstractEventLoop, outcomes: Backlog) -> None:
         self._outcomes = outcomes
-        self.failure = ""
+        self.failure = self.unread = ""
         self.future: asyncio.Future[bytes | None] = loop.create_future()
         self.answered = False
 
@@ -329,10 +330,12 @@ class _Request:
         """Take a reply. On Zenoh's thread."""
         ok = reply.ok
         if ok is None:
-            self.failure = reply.err.payload.to_bytes()[:200].decode(errors="replace")
+            why = _payload(reply.err, SMALL_BYTES)
+            self.failure = "a long error" if isinstance(why, int) else why[:200].decode(errors="replace")
         elif not self.answered:
-            self.answered = True
-            self._outcomes.offer((self, ok.payload.to_bytes()))
+            data = _payload(ok, LONG_MAX)
+            self.unread, self.answered = too_long(data), True
+            self._outcomes.offer((self, None if self.unread else data))
 
     def on_end(self) -> None:
         """Settle a request that ended without a reply. On Zenoh's thread."""
@@ -349,6 +352,13 @@ class _Request:
         """Set the outcome, unless there is one. On the loop."""
         if not self.future.done():
             self.future.set_result(value)
+
+
+def _payload(message: Any, longest: int) -> bytes | int:
+    """Return the bytes of a message, or their number where there are more."""
+    size = 0 if message.payload is None else len(message.payload)
+    data: bytes = message.payload.to_bytes() if 0 < size <= longest else b""
+    return size if size > longest else data
 
 
 def _reply_to(query: Any, data: bytes) -> None:

@@ -12,9 +12,11 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+from strands_robots.bounded_json import SMALL_BYTES, json_object
 from strands_robots.drivers.reachy.links import (
     APP_LOCK_SINCE,
     DEFAULT_PREFIX,
+    OUT_TOPICS,
     TRANSPORTS,
     ZENOH_PORT,
     DaemonInfo,
@@ -26,7 +28,7 @@ from strands_robots.drivers.reachy.links import (
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
 from strands_robots.drivers.reachy.target import HeadPose
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.utils import ValidationError, choice, json_object, port
+from strands_robots.utils import ValidationError, choice, port
 
 logger = stop_logger(__name__)
 
@@ -90,7 +92,8 @@ class Feed:
         """Store one message; a joint frame that cannot be decoded is dropped."""
         now = time.monotonic()
         if kind != "joint_positions":
-            self._raw[kind] = (payload, now)
+            if kind in OUT_TOPICS and len(payload) <= SMALL_BYTES:
+                self._raw[kind] = (payload, now)
             return
         joints = _joints(payload, now)
         with self._news:
@@ -166,11 +169,11 @@ class Feed:
         payload, at = self._raw.get(kind, ("", -math.inf))
         if time.monotonic() - at > within_s or not payload:
             return None
-        return json_object(payload) or None
+        return json_object(payload, SMALL_BYTES) or None
 
 
 def _joints(payload: str | bytes, at: float) -> JointSample | None:
-    message = json_object(payload)
+    message = json_object(payload, SMALL_BYTES)
     head = _numbers(message.get("head_joint_positions"), 7)
     antennas = _numbers(message.get("antennas_joint_positions"), 2)
     return JointSample(head, (antennas[0], antennas[1]), at) if head and antennas else None

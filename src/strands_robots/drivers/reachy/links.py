@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
+from strands_robots.bounded_json import SMALL_BYTES, json_object
 from strands_robots.drivers.reachy.rest import (
     CONNECT_S,
     DaemonFaultError,
@@ -28,7 +29,7 @@ from strands_robots.drivers.reachy.rest import (
 )
 from strands_robots.drivers.reachy.target import Target
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.utils import ValidationError, identifier, json_object, missing_extra, shown
+from strands_robots.utils import ValidationError, identifier, missing_extra, shown
 
 logger = stop_logger(__name__)
 
@@ -160,7 +161,7 @@ def _kind(frame: str | bytes) -> str:
         return ""
     if frame.startswith('{"type":"'):
         return frame[9 : frame.find('"', 9)]
-    return str(json_object(frame).get("type", ""))
+    return str(json_object(frame, SMALL_BYTES).get("type", ""))
 
 
 class PubSub(Protocol):
@@ -289,7 +290,11 @@ class ClientSession:
         self._zenoh_error = zenoh.ZError
 
     def subscribe(self, key: str, on_payload: Callable[[bytes], None], /) -> Callable[[], None]:
-        subscriber = self._session.declare_subscriber(key, lambda sample: on_payload(sample.payload.to_bytes()))
+        def deliver(sample: Any) -> None:
+            if len(sample.payload) <= SMALL_BYTES:
+                on_payload(sample.payload.to_bytes())
+
+        subscriber = self._session.declare_subscriber(key, deliver)
 
         def unsubscribe() -> None:
             # A session that has ended has dropped its subscribers with it.

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots import settings
+from strands_robots.bounded_json import SMALL_BYTES, json_object
 from strands_robots.contract import RolloutEvent
 from strands_robots.drivers.reachy.connection import RUNNING_PATH, Connection, running_moves
 from strands_robots.drivers.reachy.links import open_socket
@@ -26,7 +27,7 @@ from strands_robots.envelope import error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
 from strands_robots.safety.stopping import StopVerdict, halt_each
-from strands_robots.utils import ValidationError, json_object
+from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
 
@@ -144,7 +145,7 @@ class MoveUpdates:
         deadline = time.monotonic() + within_s
         while (left := deadline - time.monotonic()) > 0:
             try:
-                update = json_object(self._socket.recv(left))
+                update = json_object(self._socket.recv(left), SMALL_BYTES)
             except TimeoutError:
                 return None
             except Exception as exc:

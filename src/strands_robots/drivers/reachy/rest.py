@@ -7,12 +7,12 @@ authentication: every client that reaches its port controls the motors.
 from __future__ import annotations
 
 import ipaddress
-import json
 import socket
 import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.bounded_json import MESSAGE_MAX, OutOfBoundsError, json_object, parsed
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, choice, dial_host_error, missing_extra, number, port, shown
 
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 CONNECT_S = 2.0
 READ_S = 5.0
+
+DETAIL_MAX = 1000
+
+ANSWER_MAX = MESSAGE_MAX
+"""Longest answer that is read, in bytes; the longest list of a daemon has some kilobytes."""
+
 METHODS = ("GET", "POST", "PUT", "DELETE")
 
 
@@ -132,8 +138,9 @@ class RestClient:
         pool = self._enter()
         try:
             limit = pool.client.timeout if within_s is None else max(0.01, within_s)
-            answer = pool.client.request(method, path, json=body, timeout=limit)
-            if answer.status_code >= 500:
+            with pool.client.stream(method, path, json=body, timeout=limit) as answer:
+                content = _content(answer)
+            if answer.status_code >= 500 or content is None:
                 # After a 500 the daemon resets the kept-alive connection under the next request.
                 self._retire(pool)
         except (httpx.HTTPError, httpx.InvalidURL, OSError) as exc:
@@ -142,13 +149,17 @@ class RestClient:
             raise DaemonUnreachableError(f"{self.host}:{self.port} did not answer {method} {path}: {reason}.") from exc
         finally:
             self._leave(pool)
+        status: int = answer.status_code
+        if content is None:
+            raise DaemonFaultError(f"{method} {path}: the answer is longer than {ANSWER_MAX} bytes.", status)
         if not answer.is_success:
-            kind = _KINDS.get(answer.status_code, DaemonFaultError)
-            raise kind(f"{method} {path}: {_detail(answer)}", answer.status_code)
+            raise _KINDS.get(status, DaemonFaultError)(f"{method} {path}: {_detail(status, content)}", status)
         try:
-            return answer.json()
+            return parsed(content, ANSWER_MAX)
+        except OutOfBoundsError as exc:
+            raise DaemonFaultError(f"{method} {path}: the answer cannot be read: {exc}.", status) from exc
         except ValueError as exc:
-            raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
+            raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", status) from exc
 
     def close(self) -> None:
         """Close the connections, each after its requests; a request opens new ones."""
@@ -165,6 +176,7 @@ class RestClient:
                     httpx.Client(
                         base_url=f"http://{url_host(self.host)}:{self.port}",
                         timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
+                        headers={"Accept-Encoding": "identity"},
                         # A robot is on the local network: a proxy of the environment is not asked.
                         trust_env=False,
                     )
@@ -236,13 +248,22 @@ def _httpx() -> Any:
     return httpx
 
 
-def _detail(answer: httpx.Response) -> str:
+def _content(answer: httpx.Response) -> bytes | None:
+    """Return the body of an answer, or None where it is too long to be read."""
+    content = bytearray()
+    # As sent: a few packed bytes could become any number.
+    for chunk in answer.iter_raw():
+        content += chunk
+        if len(content) > ANSWER_MAX:
+            return None
+    return bytes(content)
+
+
+def _detail(status: int, content: bytes) -> str:
     """Return the daemon's ``detail``, the first of a validation list, or the body."""
-    try:
-        detail = json.loads(answer.text).get("detail")
-    except (ValueError, AttributeError):
-        detail = answer.text
+    text = content[:DETAIL_MAX].decode(errors="replace")
+    detail: Any = json_object(content, ANSWER_MAX).get("detail", text) if content[:1] == b"{" else text
     if isinstance(detail, list) and detail and isinstance(detail[0], dict):
         location = ".".join(str(part) for part in detail[0].get("loc", ()))
         detail = f"{location}: {detail[0].get('msg', '')}"
-    return f"{answer.status_code} {detail if isinstance(detail, str) else shown(detail)}"
+    return f"{status} {detail[:DETAIL_MAX] if isinstance(detail, str) else shown(detail)}"

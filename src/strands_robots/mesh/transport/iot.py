@@ -327,6 +327,9 @@ class IotMqttTransport(Transport):
     def _received(self, data: Any) -> None:
         packet = data.publish_packet
         key = packet.topic
+        if len(packet.payload or b"") > topics.topic_of(key).max_bytes:
+            logger.debug("%s: a message of %d bytes was dropped unread.", key, len(packet.payload))
+            return
         sample = Sample(key, bytes(packet.payload or b""), None, sessionless=True, retained=bool(packet.retain))
         with self._lock:
             matching = [each for each in self._subscribers if topics.matches(each.key, key)]

@@ -144,10 +144,13 @@ class ZenohTransport(Transport):
         def deliver(sample: Any) -> None:
             if sample.kind != self._zenoh.SampleKind.PUT:
                 return
-            source = sample.source_info
+            source, name = sample.source_info, str(sample.key_expr)
             session = str(source.source_id.zid) if source is not None else None
             try:
-                callback(Sample(str(sample.key_expr), sample.payload.to_bytes(), session))
+                if len(sample.payload) > topics.topic_of(name).max_bytes:
+                    logger.debug("%s: a message of %d bytes was dropped unread.", name, len(sample.payload))
+                    return
+                callback(Sample(name, sample.payload.to_bytes(), session))
             except Exception:
                 logger.exception("A subscriber of %s failed.", key)
 
