@@ -33,6 +33,9 @@ logger = stop_logger(__name__)
 FRESH_S = 1.5
 """Oldest sample that still counts, in seconds: joints come at 37 to 50 Hz."""
 
+STOP_ANSWER_MAX_BYTES = 2**16
+"""Longest answer to a stop, or list of running moves: a thousand moves."""
+
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.1, 1.0
 WATCH_EVERY_S, POLL_EVERY_S = 0.1, 1.0
 STATUS_LAG_S = 1.5
@@ -207,7 +210,7 @@ class Connection:
         zenoh_port: int = ZENOH_PORT,
     ) -> None:
         self.rest = RestClient(host, api_port)
-        self.stop_rest = RestClient(host, api_port)
+        self.stop_rest = RestClient(host, api_port, longest=STOP_ANSWER_MAX_BYTES)
         self.hub_rest = RestClient(host, api_port, read_s=10.0)
         self.host, self.port = self.rest.host, self.rest.port
         self._prefix = key_prefix(prefix)

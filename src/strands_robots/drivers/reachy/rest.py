@@ -10,6 +10,7 @@ import ipaddress
 import json
 import socket
 import threading
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 CONNECT_S = 2.0
 READ_S = 5.0
+ANSWER_MAX_BYTES = 8 * 2**20
+"""Longest answer that is read; a longer one is a fault of the daemon."""
+DETAIL_MAX = 500
 METHODS = ("GET", "POST", "PUT", "DELETE")
 
 
@@ -102,15 +106,18 @@ class RestClient:
         host: bare hostname or IP literal.
         api_port: TCP port of the daemon.
         read_s: seconds to wait for an answer.
+        longest: bytes of an answer beyond which it is not read.
 
     Raises:
         ValidationError: a host or port that cannot be dialled.
     """
 
-    def __init__(self, host: str, api_port: int = 8000, *, read_s: float = READ_S) -> None:
+    def __init__(
+        self, host: str, api_port: int = 8000, *, read_s: float = READ_S, longest: int = ANSWER_MAX_BYTES
+    ) -> None:
         self.host = checked_host(host)
         self.port = port("api_port", api_port)
-        self._read_s = read_s
+        self._read_s, self._longest = read_s, longest
         self._lock = threading.Lock()
         self._pool: _Pool | None = None
 
@@ -132,7 +139,15 @@ class RestClient:
         pool = self._enter()
         try:
             limit = pool.client.timeout if within_s is None else max(0.01, within_s)
-            answer = pool.client.request(method, path, json=body, timeout=limit)
+            began = time.monotonic()
+            with pool.client.stream(method, path, json=body, timeout=limit) as answer:
+                text = bytearray()
+                for part in answer.iter_raw():
+                    text += part
+                    if len(text) > self._longest:
+                        raise httpx.ReadError(f"the answer is longer than {self._longest} bytes")
+                    if within_s is not None and time.monotonic() - began > within_s:
+                        raise httpx.ReadTimeout("the answer did not end in time")
             if answer.status_code >= 500:
                 # After a 500 the daemon resets the kept-alive connection under the next request.
                 self._retire(pool)
@@ -144,10 +159,10 @@ class RestClient:
             self._leave(pool)
         if not answer.is_success:
             kind = _KINDS.get(answer.status_code, DaemonFaultError)
-            raise kind(f"{method} {path}: {_detail(answer)}", answer.status_code)
+            raise kind(f"{method} {path}: {_detail(answer.status_code, text)}", answer.status_code)
         try:
-            return answer.json()
-        except ValueError as exc:
+            return json.loads(text)
+        except (ValueError, RecursionError) as exc:
             raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
 
     def close(self) -> None:
@@ -159,18 +174,26 @@ class RestClient:
 
     def _enter(self) -> _Pool:
         with self._lock:
+            if self._pool is not None:
+                self._pool.users += 1
+                return self._pool
+        # Not under the lock: a name server that hangs would hold up the request behind this one.
+        httpx = _httpx()
+        fresh = _Pool(
+            httpx.Client(
+                base_url=f"http://{url_host(self.host)}:{self.port}",
+                timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
+                # An answer is read up to its bound, which nothing that was compressed keeps.
+                headers={"Accept-Encoding": "identity"},
+                # A robot is on the local network: a proxy of the environment is not asked.
+                trust_env=False,
+            ),
+            users=1,
+        )
+        with self._lock:
             if self._pool is None:
-                httpx = _httpx()
-                self._pool = _Pool(
-                    httpx.Client(
-                        base_url=f"http://{url_host(self.host)}:{self.port}",
-                        timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
-                        # A robot is on the local network: a proxy of the environment is not asked.
-                        trust_env=False,
-                    )
-                )
-            self._pool.users += 1
-            return self._pool
+                self._pool = fresh
+        return fresh
 
     def _retire(self, pool: _Pool) -> None:
         with self._lock:
@@ -236,13 +259,14 @@ def _httpx() -> Any:
     return httpx
 
 
-def _detail(answer: httpx.Response) -> str:
+def _detail(status: int, body: bytearray) -> str:
     """Return the daemon's ``detail``, the first of a validation list, or the body."""
+    text = body.decode(errors="replace")
     try:
-        detail = json.loads(answer.text).get("detail")
-    except (ValueError, AttributeError):
-        detail = answer.text
+        detail = json.loads(text).get("detail")
+    except (ValueError, AttributeError, RecursionError):
+        detail = text
     if isinstance(detail, list) and detail and isinstance(detail[0], dict):
         location = ".".join(str(part) for part in detail[0].get("loc", ()))
         detail = f"{location}: {detail[0].get('msg', '')}"
-    return f"{answer.status_code} {detail if isinstance(detail, str) else shown(detail)}"
+    return f"{status} {detail[:DETAIL_MAX] if isinstance(detail, str) else shown(detail)}"
