@@ -61,7 +61,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     Args:
         device: has ``observation_features``, ``action_features``, ``get_observation``, ``send_action``, ``connect``,
-            ``disconnect``, and may have ``is_connected``, ``joint_ranges``, ``get_joints`` and ``hold``.
+            ``disconnect``, and may have ``is_connected``, ``joint_ranges``, ``get_joints``, ``hold``, and
+            ``holds_unconnected``, true where ``hold`` needs no connection.
         tool_name: what the robot is called on a network, 1 to 128 characters.
         control_hz: control rate, 1 to 2000; ``STRANDS_CONTROL_HZ`` by default.
         joint_ranges: lowest and highest target by action key, in the device's unit; what is not named is asked of
@@ -464,7 +465,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         """
         self.wait_settled()
         verdict = self.halt("cleanup")
-        if not verdict.stopped:
+        if not verdict.stopped and (self._body.is_connected or self._body.driven or self._body.lost):
             return verdict.envelope()
         unsettled = self.wait_settled()
         if self._settling is not None and self._settling.state == "failed":
@@ -480,6 +481,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             except Exception as exc:
                 logger.exception("%s did not disconnect.", self.tool_name_str)
                 return error(f"Halted, but the device did not disconnect: {type(exc).__name__}: {exc}")
+        if not verdict.stopped:
+            return success("It was not connected; whether it moves is not known.", stopped=None)
         return success("Halted and disconnected.", stopped=True)
 
     def _stand_by(self) -> None:

@@ -212,6 +212,9 @@ class ReachyDriver:
         ValidationError: an argument outside its domain.
     """
 
+    holds_unconnected = True
+    """:meth:`hold` reaches the daemon without the link that frames need."""
+
     name = "reachy_mini"
     tool_name_str = "reachy_mini"
     device_type = "reachy_mini"

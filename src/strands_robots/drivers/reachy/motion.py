@@ -505,9 +505,9 @@ class MotionController:
         return success("no frame is sent any more", stopped=True) if streaming else None
 
     def _stop_moves(self, motion: ReachyMotion | None, deadline: float) -> object:
-        """Stop every running move and list again, on the thread of a round; None when there was none.
+        """Stop every running move and list again; None when there was none.
 
-        The daemon is asked although it was never linked: other clients move it as well.
+        On the thread of a round. The daemon is asked although it was never linked: other clients move it as well.
         """
         if motion is not None and motion.of_daemon:
             motion.posted.wait(max(0.0, deadline - time.monotonic()))

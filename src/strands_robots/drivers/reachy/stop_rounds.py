@@ -1,4 +1,4 @@
-"""Stops of moves that only the daemon can stop: each is sent at once, within bounds.
+"""Stops of moves that only the daemon can end: sent at once, within bounds.
 
 A daemon may hang, so its answer is waited for on a thread of the round, never on that of the halt. A second stop is
 sent beside the first one, which may wait for ever.
@@ -82,7 +82,7 @@ class StopRounds(Generic[T]):
         self._ordered(about, within)
 
     def claim(self, about: T, within: float) -> StopRound[T]:
-        """Return the round that was ordered last and goes on, else a new one with ``within`` seconds."""
+        """Return the round that was ordered last and goes on, else a new one."""
         with self._changing:
             latest, self._unclaimed = self._unclaimed, None
         if latest is not None and not latest.answer.done():
