@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from strands_robots import settings
 from strands_robots.arm_mixin import ArmMixin, motion_rollout
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import queue_safety_event
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
@@ -430,7 +430,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             choice("motor_ids", motor, self._body.motors)
         verdict = stop_executor().halt(_TorqueRelease(self, ",".join(asked)), self.tool_name_str, "releaseTorque")
         answer = {**verdict.envelope(), "released": list(self._body.limp_motors)}
-        log_safety_event(
+        queue_safety_event(
             "torque_released", self.tool_name_str, {"motors": answer["released"], "stopped": verdict.stopped}
         )
         if is_error(answer):

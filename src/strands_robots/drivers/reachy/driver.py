@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import queue_safety_event
 from strands_robots.contract import AT_REST, Observer, Unsubscribe
 from strands_robots.drivers.reachy.connection import FRESH_S, Connection
 from strands_robots.drivers.reachy.links import (
@@ -452,7 +452,7 @@ class ReachyDriver:
             self.motors.release(names=names)
         except Exception as exc:  # noqa: BLE001 - as in halt
             return error(f"{verdict['content'][0]['text']} Torque was not released: {exc}", **fields, released=[])
-        log_safety_event("torque_released", self.tool_name_str, {"motors": list(names) or "all"})
+        queue_safety_event("torque_released", self.tool_name_str, {"motors": list(names) or "all"})
         released = list(names or MOTOR_IDS)
         text = f"Torque is off: {', '.join(names) or 'all motors'}."
         if verdict["status"] == "error":
