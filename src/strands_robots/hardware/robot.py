@@ -39,6 +39,7 @@ from strands_robots.safety.gate import (
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
+from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
@@ -363,6 +364,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
     def halt_ordered(self) -> None:
         """Note what moves; a loop whose permit is void counts as halted."""
         self._moved.update(dict.fromkeys(self._moving()))
+        # A device that asks a daemon to stop does so at once, though a halt before this one still waits for it.
+        note_motion(self.device)
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Halt on the stop executor's thread, unless the bus blocks; wait for no loop."""

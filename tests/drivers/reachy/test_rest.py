@@ -90,6 +90,13 @@ def test_body_that_is_no_json_is_a_fault() -> None:
         RestClient("127.0.0.1").get("/x")
 
 
+@respx.mock
+def test_body_beyond_the_bound_is_not_read() -> None:
+    respx.get(f"{HERE}/x").mock(return_value=httpx.Response(200, content=b"[" + b"1," * 100 + b"1]"))
+    with pytest.raises(DaemonUnreachableError, match="longer than 100 bytes"):
+        RestClient("127.0.0.1", longest=100).get("/x")
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1/foo", "", "a b", "http://x", "x:80", None, "robot@evil"])
 def test_invalid_host_is_refused(host: Any) -> None:
     with pytest.raises(ValidationError, match="host"):

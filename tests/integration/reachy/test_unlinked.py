@@ -102,12 +102,15 @@ def test_a_move_that_the_daemon_lists_and_does_not_stop_did_not_stop() -> None:
 
 
 @pytest.mark.usefixtures("patient_halts")
-def test_each_of_three_stops_is_sent_while_the_daemon_hangs_at_those_before_it() -> None:
+@pytest.mark.parametrize("robot_of", [lambda reachy: reachy, HardwareRobot], ids=["a head", "a device"])
+def test_each_of_three_stops_is_sent_while_the_daemon_hangs_at_those_before_it(
+    robot_of: Callable[[ReachyDriver], ReachyDriver | HardwareRobot],
+) -> None:
     with BrokenDaemon("hangs") as broken:
-        reachy = unlinked(broken.port)
+        robot = robot_of(unlinked(broken.port))
         stops: list[Future[StopVerdict]] = []
         for number in range(3):
-            stops.append(stop_executor().submit(reachy, "head", "test"))
+            stops.append(stop_executor().submit(robot, "head", "test"))
             eventually(lambda sent=number: len(broken.arrivals) > sent, what="the daemon has the stop")
             time.sleep(0.05)  # later than one stop that is ordered twice
         assert not any(stop.done() for stop in stops), "each was sent although none before it was answered"

@@ -15,6 +15,7 @@ from typing import Any
 from strands_robots.drivers.reachy.links import (
     APP_LOCK_SINCE,
     DEFAULT_PREFIX,
+    FRAME_MAX_BYTES,
     TRANSPORTS,
     ZENOH_PORT,
     DaemonInfo,
@@ -42,6 +43,7 @@ STATUS_LAG_S = 1.5
 STATUS_PATH, RUNNING_PATH = "/api/daemon/status", "/api/move/running"
 LOCK_PATH, APP_PATH = "/api/daemon/robot-app-lock-status", "/api/apps/current-app-status"
 
+STORED_KINDS = frozenset({"head_pose", "imu_data", "daemon_status"})
 HEAD_JOINTS = ("body_yaw", "stewart_1", "stewart_2", "stewart_3", "stewart_4", "stewart_5", "stewart_6")
 
 
@@ -90,10 +92,17 @@ class Feed:
         self.unusable_frames = 0
 
     def take(self, kind: str, payload: str | bytes) -> None:
-        """Store one message; a joint frame that cannot be decoded is dropped."""
+        """Store one message; a joint frame that cannot be decoded is dropped.
+
+        So is any message beyond :data:`FRAME_MAX_BYTES`, which is not parsed.
+        """
         now = time.monotonic()
+        if len(payload) > FRAME_MAX_BYTES:
+            self.unusable_frames += 1
+            return
         if kind != "joint_positions":
-            self._raw[kind] = (payload, now)
+            if kind in STORED_KINDS:
+                self._raw[kind] = (payload, now)
             return
         joints = _joints(payload, now)
         with self._news:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 CONNECT_S = 2.0
 READ_S = 5.0
-ANSWER_MAX_BYTES = 8 * 2**20
+ANSWER_MAX_BYTES = 2**19
 """Longest answer that is read; a longer one is a fault of the daemon."""
 DETAIL_MAX = 500
 METHODS = ("GET", "POST", "PUT", "DELETE")
