@@ -25,6 +25,7 @@ from strands_robots.drivers.reachy.links import (
     make_link,
 )
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
+from strands_robots.drivers.reachy.stop_rounds import prepare
 from strands_robots.drivers.reachy.target import HeadPose
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, choice, json_object, port
@@ -244,6 +245,7 @@ class Connection:
         if self._thread is not None:
             return
         self._stopping.clear()
+        prepare()
         self._thread = threading.Thread(target=self._run, name="reachy-watch", daemon=True)
         self._thread.start()
 
