@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import logging
 import queue
 import stat
 import threading
@@ -29,9 +28,10 @@ from strands_robots.audit.journal import NAME, AuditEntry, Journal, storable
 from strands_robots.audit.lasting import LastingRecords, identity, lasting_journal, rotated_out, verify_both
 from strands_robots.audit.witness import WITNESS, compare, stated_head, witnessed
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 PENDING_MAX = 10_000
 QUEUED_MAX = 2 * PENDING_MAX

@@ -12,7 +12,6 @@ import contextlib
 import fcntl
 import hashlib
 import json
-import logging
 import os
 import random
 import stat
@@ -39,9 +38,10 @@ from strands_robots.audit.head import (
     write_head,
 )
 from strands_robots.safety.ed25519 import canonical
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 NAME = "mesh_audit.jsonl"
 BROKEN = "audit_broken"

@@ -42,7 +42,7 @@ def unlinked(port: int) -> ReachyDriver:
 
 
 def senders() -> list[threading.Thread]:
-    return [each for each in threading.enumerate() if each.name == "stop-sender"]
+    return [each for each in threading.enumerate() if each.name.startswith("stop-sender")]
 
 
 def of_the_plane(reachy: ReachyDriver) -> StopVerdict:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,10 +25,11 @@ from strands_robots.drivers.reachy.target import STREAM_HZ, Frames, Gesture, Hea
 from strands_robots.envelope import error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.utils import ValidationError, json_object
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 FRAME_S = 1 / STREAM_HZ
 JITTER_SHARE = 0.75

@@ -6,9 +6,7 @@ sent beside the first one, which may wait for ever.
 
 from __future__ import annotations
 
-import logging
 import os
-import queue
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +15,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Generic, TypeVar
 
-logger = logging.getLogger(__name__)
+from strands_robots.safety.ready_threads import ReadyThreads
+from strands_robots.safety.stop_log import stop_logger
+
+logger = stop_logger(__name__)
 
 ROUNDS_MAX = 8
 """Rounds that may wait for the daemon at once. A further stop waits for the first that returns."""
@@ -66,76 +67,34 @@ class StopRound(Generic[T]):
             self.answer.set_result(answer)
 
 
-class StopSenders:
-    """Threads that carry rounds out, of which one stands ready.
+def _senders() -> ReadyThreads[Callable[[], None]]:
+    return ReadyThreads("stop-sender", 1, lambda carry_out: carry_out(), threading.Thread.start, _replace)
 
-    Whoever orders a stop waits for no thread to start: the one that takes a round starts its successor first.
-    """
 
-    def __init__(self) -> None:
-        self._rounds: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._counting = threading.Lock()
-        self._begun = False
-        self._idle = 0
-
-    def prepare(self) -> None:
-        """Have a thread ready. Raises RuntimeError where none can be started."""
-        with self._counting:
-            if self._begun:
-                return
-            self._begun = True
-            self._idle += 1
-        try:
-            self._start()
-        except RuntimeError:
-            with self._counting:
-                self._begun = False
-                self._idle -= 1
-            raise
-
-    def put(self, carry_out: Callable[[], None]) -> None:
-        """Hand over a round. Raises RuntimeError where no thread can be started."""
-        self.prepare()
-        self._rounds.put(carry_out)
-
-    def _start(self) -> None:
-        threading.Thread(target=self._work, name="stop-sender", daemon=True).start()
-
-    def _work(self) -> None:
-        while True:
-            carry_out = self._rounds.get()
-            with self._counting:
-                last = self._idle == 1
-                self._idle -= not last
-            if last:
-                try:
-                    self._start()
-                except RuntimeError as exc:
-                    logger.critical("No thread can be started for the next stop, which waits for this one: %s.", exc)
-                    carry_out()
-                    continue
-            carry_out()
-            with self._counting:
-                if self._idle:
-                    return
-                self._idle += 1
+def _replace() -> None:
+    """Start the successor of the thread that took a round, on that thread."""
+    try:
+        _OfProcess.senders.refill()
+    except RuntimeError as exc:
+        logger.critical("No thread can be started for the next stop, which waits for this one: %s.", exc)
 
 
 class _OfProcess:
-    senders = StopSenders()
+    senders = _senders()
 
     @classmethod
     def renew(cls) -> None:
         """Start anew in a forked child, which has none of its parent's threads."""
-        cls.senders = StopSenders()
+        cls.senders = _senders()
 
 
 os.register_at_fork(after_in_child=_OfProcess.renew)
 
 
 def prepare() -> None:
-    """Have a thread ready for the next stop of this process."""
-    _OfProcess.senders.prepare()
+    """Have a thread ready for the next stop. Raises RuntimeError where there is none."""
+    if not _OfProcess.senders.wanted:
+        _OfProcess.senders.prepare()
 
 
 class StopRounds(Generic[T]):
@@ -181,7 +140,8 @@ class StopRounds(Generic[T]):
             self._unclaimed = fresh
             self._running += 1
         try:
-            _OfProcess.senders.put(partial(self._run, fresh))
+            prepare()
+            _OfProcess.senders.items.put(partial(self._run, fresh))
         except RuntimeError as exc:
             logger.critical("No thread can be started to stop the daemon's moves; this one does it: %s.", exc)
             self._run(fresh)
