@@ -235,7 +235,12 @@ _declare(
         "Ed25519 keys (base64url) of the operators who may resume a robot. Unset: no signed resume is admitted.",
     ),
     Setting("STRANDS_MESH_AUDIT_DIR", "path", "", "Directory of the safety audit. Unset: ~/.strands_robots."),
-    Setting("STRANDS_MESH_AUDIT_PSK", "text", "", "Secret that signs each audit record (HMAC-SHA256)."),
+    Setting(
+        "STRANDS_MESH_AUDIT_PSK",
+        "text",
+        "",
+        "Secret that signs each audit record (HMAC-SHA256); a process keeps that of its first record.",
+    ),
 )
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import math
+import os
 import stat
 import threading
 import time
@@ -15,7 +17,14 @@ import pytest
 from fixtures.waiting import eventually
 
 from strands_robots import audit
-from strands_robots.audit import flush_audit, log_safety_event, read_audit_log, verify_audit_integrity
+from strands_robots.audit import (
+    flush_audit,
+    log_safety_event,
+    queue_safety_event,
+    read_audit_log,
+    verify_audit_integrity,
+)
+from strands_robots.audit import journal as journal_module
 from strands_robots.audit.head import GENESIS
 from strands_robots.audit.journal import NAME, AuditEntry, Journal
 from strands_robots.audit.verification import verify
@@ -159,8 +168,10 @@ def test_rotation_keeps_five_files_and_the_chain_and_the_numbers(tmp_path: Path)
 def test_what_json_cannot_hold_is_recorded_with_what_could_be_kept(payload: Any) -> None:
     log_safety_event("odd", "arm-1", payload)
     (record,) = read_audit_log()
-    assert record["payload"] == payload or "SERIALISE_FAILED" in record["payload"]
-    assert verify_audit_integrity()["ok"]
+    whole = record["payload"] == payload
+    assert whole or "SERIALISE_FAILED" in record["payload"]
+    found = verify_audit_integrity()
+    assert (found["replaced"], found["ok"]) == (int(not whole), whole)
 
 
 def test_a_payload_nested_beyond_measure_is_recorded_as_such() -> None:
@@ -187,13 +198,144 @@ def test_a_link_in_place_of_the_log_is_not_followed_and_the_record_waits(
     assert read_audit_log()[0]["payload"] == {"reason": "smoke"}
 
 
-def test_logging_does_not_wait_while_another_process_holds_the_lock(state_directory: Path) -> None:
+def test_queueing_does_not_wait_while_another_process_holds_the_lock(state_directory: Path) -> None:
     with (state_directory / "mesh_audit.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        log_safety_event("emergency_stop", "arm-1", {})
+        queue_safety_event("emergency_stop", "arm-1", {})
         assert not flush_audit(0.1)
     assert flush_audit(20)
     assert len(read_audit_log()) == 1
+
+
+def test_an_event_that_was_logged_is_in_the_file(state_directory: Path) -> None:
+    for number in range(3):
+        log_safety_event("emergency_stop", "arm-1", {"n": number})
+        assert f'"n":{number}' in (state_directory / NAME).read_text()
+
+
+def test_logging_waits_for_a_lock_no_longer_than_its_bound(
+    state_directory: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(audit, "FLUSH_S", 0.2)
+    monkeypatch.setattr(journal_module, "LOCK_S", 0.5)
+    with (state_directory / "mesh_audit.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        log_safety_event("emergency_stop", "arm-1", {"reason": "smoke"})
+        assert "not on disk within 0.2 s: emergency_stop arm-1" in caplog.text
+        eventually(lambda: "locked for 0.5 s" in caplog.text, what="the writer's complaint")
+        with pytest.raises(OSError, match="locked"):
+            verify_audit_integrity()
+    assert eventually(lambda: flush_audit(0.2))
+    assert [each["payload"] for each in read_audit_log()] == [{"reason": "smoke"}]
+
+
+@pytest.mark.parametrize("name", [NAME, "mesh_audit.head", "mesh_audit.lock", "mesh_audit.draft", "kept/" + NAME])
+def test_a_pipe_in_place_of_a_file_holds_up_nobody(
+    state_directory: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """It may be taken for an attack on the audit; it may not hang who stops a robot, or asks what happened."""
+    pipe = state_directory / name
+    pipe.parent.mkdir(mode=0o700, exist_ok=True)
+    os.mkfifo(pipe)
+    log_safety_event("emergency_stop", "arm-1", {"epoch": "e" * 32})
+    monkeypatch.setattr(audit, "FLUSH_S", 0.2)
+    read_audit_log()
+    with contextlib.suppress(OSError):  # it says that it cannot read what is there
+        verify_audit_integrity()
+    pipe.unlink()
+    assert eventually(lambda: flush_audit(0.2))
+    assert [each["event"] for each in read_audit_log()][-1] == "emergency_stop"
+
+
+def test_a_disk_that_hangs_holds_up_no_queued_record_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    wedged, free = threading.Event(), threading.Event()
+    append = Journal.append
+
+    def hanging(journal: Journal, entries: Any) -> None:
+        wedged.set()
+        assert free.wait(60)
+        append(journal, entries)
+
+    monkeypatch.setattr(Journal, "append", hanging)
+    monkeypatch.setattr(audit, "QUEUED_MAX", 10)
+    monkeypatch.setattr(audit, "FLUSH_S", 0.1)
+    queue_safety_event("e", "arm-1", {})
+    assert wedged.wait(20)
+    for number in range(50):
+        queue_safety_event("e", "arm-1", {"n": number})
+    queue_safety_event("emergency_stop", "arm-1", {"epoch": "e" * 32})
+    log_safety_event("e", "arm-1", {"n": "waits"})
+    free.set()
+    monkeypatch.setattr(audit, "FLUSH_S", 20.0)
+    records = read_audit_log()
+    lost = sum(each["payload"]["lost"] for each in records if each["event"] == "audit_records_lost")
+    assert lost + sum(each["event"] == "e" for each in records) == 52
+    assert lost >= 40
+    assert [each["event"] for each in records].count("emergency_stop") == 1
+
+
+def test_signed_records_without_their_secret_are_not_ok(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    journal = Journal(tmp_path, b"a secret")
+    journal.append([entry(1), entry(2)])
+    found = check(Journal(tmp_path))
+    assert (found["signed"], found["verified"], found["ok"]) == (2, 0, False)
+    assert "were not verified" in found["breaks"][0]["why"]
+
+
+def test_a_process_goes_on_with_the_secret_it_began_with(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for stated in ("a secret", "", "another", None):
+        if stated is None:
+            monkeypatch.delenv("STRANDS_MESH_AUDIT_PSK")
+        else:
+            monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", stated)
+        log_safety_event("emergency_stop", "arm-1", {})
+    assert caplog.text.count("goes on signing the safety audit") == 2, "once each: gone, and changed"
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", "a secret")
+    found = verify_audit_integrity()
+    assert (found["total"], found["verified"], found["ok"]) == (4, 4, True)
+
+
+def test_a_process_without_the_secret_marks_the_signed_audit_that_it_writes_to(tmp_path: Path) -> None:
+    Journal(tmp_path, b"a secret").append([entry(1)])
+    Journal(tmp_path).append([entry(2)])
+    assert "it is signed, and this process has no secret" in str([*Journal(tmp_path).records()])
+    assert not check(Journal(tmp_path))["ok"]
+    assert not check(Journal(tmp_path, b"a secret"), keyed=True)["ok"]
+
+
+def test_records_that_are_not_on_the_disk_yet_are_not_ok(
+    state_directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log_safety_event("e", "arm-1", {})
+    assert verify_audit_integrity()["ok"]
+    monkeypatch.setattr(audit, "FLUSH_S", 0.1)
+    monkeypatch.setattr(Journal, "append", lambda journal, entries: (_ for _ in ()).throw(OSError("full")))
+    log_safety_event("e", "arm-1", {})
+    found = verify_audit_integrity()
+    assert (found["total"], found["ok"]) == (1, False)
+    assert "not on the disk yet" in str(found["breaks"])
+
+
+def test_a_foreign_repr_that_hangs_holds_up_its_caller_alone() -> None:
+    asked, answer = threading.Event(), threading.Event()
+
+    class Slow:
+        def __repr__(self) -> str:
+            asked.set()
+            assert answer.wait(60)
+            return "Slow()"
+
+    caller = threading.Thread(target=log_safety_event, args=("odd", "arm-1", {"x": Slow()}))
+    caller.start()
+    try:
+        assert asked.wait(20)
+        log_safety_event("emergency_stop", "arm-1", {})
+        assert [each["event"] for each in read_audit_log()] == ["emergency_stop"]
+    finally:
+        answer.set()
+        caller.join(20)
 
 
 def test_many_threads_lose_nothing() -> None:

@@ -424,3 +424,22 @@ def test_action_of_a_device_of_its_own_kind_is_sent_once() -> None:
     assert robot.send_action({"pan.pos": 5.0})["status"] == "error"
     assert [write.action["pan.pos"] for write in device.writes] == [15.0]
     robot.cleanup()
+
+
+def test_a_robot_that_was_never_connected_is_unknown_each_time_and_stopped_once_frozen() -> None:
+    """Whatever drove it before may still, and nobody here can ask it."""
+    robot = HardwareRobot(RecordingDevice(), "arm")
+    for _ in range(3):
+        verdict = robot.halt("test")
+        assert verdict.stopped is None
+        assert "never connected" in str(verdict.unknown)
+    robot.connect()
+    assert robot.halt("test").stopped is True
+    robot.device.disconnect()
+    assert robot.halt("test").stopped is True, "frozen, and only we could have moved it since"
+
+
+def test_cleanup_of_a_robot_that_was_never_connected_ends_and_claims_nothing() -> None:
+    robot = HardwareRobot(RecordingDevice(), "arm")
+    answer = robot.cleanup()
+    assert (answer["status"], answer["stopped"]) == ("success", None)

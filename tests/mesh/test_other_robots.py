@@ -122,7 +122,9 @@ def test_reachy_that_is_away_says_so_over_the_mesh(peers: Fleet, console: Mesh) 
     Grants(state_dir() / "grants").grant("look", "head-1")
     assert send(console, "head-1", "look", pitch=10)["status"] == "error"
     assert "look, a gesture such as nod, or playMove" in str(reachy.start_task("wave"))
-    assert send(console, "head-1", "stop")["ok"] is True
+    answer = send(console, "head-1", "stop")
+    assert answer["ok"] is False, "nobody could ask the daemon"
+    assert "did not answer GET /api/move/running" in answer["error"]
 
 
 def test_presence_names_the_kind_whose_actions_the_tool_lists(

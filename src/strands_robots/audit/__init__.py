@@ -1,21 +1,22 @@
 """The safety audit: a record of every stop, resume and refusal.
 
-:func:`log_safety_event` hands the record to one writer thread and returns at once: it never waits for a disk and
-never raises, so that it may stand on the way of a stop. A record is acknowledged when :func:`flush_audit` returns
-True: then everything handed over before it is on the disk. A record that cannot be written is logged at CRITICAL
-and tried again until it can; :data:`PENDING_MAX` of them are held.
+:func:`log_safety_event` returns when the record is on the disk. :func:`queue_safety_event` hands it to the same writer
+thread and returns at once: on the way of a stop, of a verdict or of a refusal nothing waits for a disk. Neither raises.
+:func:`flush_audit` returns True when everything handed over before it is on the disk. A record that cannot be written
+is logged at CRITICAL and tried again until it can; :data:`PENDING_MAX` of them are held.
+
+A process signs with the secret of its first record for as long as it lives.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import logging
 import queue
 import stat
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -23,18 +24,22 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.audit.head import Anchor, log_id
-from strands_robots.audit.journal import NAME, AuditEntry, Journal
+from strands_robots.audit.journal import NAME, AuditEntry, Journal, storable
 from strands_robots.audit.lasting import LastingRecords, identity, lasting_journal, rotated_out, verify_both
 from strands_robots.audit.witness import WITNESS, compare, stated_head, witnessed
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 PENDING_MAX = 10_000
+QUEUED_MAX = 2 * PENDING_MAX
 RETRY_S = 1.0
 LOST = "audit_records_lost"
+NOT_ON_DISK = "records of this process are not on the disk yet"
 FLUSH_S = 2.0
+"""Seconds that a record, a flush or a reader waits for the disk."""
 
 
 def audit_directory() -> Path:
@@ -44,14 +49,31 @@ def audit_directory() -> Path:
 
 
 def log_safety_event(event_type: str, peer_id: str, payload: dict[str, Any]) -> None:
-    """Append one safety event to the audit log; returns at once.
+    """Append one safety event to the audit log; returns when it is on the disk.
+
+    Never raises. Where the disk refuses the record, or does not take it within 2 s, that is logged at CRITICAL, and it
+    is tried again for as long as the process lives. It may not stand on the way of a stop: see
+    :func:`queue_safety_event`.
 
     Args:
         event_type: short lower-case name, such as ``emergency_stop``.
         peer_id: the robot or peer that it happened at.
-        payload: facts of the event; a value that JSON cannot hold is recorded by its short ``repr``.
+        payload: facts of the event. Those that JSON cannot hold, or too long ones, are replaced by their short
+            ``repr``; the record says so, and the check of the audit names it.
     """
-    _WRITER.put(_journal_key(), AuditEntry(time.time(), _text(event_type), _text(peer_id), payload))
+    # Here, so that a foreign repr holds up its caller alone, and a later change of the payload is not recorded.
+    entry = AuditEntry(time.time(), _text(event_type), _text(peer_id), storable(payload))
+    if not _WRITER.write(_writing_key(), entry, FLUSH_S):
+        logger.critical("Audit not on disk within %g s: %s %s.", FLUSH_S, entry.event, entry.peer_id)
+
+
+def queue_safety_event(event_type: str, peer_id: str, payload: dict[str, Any]) -> None:
+    """Hand over one safety event to be appended; returns at once and never raises.
+
+    For the way of a stop, of its verdict and of a refusal. A process that is killed within the next milliseconds takes
+    the record with it. The arguments are those of :func:`log_safety_event`.
+    """
+    _WRITER.put(_writing_key(), AuditEntry(time.time(), _text(event_type), _text(peer_id), payload))
 
 
 def flush_audit(timeout: float = FLUSH_S) -> bool:
@@ -59,7 +81,7 @@ def flush_audit(timeout: float = FLUSH_S) -> bool:
     if not _WRITER.used:
         return True
     done = threading.Event()
-    _WRITER.put(_journal_key(), done)
+    _WRITER.put(_writing_key(), done)
     return done.wait(timeout)
 
 
@@ -78,7 +100,7 @@ def audit_head() -> dict[str, Any] | None:
     Before its first record it is the last one on the disk, once that has been read: the first call has that done.
     """
     if _WRITER.last is None:
-        _WRITER.put(_journal_key(), threading.Event())
+        _WRITER.put(_writing_key(), threading.Event())
     return stated_head(_WRITER.last)
 
 
@@ -97,7 +119,7 @@ def log_witness(witness: str, robot_id: str, head: object, *, signed: bool) -> N
     known = witnessed(head)
     if known is not None and known.log != own_log_id():
         facts = {"log": known.log, "count": known.count, "last": known.last}
-        log_safety_event(WITNESS, robot_id, {**facts, "witness": witness, "signed": signed})
+        queue_safety_event(WITNESS, robot_id, {**facts, "witness": witness, "signed": signed})
 
 
 def compare_with_witnesses(files: Sequence[Path]) -> tuple[int, list[dict[str, Any]]]:
@@ -113,20 +135,56 @@ def verify_audit_integrity() -> dict[str, Any]:
     """Check the audit of this machine.
 
     Counts ``total``, ``signed``, ``verified``, ``bad``, ``missing``, ``gaps``, ``torn``, ``broken``, ``tampered``,
-    the list ``breaks`` that says where, ``head``, and ``ok``; see :func:`strands_robots.audit.verification.verify`.
-    ``kept`` are the records that are never rotated out.
+    ``replaced``, the list ``breaks`` that says where, ``head``, and ``ok``; see
+    :func:`strands_robots.audit.verification.verify`. ``kept`` are the records that are never rotated out. What could
+    not be verified is not ok: signed records without their secret, and records of this process that the disk has not
+    taken.
+
+    Raises:
+        OSError: the files cannot be read, or another process keeps them locked.
     """
-    flush_audit(FLUSH_S)
+    written = flush_audit(FLUSH_S)
     key = _journal_key()
-    return verify_both(*_journals(key), keyed=key[1] is not None)
+    found = verify_both(*_journals(key), keyed=key[1] is not None)
+    if not written:
+        found["breaks"].append({"where": "end", "why": NOT_ON_DISK})
+        found["ok"] = False
+    return found
 
 
 _Key = tuple[Path, bytes | None]
 
 
-def _journal_key() -> _Key:
+_SECRETS: dict[Path, bytes] = {}
+"""Secret of the first record of this process, by directory."""
+
+_MISSED: set[tuple[Path, bytes | None]] = set()
+
+
+def _stated_secret() -> bytes | None:
     secret = settings.raw("STRANDS_MESH_AUDIT_PSK")
-    return audit_directory(), secret.encode() if secret else None
+    return secret.encode() if secret else None
+
+
+def _journal_key() -> _Key:
+    """Return directory and secret to read and check with: the stated one first."""
+    directory = audit_directory()
+    return directory, _stated_secret() or _SECRETS.get(directory)
+
+
+def _writing_key() -> _Key:
+    """Return directory and secret to write with: that of the first record."""
+    directory, stated = audit_directory(), _stated_secret()
+    if stated is not None:
+        _SECRETS.setdefault(directory, stated)
+    secret = _SECRETS.get(directory)
+    if secret != stated and (directory, stated) not in _MISSED:
+        _MISSED.add((directory, stated))
+        logger.critical(
+            "STRANDS_MESH_AUDIT_PSK %s: this process goes on signing the safety audit with the secret it began with.",
+            "was changed" if stated else "is gone",
+        )
+    return directory, secret
 
 
 def _journals(key: _Key) -> tuple[Journal, Journal]:
@@ -146,6 +204,14 @@ def _time(record: dict[str, Any]) -> float:
     return float(ts) if isinstance(ts, int | float) else 0.0
 
 
+def _must_last(entry: AuditEntry) -> bool:
+    return identity(entry.event, entry.peer_id, entry.payload) is not None
+
+
+class _Tried(threading.Event):
+    """Set after the next try to write, however it went."""
+
+
 class _Pending:
     """Records of one journal that are not on the disk yet, and waiting flushes."""
 
@@ -155,6 +221,7 @@ class _Pending:
         self._lasting = LastingRecords(kept)
         self.entries: deque[AuditEntry] = deque()
         self.waiting: list[threading.Event] = []
+        self.tried: list[_Tried] = []
         self.failing = False
         self.last = self._last()
         self._reported = 0
@@ -189,6 +256,12 @@ class _Pending:
             done.set()
         self.waiting.clear()
 
+    def answer(self) -> None:
+        """Let the callers go on whose record was tried."""
+        for each in self.tried:
+            each.set()
+        self.tried.clear()
+
     def _complain(self, exc: Exception) -> None:
         if not self.failing:
             logger.critical("The safety audit in %s cannot be written: %s. Records are kept.", self.directory, exc)
@@ -202,7 +275,7 @@ class _Pending:
         if lost <= 0:
             return
         # One more makes room for the record that says so. Noise goes first, the oldest of it.
-        by_worth = sorted(self.entries, key=lambda each: identity(each.event, each.peer_id, each.payload) is not None)
+        by_worth = sorted(self.entries, key=_must_last)
         gone = by_worth[: lost + 1]
         away = {id(each) for each in gone}
         counted = sum(each.payload["lost"] if each.event == LOST else 1 for each in gone)
@@ -215,6 +288,8 @@ class _Writer:
     """Thread that owns the journals, fed by one queue that is never full."""
 
     def __init__(self) -> None:
+        self._lost: Counter[_Key] = Counter()
+        self._counting = threading.Lock()
         self._queue: queue.SimpleQueue[tuple[_Key, AuditEntry | threading.Event]] = queue.SimpleQueue()
         self._pending: dict[_Key, _Pending] = {}
         self._starting = threading.Lock()
@@ -222,7 +297,14 @@ class _Writer:
         self.last: Anchor | None = None
 
     def put(self, key: _Key, item: AuditEntry | threading.Event) -> None:
-        """Hand over a record, or an event to set when all before it are on the disk."""
+        """Hand over a record, or an event to set when all before it are on the disk.
+
+        A disk that hangs keeps the thread: noise beyond :data:`QUEUED_MAX` records is counted instead.
+        """
+        if isinstance(item, AuditEntry) and self._queue.qsize() >= QUEUED_MAX and not _must_last(item):
+            with self._counting:
+                self._lost[key] += 1
+            return
         self._queue.put((key, item))
         # A fork leaves the child with the object and without the thread.
         if self._thread is None or not self._thread.is_alive():
@@ -230,6 +312,19 @@ class _Writer:
                 if self._thread is None or not self._thread.is_alive():
                     self._thread = threading.Thread(target=self._run, name="safety-audit", daemon=True)
                     self._thread.start()
+
+    def write(self, key: _Key, entry: AuditEntry, within_s: float) -> bool:
+        """Hand over a record and wait for it; False when time is over first.
+
+        A record that the disk refused was logged by the writer.
+        """
+        self.put(key, entry)
+        if threading.current_thread() is self._thread:
+            # A handler of the log records what the writer complains of.
+            return True
+        tried = _Tried()
+        self.put(key, tried)
+        return tried.wait(within_s)
 
     @property
     def used(self) -> bool:
@@ -240,9 +335,10 @@ class _Writer:
         while True:
             self._take()
             for pending in self._pending.values():
-                if pending.entries or pending.waiting:
+                if pending.entries or pending.waiting or pending.tried:
                     written = pending.write()
                     self.last = pending.last or self.last
+                    pending.answer()
                     if written:
                         pending.acknowledge()
 
@@ -251,15 +347,26 @@ class _Writer:
         with contextlib.suppress(queue.Empty):  # everything was taken, or it is time to try again
             key, item = self._queue.get(timeout=RETRY_S if unwritten else None)
             while True:
-                pending = self._pending.get(key)
-                if pending is None:
-                    # Made once: it reads the head from the disk.
-                    pending = self._pending[key] = _Pending(key)
+                pending = self._pending_of(key)
                 if isinstance(item, AuditEntry):
                     pending.entries.append(item)
+                elif isinstance(item, _Tried):
+                    pending.tried.append(item)
                 else:
                     pending.waiting.append(item)
                 key, item = self._queue.get_nowait()
+
+    def _pending_of(self, key: _Key) -> _Pending:
+        pending = self._pending.get(key)
+        if pending is None:
+            # Made once: it reads the head from the disk.
+            pending = self._pending[key] = _Pending(key)
+        if self._lost:
+            with self._counting:
+                lost, self._lost = self._lost, Counter()
+            for each, count in lost.items():
+                self._pending_of(each).entries.append(AuditEntry(time.time(), LOST, "audit", {"lost": count}))
+        return pending
 
 
 _warned: set[Path] = set()

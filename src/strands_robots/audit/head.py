@@ -13,6 +13,7 @@ import hmac
 import json
 import os
 import socket
+import stat
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -140,6 +141,15 @@ def read_head(path: Path, seal: Seal, log: str) -> Head | None:
     return head if head is not None and head.log == log else None
 
 
+def signed_head(path: Path) -> bool:
+    """True when a head is there that was written with a secret."""
+    try:
+        fields = json.loads(read_bytes(path))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(fields, dict) and "sig" in fields
+
+
 def write_head(path: Path, seal: Seal, head: Head, *, durable: bool) -> None:
     """Replace the head in ``path``; with ``durable``, return when it is on the disk."""
     draft = path.with_suffix(".draft")
@@ -177,9 +187,16 @@ def write_anchor(path: Path, seal: Seal, anchor: Anchor) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path, flags: int) -> Iterator[int]:
-    """Open a file of the audit, made for its owner alone, without following links."""
-    descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    """Open a file of the audit, made for its owner alone; refuse links and pipes.
+
+    Raises:
+        OSError: it cannot be opened, or is no regular file.
+    """
+    # Not blocking: a pipe in the place of a file would hold up its writer for good.
+    descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
     try:
+        if not flags & os.O_DIRECTORY and not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(f"{path} is no regular file; the audit does not follow links or pipes")
         yield descriptor
     finally:
         os.close(descriptor)

@@ -12,8 +12,8 @@ import contextlib
 import fcntl
 import hashlib
 import json
-import logging
 import os
+import random
 import stat
 import time
 from collections.abc import Iterator, Sequence
@@ -31,15 +31,17 @@ from strands_robots.audit.head import (
     opened,
     read_anchor,
     read_head,
+    signed_head,
     sync_directory,
     write_all,
     write_anchor,
     write_head,
 )
 from strands_robots.safety.ed25519 import canonical
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import shown
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 NAME = "mesh_audit.jsonl"
 BROKEN = "audit_broken"
@@ -47,6 +49,12 @@ AUDIT_PEER = "audit"
 MAX_BYTES = 100 * 2**20
 KEPT_FILES = 5
 PAYLOAD_MAX_BYTES = 256 * 2**10
+REPLACED = "SERIALISE_FAILED"
+"""Field of a payload in place of facts that could not be written, with the reason."""
+
+LOCK_S = 10.0
+"""Seconds that a writer or a reader waits for the other processes."""
+
 WRITE_BYTES = 2**20
 """Bytes after which a write ends and the next begins: the head names the lines of one write."""
 
@@ -151,7 +159,8 @@ class Journal:
     def files(self) -> list[Path]:
         """Return the files that exist, oldest first."""
         names = [self._rotated(number) for number in range(self._kept, 0, -1)]
-        return [path for path in (*names, self.path) if path.exists()]
+        # A pipe is none: reading it would not end.
+        return [path for path in (*names, self.path) if path.is_file()]
 
     def in_order(self, files: Sequence[Path]) -> bool:
         """True when the numbers of these files have no gap."""
@@ -235,7 +244,10 @@ class Journal:
         if found is None and self._head is None and self._untouched(size):
             write_anchor(self._anchor_path, self._seal, Anchor(log, 0, GENESIS))
             return Head(log), []
+        signed = self._head is None and not self._seal.keyed and signed_head(self._head_path)
         head, mismatches = self._believed(found, anchor, log)
+        if signed:
+            mismatches.append("it is signed, and this process has no secret")
         if head.rotating and inode != head.inode and self._renamed(head):
             head.rotated(self._kept)
         announced_from = head.count
@@ -389,7 +401,7 @@ class Journal:
     def _locked(self, *, shared: bool = False) -> Iterator[None]:
         flags = os.O_RDONLY if shared else os.O_RDWR | os.O_CREAT
         with opened(self.path.with_suffix(".lock"), flags) as descriptor:
-            fcntl.flock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+            _lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, self.path)
             yield
 
 
@@ -441,7 +453,29 @@ def storable(payload: Any) -> Any:
     except (TypeError, ValueError, RecursionError) as exc:
         reason = f"{type(exc).__name__}: {exc}"[:200]
     items = list(payload.items())[:64] if isinstance(payload, dict) else [("value", payload)]
-    return {"SERIALISE_FAILED": reason, "kept": {shown(key): shown(value) for key, value in items}}
+    return {REPLACED: reason, "kept": {shown(key): shown(value) for key, value in items}}
+
+
+def replaced(payload: object) -> bool:
+    """True for what :func:`storable` made of a payload."""
+    return isinstance(payload, dict) and REPLACED in payload
+
+
+def _lock(descriptor: int, kind: int, path: Path) -> None:
+    """Lock within :data:`LOCK_S`; raise OSError where another process keeps it."""
+    deadline = time.monotonic() + LOCK_S
+    pause = 0.001
+    while True:
+        try:
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        except BlockingIOError as exc:
+            if time.monotonic() >= deadline:
+                raise OSError(f"another process has kept {path} locked for {LOCK_S:g} s") from exc
+            # By chance, so that a writer that is always busy leaves a turn to the others.
+            time.sleep(random.uniform(0.5, 1.0) * pause)
+            pause = min(0.02, 1.5 * pause)
+        else:
+            return
 
 
 def _ends_whole(descriptor: int) -> bool:

@@ -7,7 +7,6 @@ never rotated. At :data:`LASTING_MAX_BYTES` it takes no more.
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,8 +15,9 @@ from typing import Any
 from strands_robots.audit.journal import AUDIT_PEER, BROKEN, NAME, AuditEntry, Journal
 from strands_robots.audit.verification import verify
 from strands_robots.safety.state_files import make_private
+from strands_robots.safety.stop_log import stop_logger
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 FOLDER = "kept"
 LASTING_MAX_BYTES = 64 * 2**20

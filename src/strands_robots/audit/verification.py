@@ -8,9 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots.audit.head import Head
-from strands_robots.audit.journal import BROKEN, Journal, LogSnapshot, anchor_mismatches, parse
+from strands_robots.audit.journal import BROKEN, Journal, LogSnapshot, anchor_mismatches, parse, replaced
 
 BREAKS_SHOWN = 100
+SIGNATURES = "signatures"
+"""Place of a break that is none of a line: the signatures were not verified."""
+
+FACTS_REPLACED = "its facts could not be written; what could be kept is there as text"
 
 
 @dataclass(slots=True)
@@ -26,6 +30,7 @@ class Findings:
     torn: int = 0
     broken: int = 0
     tampered: int = 0
+    replaced: int = 0
     breaks: list[dict[str, Any]] = field(default_factory=list)
 
     def note(self, where: str, why: str) -> None:
@@ -35,8 +40,8 @@ class Findings:
 
     def whole(self, *, keyed: bool) -> bool:
         """True when nothing was found; a torn line is an offence only where a key is set."""
-        found = self.bad or self.missing or self.gaps or self.broken or self.tampered
-        return not found and not (keyed and self.torn)
+        found = self.bad or self.missing or self.gaps or self.broken or self.tampered or self.replaced
+        return not found and self.verified == self.signed and not (keyed and self.torn)
 
 
 def verify(journal: Journal, *, keyed: bool) -> dict[str, Any]:
@@ -44,9 +49,10 @@ def verify(journal: Journal, *, keyed: bool) -> dict[str, Any]:
 
     ``bad`` are invalid signatures, ``missing`` records without one although a key is set, ``gaps`` jumps in a peer's
     numbers, ``broken`` records that do not continue the one before, ``torn`` lines that are no record, ``tampered``
-    what a writer found and recorded as ``audit_broken``. ``head`` is ok, missing (a cut at the end cannot be excluded),
-    cut (the last record is not there) or older (it was rolled back, or the anchor was). With a key everything but ok
-    fails; without one a missing head and torn lines do not.
+    what a writer found and recorded as ``audit_broken``, ``replaced`` records whose facts could not be written.
+    ``head`` is ok, missing (a cut at the end cannot be excluded), cut (the last record is not there) or older (it was
+    rolled back, or the anchor was). With a key everything but ok fails; without one a missing head and torn lines do
+    not, but signed records do: they are not verified.
     """
     with journal.snapshot() as snapshot:
         return _Check(journal, snapshot, keyed=keyed).run()
@@ -87,6 +93,8 @@ class _Check:
         standing = self._standing(head, reached, last, anchored=anchored)
         for each in head.breaks if head is not None else ():
             found.tampered += not self._tampering_seen(each)
+        if found.signed and not self._keyed:
+            found.note(SIGNATURES, f"{found.signed} signed records were not verified: there is no secret here")
         counts = {name: getattr(found, name) for name in Findings.__slots__}
         whole = found.whole(keyed=self._keyed) and standing in (("ok",) if self._keyed else ("ok", "missing"))
         return {**counts, "head": standing, "ok": whole}
@@ -118,6 +126,9 @@ class _Check:
             found.tampered += 1
             payload = record.get("payload")
             found.note(where, f"the writer found: {payload.get('why') if isinstance(payload, dict) else payload}")
+        if replaced(record.get("payload")):
+            found.replaced += 1
+            found.note(where, FACTS_REPLACED)
         self._signature(record, where)
 
     def _signature(self, record: dict[str, Any], where: str) -> None:

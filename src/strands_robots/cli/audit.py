@@ -10,11 +10,13 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from strands_robots.audit import (
+    NOT_ON_DISK,
     audit_directory,
     compare_with_witnesses,
     read_audit_log,
     verify_audit_integrity,
 )
+from strands_robots.audit.verification import FACTS_REPLACED, SIGNATURES
 from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Screen, plain, table
 from strands_robots.safety.lockout import utc
@@ -24,6 +26,13 @@ T = TypeVar("T")
 
 FOLLOW_S = 0.3
 NOT_INTACT = "The audit is not intact: records were changed, left out, cut off or rolled back."
+NOT_VERIFIED = (
+    "The audit was not verified: {} of {} records are signed, and STRANDS_MESH_AUDIT_PSK is not set here. "
+    "Set the secret that they were signed with, and verify again."
+)
+REPLACED = "The audit is not complete: the facts of {} of {} records could not be written, and stand there as text."
+NOT_WRITTEN = "The audit is not complete: records of this process are not on the disk yet."
+GRAVE = ("bad", "missing", "gaps", "broken", "tampered")
 NEVER_BEGUN = "There is no audit: nothing was recorded here with this secret yet, or all of it was deleted."
 FIRST_FIELDS = ("stopped", "source", "who", "why", "reason", "estop_id", "epoch")
 HIDDEN_FIELDS = ("device_id", "epochs", "issued", "pressed_at", "timing", "repeated", "late", "road", "persisted")
@@ -89,23 +98,39 @@ def verify(
         list[Path] | None, typer.Option("--with", help="An audit file of another machine, such as a controller's.")
     ] = None,
 ) -> None:
-    """Check the chain, the numbers and the signatures. Exits with 1 when the record was cut or changed."""
+    """Check the chain, the numbers and the signatures.
+
+    Exits with 1 when the record was cut or changed, or could not be verified.
+    """
     found = _readable(verify_audit_integrity)
     if witnesses:
         seen, gone = _readable(lambda: compare_with_witnesses(witnesses))
         found |= {"witnesses": seen, "breaks": [*found["breaks"], *gone], "ok": found["ok"] and not gone}
         screen.say(f"{seen} records of other machines are about this audit.")
-    counts = ("total", "signed", "verified", "bad", "missing", "gaps", "broken", "torn", "tampered")
+    counts = ("total", "signed", "verified", "bad", "missing", "gaps", "broken", "torn", "tampered", "replaced")
     screen.say(str(audit_directory()))
     screen.show(table("", ("what", "count"), ((name, found[name]) for name in counts)))
     for each in found["breaks"]:
         screen.say(f"{each['where']}: {each['why']}", "red")
     if not found["ok"]:
-        why = NEVER_BEGUN if found["head"] == "missing" and not found["total"] else NOT_INTACT
-        raise CliError(why, **found)
+        raise CliError(_verdict(found), **found)
     screen.data({"status": "success", **found})
     end = "" if found["head"] == "ok" else " A cut at its end cannot be excluded: its head is missing."
     screen.say(f"The audit is intact: {found['total']} records.{end}", "yellow" if end else "green")
+
+
+def _verdict(found: Mapping[str, Any]) -> str:
+    """Return the sentence on an audit that is not ok: on the gravest thing."""
+    total, unverified = found["total"], found["signed"] - found["verified"] - found["bad"]
+    lesser = [each for each in found["breaks"] if each["why"] in {FACTS_REPLACED, NOT_ON_DISK}]
+    lesser += [each for each in found["breaks"] if each["where"].endswith(SIGNATURES)]
+    if found["head"] == "missing" and not total:
+        return NEVER_BEGUN
+    if len(lesser) < len(found["breaks"]) or any(found[name] for name in GRAVE) or found["head"] in ("cut", "older"):
+        return NOT_INTACT
+    if unverified:
+        return NOT_VERIFIED.format(unverified, total)
+    return REPLACED.format(found["replaced"], total) if found["replaced"] else NOT_WRITTEN
 
 
 def _records(since: float | None = None) -> list[dict[str, Any]]:

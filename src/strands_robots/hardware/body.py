@@ -85,6 +85,8 @@ class DeviceBody:
         self.targets: dict[str, float] = {}
         """What it was told last by an action, by key; empty once it was frozen or let go."""
         self._lost = False
+        self._was_connected = self.is_connected
+        self._holds_unconnected = bool(getattr(device, "holds_unconnected", False))
         self._stops: list[object] = []
         self.driven = False
         """True from an action until it was frozen or let go."""
@@ -124,7 +126,7 @@ class DeviceBody:
             elif self.is_connected and hasattr(self.device, "is_connected"):
                 return
             self.bring_up(self.device)
-            self._lost = False
+            self._lost, self._was_connected = False, True
             # A driver that connects switches the torque on.
             self._limp = set()
 
@@ -251,15 +253,21 @@ class DeviceBody:
         with self.stopping():
             if self.lost:
                 raise ConnectionError("its port is gone; a servo goes on to its last goal")
-            if not self.is_connected:
-                if not self.driven:
-                    return
-                raise ConnectionError("it is not connected; what it was told last goes on")
+            if not (self.is_connected or self._holds_unconnected):
+                self._check_known_still()
+                return
             if self.stop_level == "limp":
                 self._release()
             else:
                 self._hold(urgent=True)
-            self.driven = False
+            self.driven, self._was_connected = False, True
+
+    def _check_known_still(self) -> None:
+        """Raise :class:`ConnectionError` unless the device is known not to move."""
+        if self.driven:
+            raise ConnectionError("it is not connected; what it was told last goes on")
+        if not self._was_connected:
+            raise ConnectionError("it was never connected here, so it is not known whether it moves")
 
     def running(self) -> AbstractContextManager[None]:
         return nullcontext()

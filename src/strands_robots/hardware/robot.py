@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from strands_robots import settings
 from strands_robots.arm_mixin import ArmMixin, motion_rollout
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import queue_safety_event
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
@@ -39,6 +39,7 @@ from strands_robots.safety.gate import (
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
+from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, number, text
@@ -61,7 +62,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     Args:
         device: has ``observation_features``, ``action_features``, ``get_observation``, ``send_action``, ``connect``,
-            ``disconnect``, and may have ``is_connected``, ``joint_ranges``, ``get_joints`` and ``hold``.
+            ``disconnect``, and may have ``is_connected``, ``joint_ranges``, ``get_joints``, ``hold``, and
+            ``holds_unconnected``, true where ``hold`` needs no connection.
         tool_name: what the robot is called on a network, 1 to 128 characters.
         control_hz: control rate, 1 to 2000; ``STRANDS_CONTROL_HZ`` by default.
         joint_ranges: lowest and highest target by action key, in the device's unit; what is not named is asked of
@@ -362,6 +364,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
     def halt_ordered(self) -> None:
         """Note what moves; a loop whose permit is void counts as halted."""
         self._moved.update(dict.fromkeys(self._moving()))
+        # A device that asks a daemon to stop does so at once, though a halt before this one still waits for it.
+        note_motion(self.device)
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Halt on the stop executor's thread, unless the bus blocks; wait for no loop."""
@@ -429,7 +433,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             choice("motor_ids", motor, self._body.motors)
         verdict = stop_executor().halt(_TorqueRelease(self, ",".join(asked)), self.tool_name_str, "releaseTorque")
         answer = {**verdict.envelope(), "released": list(self._body.limp_motors)}
-        log_safety_event(
+        queue_safety_event(
             "torque_released", self.tool_name_str, {"motors": answer["released"], "stopped": verdict.stopped}
         )
         if is_error(answer):
@@ -464,7 +468,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         """
         self.wait_settled()
         verdict = self.halt("cleanup")
-        if not verdict.stopped:
+        if not verdict.stopped and (self._body.is_connected or self._body.driven or self._body.lost):
             return verdict.envelope()
         unsettled = self.wait_settled()
         if self._settling is not None and self._settling.state == "failed":
@@ -480,6 +484,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             except Exception as exc:
                 logger.exception("%s did not disconnect.", self.tool_name_str)
                 return error(f"Halted, but the device did not disconnect: {type(exc).__name__}: {exc}")
+        if not verdict.stopped:
+            return success("It was not connected; whether it moves is not known.", stopped=None)
         return success("Halted and disconnected.", stopped=True)
 
     def _stand_by(self) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any
 
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import queue_safety_event
 
 AuditSink = Callable[[str, str, dict[str, Any]], None]
 """Event type, peer id, payload; returns at once and never raises."""
@@ -34,7 +34,7 @@ class AuditThrottle:
     """
 
     def __init__(
-        self, peer_id: str, sink: AuditSink = log_safety_event, clock: Callable[[], float] = time.monotonic
+        self, peer_id: str, sink: AuditSink = queue_safety_event, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._peer = peer_id
         self._sink = sink

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import Any, Literal, Protocol
 
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import queue_safety_event
 from strands_robots.contract import SETTLE, RolloutEvent
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
@@ -260,7 +260,7 @@ class Settling:
         else:
             logger.info("%s %s.", name, "settled and is limp" if state == "settled" else "was stopped while it settled")
         took = 0.0 if began is None else self._clock() - began
-        log_safety_event("settle_" + state, name, {"why": problem, "elapsed_s": round(took, 3)})
+        queue_safety_event("settle_" + state, name, {"why": problem, "elapsed_s": round(took, 3)})
         self._notify("finished", took, {"settled": "completed", "stopped": "stopped"}.get(state, "error"), problem)
 
     def _notify(

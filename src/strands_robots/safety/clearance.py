@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from strands_robots.audit import flush_audit, log_safety_event
+from strands_robots.audit import log_safety_event
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import LockoutState
 from strands_robots.safety.persistence import LockoutStore
@@ -126,7 +126,6 @@ def _clear_on_disk(who: str, name: str) -> bool:
     store.save({key: replace(kept, state=LockoutState()) for key, kept in locked.items()})
     for kept in locked.values():
         log_safety_event("resume_local", name, {"who": who, "epochs": list(kept.state.epochs), "persisted": True})
-    flush_audit()
     return True
 
 

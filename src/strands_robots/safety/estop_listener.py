@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-from strands_robots.audit import audit_head, log_safety_event, own_log_id
+from strands_robots.audit import audit_head, own_log_id, queue_safety_event
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
@@ -309,7 +309,7 @@ class RefusalLog:
         more, entry[:] = int(entry[1]), [time.monotonic() + REFUSAL_INTERVAL_S, 0.0]
         logger.warning("%s of %s does not count: %s.", event, shown(refused.source), refused.why)
         facts = {"event": event, "source": refused.source[:256], "why": refused.why, "more_since": more}
-        log_safety_event("estop_refused", "stop-lane", facts)
+        queue_safety_event("estop_refused", "stop-lane", facts)
 
     def _entry(self, source: str) -> list[float]:
         name = source if source in self._sources or len(self._sources) < SOURCES_MAX else ""
@@ -546,7 +546,7 @@ class EstopListener:
         if report.repeated and report.names_its_epoch and key not in self._redundant:
             # Once for each stop: a controller repeats until every robot has answered.
             self._redundant[key] = None
-            log_safety_event("remote_estop_redundant", report.robot_id, {"epoch": report.epoch})
+            queue_safety_event("remote_estop_redundant", report.robot_id, {"epoch": report.epoch})
             _bound(self._redundant)
         self._answered[key] = now
         _bound(self._answered)

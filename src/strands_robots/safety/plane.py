@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from strands_robots import settings
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import queue_safety_event
 from strands_robots.contract import Haltable, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
@@ -428,11 +428,11 @@ class SafetyPlane:
             return error(REJECTED)
         verdict = entry.verifier.check(assertion, entry.latch.state.resumable)
         if not isinstance(verdict, Admitted):
-            log_safety_event("resume_denied", robot_id, {"why": verdict.value, "road": path})
+            queue_safety_event("resume_denied", robot_id, {"why": verdict.value, "road": path})
             return error(REJECTED)
         entry.latch.resume(verdict.epoch)
         persisted = self._kept([entry])
-        log_safety_event(
+        queue_safety_event(
             "resume_ok",
             robot_id,
             {"epoch": verdict.epoch, "road": path, "still_held": list(entry.epochs), "persisted": persisted},
@@ -458,7 +458,7 @@ class SafetyPlane:
             cleared[name] = gone
             persisted = self._kept([entry])
             epochs = [each.epoch for each in gone]
-            log_safety_event("resume_local", name, {"who": who, "epochs": epochs, "persisted": persisted})
+            queue_safety_event("resume_local", name, {"who": who, "epochs": epochs, "persisted": persisted})
             logger.warning("%s was cleared at this machine by %s.", name, who)
         self._freed()
         return cleared
@@ -500,7 +500,7 @@ class SafetyPlane:
                 if entry.keep_again:
                     entry.keep_again = False
                     logger.warning("The lockout file of %s is written now.", entry.robot_id)
-                    log_safety_event("lockout_kept", entry.robot_id, {"epochs": list(record.state.epochs)})
+                    queue_safety_event("lockout_kept", entry.robot_id, {"epochs": list(record.state.epochs)})
 
     def _kept(self, entries: Iterable[Registered]) -> bool:
         try:
@@ -535,11 +535,11 @@ class SafetyPlane:
                 "delay_s": order.delay_s(order.received_at),
                 "timing": order.timing(order.received_at),
             }
-            log_safety_event(event, report.robot_id, facts)
+            queue_safety_event(event, report.robot_id, facts)
         if len(self._issued) < 1024 or order.source in self._issued:
             self._issued[order.source] = self._issued.get(order.source, 0) + 1
             if self._issued[order.source] == ISSUER_EXCESS:
-                log_safety_event("estop_issuer_excess", order.source or "unnamed", {"stops": ISSUER_EXCESS})
+                queue_safety_event("estop_issuer_excess", order.source or "unnamed", {"stops": ISSUER_EXCESS})
 
     def _freed(self) -> None:
         if not self.lockouts():
@@ -548,7 +548,7 @@ class SafetyPlane:
     def _tick(self) -> None:
         counted = self._counted.take(time.monotonic())
         if counted is not None:
-            log_safety_event("estops_counted", "stop-lane", counted)
+            queue_safety_event("estops_counted", "stop-lane", counted)
         silent = self.checkin.lapsed(time.monotonic())
         if silent is not None:
             names = ", ".join(silent) or "no safety controller was ever heard"

@@ -198,7 +198,7 @@ def explain(answer: object) -> str:
     outcome = grade(answer)
     if outcome in (Outcome.RAISED, Outcome.TIMED_OUT):
         return f"{outcome.value}: {type(answer).__name__}: {answer}"
-    if outcome is Outcome.REFUSED and isinstance(answer, Mapping):
+    if outcome in (Outcome.REFUSED, Outcome.UNKNOWN) and isinstance(answer, Mapping):
         for key in ("reason", "error", "message"):
             if isinstance(answer.get(key), str) and answer[key]:
                 return f"{outcome.value}: {answer[key]}"

@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from strands_robots.bounded_json import SMALL_BYTES
 from strands_robots.drivers.reachy import connection
 from strands_robots.drivers.reachy.connection import Feed
 
@@ -34,3 +35,10 @@ def test_joint_frame_without_nine_numbers_is_dropped_and_counted_and_shows_life(
 def test_feed_is_not_alive_before_its_first_frame() -> None:
     assert Feed().silent_s == math.inf
     assert not Feed().alive
+
+
+def test_a_message_beyond_the_bound_is_dropped_unparsed() -> None:
+    feed = Feed()
+    for kind in ("joint_positions", "head_pose", "daemon_status"):
+        feed.take(kind, "[" * (SMALL_BYTES + 1))
+    assert (feed.joints, feed.pose(), feed.status(), feed.unusable_frames) == (None, None, None, 3)

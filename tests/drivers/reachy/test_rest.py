@@ -91,6 +91,13 @@ def test_body_that_is_no_json_is_a_fault() -> None:
         RestClient("127.0.0.1").get("/x")
 
 
+@respx.mock
+def test_body_beyond_the_bound_is_not_read() -> None:
+    respx.get(f"{HERE}/x").mock(return_value=httpx.Response(200, content=b"[" + b"1," * 100 + b"1]"))
+    with pytest.raises(DaemonUnreachableError, match="longer than 100 bytes"):
+        RestClient("127.0.0.1", longest=100).get("/x")
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1/foo", "", "a b", "http://x", "x:80", None, "robot@evil"])
 def test_invalid_host_is_refused(host: Any) -> None:
     with pytest.raises(ValidationError, match="host"):
@@ -146,7 +153,7 @@ def test_every_error_kind_is_a_daemon_error() -> None:
 
 @respx.mock
 @pytest.mark.parametrize(
-    ("size", "why"), [(len(LONG), "longer than 1048576 bytes"), (200_000, "more than 20000 values")]
+    ("size", "why"), [(len(LONG), "longer than 524288 bytes"), (200_000, "more than 20000 values")]
 )
 def test_answer_out_of_bounds_is_a_fault_and_not_parsed(size: int, why: str) -> None:
     respx.get(f"{HERE}/x").mock(return_value=httpx.Response(200, content=LONG[:size]))

@@ -16,7 +16,6 @@ from strands_robots.bounded_json import SMALL_BYTES, json_object
 from strands_robots.drivers.reachy.links import (
     APP_LOCK_SINCE,
     DEFAULT_PREFIX,
-    OUT_TOPICS,
     TRANSPORTS,
     ZENOH_PORT,
     DaemonInfo,
@@ -26,6 +25,7 @@ from strands_robots.drivers.reachy.links import (
     make_link,
 )
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
+from strands_robots.drivers.reachy.stop_rounds import prepare
 from strands_robots.drivers.reachy.target import HeadPose
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, choice, port
@@ -35,12 +35,16 @@ logger = stop_logger(__name__)
 FRESH_S = 1.5
 """Oldest sample that still counts, in seconds: joints come at 37 to 50 Hz."""
 
+STOP_ANSWER_MAX_BYTES = 2**16
+"""Longest answer to a stop, or list of running moves: a thousand moves."""
+
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.1, 1.0
 WATCH_EVERY_S, POLL_EVERY_S = 0.1, 1.0
 STATUS_LAG_S = 1.5
 STATUS_PATH, RUNNING_PATH = "/api/daemon/status", "/api/move/running"
 LOCK_PATH, APP_PATH = "/api/daemon/robot-app-lock-status", "/api/apps/current-app-status"
 
+STORED_KINDS = frozenset({"head_pose", "imu_data", "daemon_status"})
 HEAD_JOINTS = ("body_yaw", "stewart_1", "stewart_2", "stewart_3", "stewart_4", "stewart_5", "stewart_6")
 
 
@@ -89,10 +93,16 @@ class Feed:
         self.unusable_frames = 0
 
     def take(self, kind: str, payload: str | bytes) -> None:
-        """Store one message; a joint frame that cannot be decoded is dropped."""
+        """Store one message; a joint frame that cannot be decoded is dropped.
+
+        So is any message beyond :data:`~strands_robots.bounded_json.SMALL_BYTES`, which is not parsed.
+        """
         now = time.monotonic()
+        if len(payload) > SMALL_BYTES:
+            self.unusable_frames += 1
+            return
         if kind != "joint_positions":
-            if kind in OUT_TOPICS and len(payload) <= SMALL_BYTES:
+            if kind in STORED_KINDS:
                 self._raw[kind] = (payload, now)
             return
         joints = _joints(payload, now)
@@ -210,7 +220,7 @@ class Connection:
         zenoh_port: int = ZENOH_PORT,
     ) -> None:
         self.rest = RestClient(host, api_port)
-        self.stop_rest = RestClient(host, api_port)
+        self.stop_rest = RestClient(host, api_port, longest=STOP_ANSWER_MAX_BYTES)
         self.hub_rest = RestClient(host, api_port, read_s=10.0)
         self.host, self.port = self.rest.host, self.rest.port
         self._prefix = key_prefix(prefix)
@@ -235,6 +245,7 @@ class Connection:
         if self._thread is not None:
             return
         self._stopping.clear()
+        prepare()
         self._thread = threading.Thread(target=self._run, name="reachy-watch", daemon=True)
         self._thread.start()
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.audit import log_safety_event
+from strands_robots.audit import queue_safety_event
 from strands_robots.contract import AT_REST, Observer, Unsubscribe
 from strands_robots.drivers.reachy.connection import FRESH_S, Connection
 from strands_robots.drivers.reachy.links import (
@@ -19,6 +19,7 @@ from strands_robots.drivers.reachy.links import (
 )
 from strands_robots.drivers.reachy.motion import MotionController
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonFaultError, DaemonUnreachableError, RestClient
+from strands_robots.drivers.reachy.stop_rounds import StopRounds
 from strands_robots.drivers.reachy.target import (
     ACTION_KEYS,
     BOUNDS,
@@ -211,6 +212,9 @@ class ReachyDriver:
         ValidationError: an argument outside its domain.
     """
 
+    holds_unconnected = True
+    """:meth:`hold` reaches the daemon without the link that frames need."""
+
     name = "reachy_mini"
     tool_name_str = "reachy_mini"
     device_type = "reachy_mini"
@@ -237,6 +241,7 @@ class ReachyDriver:
             self.connection, self.gate, self.tool_name_str, automatic_body_yaw=self._automatic
         )
         self.motors = Motors(self.connection, self.motions)
+        self._releases: StopRounds[None] = StopRounds(self._release)
         self.catalogue = RecordedMoves(self.connection, self.motions)
 
     @property
@@ -425,11 +430,11 @@ class ReachyDriver:
         began = time.monotonic()
         verdict = self.motions.halt(reason)
         locked = self.gate.lockout("motion") or {}
-        if not (self.release_on_estop and locked.get("locked") is True and self.connection.connects):
+        if not (self.release_on_estop and locked.get("locked") is True):
             return verdict
         left = 0.95 * settings.number("STRANDS_HALT_DEADLINE_S") - (time.monotonic() - began)
         try:
-            self.motors.release(max(left / 2, 0.05))
+            self._releases.claim(None, max(left, 0.1)).wait()
         except Exception as exc:  # noqa: BLE001 - a stop reports every failure of its parts
             return replace(verdict, unknown={**verdict.unknown, "torque": f"it was not released: {exc}"})
         return verdict
@@ -447,7 +452,7 @@ class ReachyDriver:
             self.motors.release(names=names)
         except Exception as exc:  # noqa: BLE001 - as in halt
             return error(f"{verdict['content'][0]['text']} Torque was not released: {exc}", **fields, released=[])
-        log_safety_event("torque_released", self.tool_name_str, {"motors": list(names) or "all"})
+        queue_safety_event("torque_released", self.tool_name_str, {"motors": list(names) or "all"})
         released = list(names or MOTOR_IDS)
         text = f"Torque is off: {', '.join(names) or 'all motors'}."
         if verdict["status"] == "error":
@@ -527,6 +532,10 @@ class ReachyDriver:
             "instruction": motion.name,
             "outcome": {"task_status": state, "instruction": motion.name, "why": why},
         }
+
+    def _release(self, about: None, deadline: float) -> None:
+        # Two requests, and each may take half of the time.
+        self.motors.release(max((deadline - time.monotonic()) / 2, 0.05))
 
     def _awake(self) -> str:
         joints = self.connection.feed.fresh_joints

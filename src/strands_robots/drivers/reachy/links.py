@@ -60,9 +60,18 @@ def open_socket(stack: contextlib.ExitStack, host: str, api_port: int, path: str
         raise missing_extra("Reachy Mini", "reachy") from exc
     url = f"ws://{url_host(host)}:{api_port}{path}"
     try:
-        # No compression: a frame of 300 bytes costs more to inflate than to carry. No keepalive: data shows life.
         return stack.enter_context(
-            connect(url, compression=None, ping_interval=None, open_timeout=CONNECT_S, close_timeout=0.5, proxy=None)
+            connect(
+                url,
+                # A frame of 300 bytes costs more to inflate than to carry.
+                compression=None,
+                # Data shows life.
+                ping_interval=None,
+                max_size=SMALL_BYTES,
+                open_timeout=CONNECT_S,
+                close_timeout=0.5,
+                proxy=None,
+            )
         )
     except (OSError, WebSocketException) as exc:
         raise DaemonUnreachableError(f"{url} did not open: {exc}.") from exc

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,14 +21,16 @@ from strands_robots.contract import RolloutEvent
 from strands_robots.drivers.reachy.connection import RUNNING_PATH, Connection, running_moves
 from strands_robots.drivers.reachy.links import open_socket
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonFaultError, DaemonUnreachableError
+from strands_robots.drivers.reachy.stop_rounds import StopRound, StopRounds
 from strands_robots.drivers.reachy.target import STREAM_HZ, Frames, Gesture, HeadPose, Target, ramp
 from strands_robots.envelope import error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.utils import ValidationError
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 FRAME_S = 1 / STREAM_HZ
 JITTER_SHARE = 0.75
@@ -100,22 +101,50 @@ class DaemonMoves:
             if uuid in self.running(deadline):
                 raise
 
-    def stop_all(self, own: str, deadline: float) -> tuple[frozenset[str], frozenset[str]]:
+    def stop_all(self, own: str, deadline: float) -> object:
         """Stop the move ``own`` (may be empty), then every other one, and list again.
 
         Returns:
-            The uuids that were asked to stop, and those that still run.
+            None where no move ran, else an envelope: ``stopped`` is False where a move is known to run on, and None
+            where the daemon does not say.
         """
-        stopped = frozenset({own} if own else ())
+        asked: set[str] = set()
+        failed: dict[str, str] = {}
+        doubt = ""
+
+        def stop(uuid: str) -> None:
+            asked.add(uuid)
+            try:
+                if time.monotonic() >= deadline:
+                    raise DaemonUnreachableError("no time was left")
+                self.stop(uuid, deadline)
+            except (DaemonError, ValidationError) as exc:
+                failed[uuid] = str(exc)
+
+        def listed() -> frozenset[str]:
+            nonlocal doubt
+            try:
+                return self.running(deadline)
+            except (DaemonError, ValidationError) as exc:
+                doubt = doubt or str(exc)
+                return frozenset(failed)
+
         if own:
-            self.stop(own, deadline)
-        others = self.running(deadline) - stopped
-        for uuid in others:
-            self.stop(uuid, deadline)
+            stop(own)
+        for uuid in listed() - asked:
+            stop(uuid)
         if self._connection.alive:
-            self._connection.link().stop_move()
-        stopped |= others
-        return stopped, self.running(deadline) if stopped else frozenset()
+            try:
+                self._connection.link().stop_move()
+            except DaemonError as exc:
+                doubt = doubt or str(exc)
+        left = listed() if asked else frozenset()
+        if left:
+            why = "; ".join(sorted({failed[uuid] for uuid in left if uuid in failed}))
+            return error(f"the daemon still runs {', '.join(sorted(left))}{why and ': ' + why}", stopped=False)
+        if doubt:
+            return error(f"the daemon does not say whether a move runs: {doubt}", stopped=None)
+        return success(f"stopped {len(asked)} moves", stopped=True, moves=sorted(asked)) if asked else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +188,11 @@ class MoveUpdates:
         self._stack.close()
 
 
+def round_s() -> float:
+    """Return the seconds in which the daemon must have answered a stop."""
+    return 0.85 * settings.number("STRANDS_HALT_DEADLINE_S")
+
+
 class MotionController:
     """Motions of one robot: streamed frames, and moves that the daemon plays."""
 
@@ -171,6 +205,7 @@ class MotionController:
         self._next_frame_at = 0.0
         self._current: ReachyMotion | None = None
         self._moved: ReachyMotion | None = None
+        self._rounds: StopRounds[ReachyMotion | None] = StopRounds(self._stop_moves)
         self._sent = Target()
         self._sent_on = 0
         self._body_yaw_sent_on = 0
@@ -285,26 +320,33 @@ class MotionController:
             self._end(motion, "completed")
 
     def halt_ordered(self) -> None:
-        """Note what moves; a motion whose permit is void counts as halted."""
-        if self._current is not None and self._current.running:
-            self._moved = self._current
+        """Note what moves, void its permits, and send the stop to the daemon at once.
+
+        The halt itself may wait behind an earlier one that waits for a daemon that hangs.
+        """
+        self._note_moved()
+        self._rounds.order(self._moved, round_s())
 
     def halt(self, reason: str) -> StopVerdict:
         """Stop every motion, from any thread, without waiting for a motion's start."""
-        self.halt_ordered()
-        self._gate.revoke()
-        deadline = time.monotonic() + 0.85 * settings.number("STRANDS_HALT_DEADLINE_S")
+        self._note_moved()
         motion, self._moved = self._moved, None
         if motion is not None:
             motion.detail = motion.detail or reason
             motion.cancelled.set()
+        stop = self._rounds.claim(motion, round_s())
         streamed = motion.name if motion is not None and not motion.of_daemon else "stream"
         return halt_each(
             {
-                streamed: lambda: self._stop_frames(motion, deadline),
-                "moves of the daemon": lambda: self._stop_moves(motion, deadline),
+                streamed: lambda: self._stop_frames(motion, stop.deadline),
+                "moves of the daemon": lambda: self._answer_of(stop),
             }
         )
+
+    def _note_moved(self) -> None:
+        if self._current is not None and self._current.running:
+            self._moved = self._current
+        self._gate.revoke()
 
     @contextlib.contextmanager
     def _started(
@@ -466,19 +508,26 @@ class MotionController:
         return success("no frame is sent any more", stopped=True) if streaming else None
 
     def _stop_moves(self, motion: ReachyMotion | None, deadline: float) -> object:
-        """Stop every running move and list again; None when there was none."""
+        """Stop every running move and list again; None when there was none.
+
+        On the thread of a round. The daemon is asked although it was never linked: other clients move it as well.
+        """
         if motion is not None and motion.of_daemon:
             motion.posted.wait(max(0.0, deadline - time.monotonic()))
-        if self._connection.connects == 0 and (motion is None or not motion.of_daemon):
-            # Never connected: nothing was ever asked of this daemon.
-            return None
-        stopped, left = self._moves.stop_all(motion.uuid if motion is not None else "", deadline)
-        if not stopped:
-            return None
-        self.forget_sent()
-        if left:
-            return error(f"the daemon still runs {', '.join(sorted(left))}", stopped=False)
-        return success(f"stopped {len(stopped)} moves", stopped=True, moves=sorted(stopped))
+        answer = self._moves.stop_all(motion.uuid if motion is not None else "", deadline)
+        if answer is not None:
+            self.forget_sent()
+        return answer
+
+    def _answer_of(self, stop: StopRound[ReachyMotion | None]) -> object:
+        """Return the daemon's answer; where it gives none, what is known without it."""
+        motion = stop.about
+        try:
+            return stop.wait()
+        except (TimeoutError, ImportError) as exc:
+            if motion is not None and motion.of_daemon:
+                return error(f"{motion.name} is not known to have ended: {exc}", stopped=False)
+            return error(f"the daemon was not asked: {exc}" if isinstance(exc, ImportError) else str(exc), stopped=None)
 
 
 def _uuid(path: str, answer: object) -> str:

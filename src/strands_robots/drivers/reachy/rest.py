@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import ipaddress
 import socket
+import ssl
 import threading
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.bounded_json import MESSAGE_MAX, OutOfBoundsError, json_object, parsed
+from strands_robots.bounded_json import OutOfBoundsError, json_object, parsed
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, choice, dial_host_error, missing_extra, number, port, shown
 
@@ -21,12 +23,10 @@ if TYPE_CHECKING:
 
 CONNECT_S = 2.0
 READ_S = 5.0
+ANSWER_MAX_BYTES = 2**19
+"""Longest answer that is read; a longer one is a fault of the daemon."""
 
-DETAIL_MAX = 1000
-
-ANSWER_MAX = MESSAGE_MAX
-"""Longest answer that is read, in bytes; the longest list of a daemon has some kilobytes."""
-
+DETAIL_MAX = 500
 METHODS = ("GET", "POST", "PUT", "DELETE")
 
 
@@ -108,15 +108,18 @@ class RestClient:
         host: bare hostname or IP literal.
         api_port: TCP port of the daemon.
         read_s: seconds to wait for an answer.
+        longest: bytes of an answer beyond which it is not read.
 
     Raises:
         ValidationError: a host or port that cannot be dialled.
     """
 
-    def __init__(self, host: str, api_port: int = 8000, *, read_s: float = READ_S) -> None:
+    def __init__(
+        self, host: str, api_port: int = 8000, *, read_s: float = READ_S, longest: int = ANSWER_MAX_BYTES
+    ) -> None:
         self.host = checked_host(host)
         self.port = port("api_port", api_port)
-        self._read_s = read_s
+        self._read_s, self._longest = read_s, longest
         self._lock = threading.Lock()
         self._pool: _Pool | None = None
 
@@ -138,9 +141,17 @@ class RestClient:
         pool = self._enter()
         try:
             limit = pool.client.timeout if within_s is None else max(0.01, within_s)
+            began = time.monotonic()
             with pool.client.stream(method, path, json=body, timeout=limit) as answer:
-                content = _content(answer)
-            if answer.status_code >= 500 or content is None:
+                text = bytearray()
+                for part in answer.iter_raw():
+                    text += part
+                    if len(text) > self._longest:
+                        self._retire(pool)
+                        raise DaemonFaultError(f"{method} {path}: the answer is longer than {self._longest} bytes.")
+                    if within_s is not None and time.monotonic() - began > within_s:
+                        raise httpx.ReadTimeout("the answer did not end in time")
+            if answer.status_code >= 500:
                 # After a 500 the daemon resets the kept-alive connection under the next request.
                 self._retire(pool)
         except (httpx.HTTPError, httpx.InvalidURL, OSError) as exc:
@@ -149,17 +160,15 @@ class RestClient:
             raise DaemonUnreachableError(f"{self.host}:{self.port} did not answer {method} {path}: {reason}.") from exc
         finally:
             self._leave(pool)
-        status: int = answer.status_code
-        if content is None:
-            raise DaemonFaultError(f"{method} {path}: the answer is longer than {ANSWER_MAX} bytes.", status)
         if not answer.is_success:
-            raise _KINDS.get(status, DaemonFaultError)(f"{method} {path}: {_detail(status, content)}", status)
+            kind = _KINDS.get(answer.status_code, DaemonFaultError)
+            raise kind(f"{method} {path}: {_detail(answer.status_code, bytes(text))}", answer.status_code)
         try:
-            return parsed(content, ANSWER_MAX)
+            return parsed(bytes(text), self._longest)
         except OutOfBoundsError as exc:
-            raise DaemonFaultError(f"{method} {path}: the answer cannot be read: {exc}.", status) from exc
+            raise DaemonFaultError(f"{method} {path}: the answer cannot be read: {exc}.", answer.status_code) from exc
         except ValueError as exc:
-            raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", status) from exc
+            raise DaemonFaultError(f"{method} {path}: the answer is not JSON.", answer.status_code) from exc
 
     def close(self) -> None:
         """Close the connections, each after its requests; a request opens new ones."""
@@ -170,19 +179,28 @@ class RestClient:
 
     def _enter(self) -> _Pool:
         with self._lock:
+            if self._pool is not None:
+                self._pool.users += 1
+                return self._pool
+        # Not under the lock: a name server that hangs would hold up the request behind this one.
+        httpx = _httpx()
+        fresh = _Pool(
+            httpx.Client(
+                base_url=f"http://{url_host(self.host)}:{self.port}",
+                timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
+                # An answer is read up to its bound, which nothing that was compressed keeps.
+                headers={"Accept-Encoding": "identity"},
+                # The daemon speaks plain HTTP: reading the system's certificates would cost a stop its first 50 ms.
+                verify=ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
+                # A robot is on the local network: a proxy of the environment is not asked.
+                trust_env=False,
+            ),
+            users=1,
+        )
+        with self._lock:
             if self._pool is None:
-                httpx = _httpx()
-                self._pool = _Pool(
-                    httpx.Client(
-                        base_url=f"http://{url_host(self.host)}:{self.port}",
-                        timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
-                        headers={"Accept-Encoding": "identity"},
-                        # A robot is on the local network: a proxy of the environment is not asked.
-                        trust_env=False,
-                    )
-                )
-            self._pool.users += 1
-            return self._pool
+                self._pool = fresh
+        return fresh
 
     def _retire(self, pool: _Pool) -> None:
         with self._lock:
@@ -248,21 +266,10 @@ def _httpx() -> Any:
     return httpx
 
 
-def _content(answer: httpx.Response) -> bytes | None:
-    """Return the body of an answer, or None where it is too long to be read."""
-    content = bytearray()
-    # As sent: a few packed bytes could become any number.
-    for chunk in answer.iter_raw():
-        content += chunk
-        if len(content) > ANSWER_MAX:
-            return None
-    return bytes(content)
-
-
-def _detail(status: int, content: bytes) -> str:
+def _detail(status: int, body: bytes) -> str:
     """Return the daemon's ``detail``, the first of a validation list, or the body."""
-    text = content[:DETAIL_MAX].decode(errors="replace")
-    detail: Any = json_object(content, ANSWER_MAX).get("detail", text) if content[:1] == b"{" else text
+    text = body[:DETAIL_MAX].decode(errors="replace")
+    detail: Any = json_object(body, ANSWER_MAX_BYTES).get("detail", text) if body[:1] == b"{" else text
     if isinstance(detail, list) and detail and isinstance(detail[0], dict):
         location = ".".join(str(part) for part in detail[0].get("loc", ()))
         detail = f"{location}: {detail[0].get('msg', '')}"
