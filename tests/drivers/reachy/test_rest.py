@@ -94,7 +94,7 @@ def test_body_that_is_no_json_is_a_fault() -> None:
 @respx.mock
 def test_body_beyond_the_bound_is_not_read() -> None:
     respx.get(f"{HERE}/x").mock(return_value=httpx.Response(200, content=b"[" + b"1," * 100 + b"1]"))
-    with pytest.raises(DaemonUnreachableError, match="longer than 100 bytes"):
+    with pytest.raises(DaemonFaultError, match="longer than 100 bytes"):
         RestClient("127.0.0.1", longest=100).get("/x")
 
 
