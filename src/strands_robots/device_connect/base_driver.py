@@ -35,9 +35,9 @@ from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control import ControlChange
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
-from strands_robots.serving.robot_verbs import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
+from strands_robots.serving.world_stops import stop_within
 from strands_robots.utils import WAIT_S, ValidationError, shown, text
 
 logger = stop_logger(__name__)

@@ -29,8 +29,8 @@ from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.pipeline import Own, Pipeline
-from strands_robots.serving.robot_verbs import RobotStop
 from strands_robots.serving.verbs import Arguments, Verb
+from strands_robots.serving.world_stops import RobotStop
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)

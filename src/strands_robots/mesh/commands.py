@@ -20,11 +20,12 @@ from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
-from strands_robots.serving.robot_verbs import peer_stop_answer, robot_stop, run_to_end, stop_within
+from strands_robots.serving.robot_verbs import peer_stop_answer, run_to_end
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
+from strands_robots.serving.world_stops import robot_stop, stop_within
 from strands_robots.utils import ValidationError, shown
 
 logger = stop_logger(__name__)
