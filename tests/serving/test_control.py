@@ -12,19 +12,13 @@ from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import eventually
 
 from strands_robots.safety import ed25519
-from strands_robots.serving.control import (
-    PURPOSE,
-    VERSION,
-    ControlChange,
-    ControlLease,
-    LeaseWatch,
-    NotHolderError,
-    leases_of,
-    sign_take,
-)
+from strands_robots.serving.control import ControlLease, NotHolderError, leases_of
+from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.lease_watch import LeaseWatch
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.take_assertion import PURPOSE, VERSION, sign_take
 
 KEY = Ed25519PrivateKey.generate()
 SECRET = "a secret of agent-a"
@@ -62,7 +56,7 @@ class Bench:
         self.lease = ControlLease(
             "arm-1",
             self.body.halt,
-            lambda: self.body.moves,
+            self.moving,
             hardware=hardware,
             keys=lambda: keys,
             clock=self.clock,
@@ -70,6 +64,9 @@ class Bench:
             watched=lambda lease: None,
         )
         self.lease.observe(self.changes.append)
+
+    def moving(self) -> bool | None:
+        return self.body.moves
 
     def acquire(self, who: str = "agent-a", ttl_s: float = 60.0, kind: str = "agent") -> str:
         return str(self.lease.acquire(who, kind, ttl_s)["lease_id"])
@@ -220,7 +217,7 @@ def test_human_takes_control_and_the_motion_is_halted_before_the_answer(bench: B
         ({"t": 0.0}, "not fresh"),
         ({"t": True}, "not fresh"),
         ({"t": 1e9}, "not fresh"),
-        ({"nonce": 3}, "used before"),
+        ({"nonce": 3}, "nonce of the assertion"),
     ],
 )
 def test_assertion_for_something_else_takes_nothing(bench: Bench, changed: dict[str, Any], why: str) -> None:
@@ -385,9 +382,8 @@ class Unreadable(Bench):
     def __init__(self) -> None:
         super().__init__()
         self.state: bool | Exception | None = True
-        self.lease._moving = self.read
 
-    def read(self) -> bool | None:
+    def moving(self) -> bool | None:
         """Answer, or raise, as the test has set it."""
         if isinstance(self.state, Exception):
             raise self.state

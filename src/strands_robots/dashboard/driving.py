@@ -16,7 +16,8 @@ from typing import Any
 from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.envelope import Envelope, error, is_error, text_of
 from strands_robots.safety.stopping import grade
-from strands_robots.serving.control import HUMAN, sign_take
+from strands_robots.serving.control import HUMAN
+from strands_robots.serving.take_assertion import sign_take
 from strands_robots.serving.verbs import LEASE_ID
 from strands_robots.utils import ValidationError, choice, number, shown, text
 

@@ -33,7 +33,7 @@ from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.control import ControlChange
+from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future

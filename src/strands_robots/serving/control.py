@@ -5,7 +5,11 @@ holds the robot until it has ended, so that two programs never move one arm in t
 and a lockout is separate and stronger. A lease prevents accidents among programs that behave; what keeps out others is
 authorization and the operator's approval.
 
-Leases live in memory: a restart of the robot's process voids them all.
+Leases live in memory: a restart of the robot's process ends them all. Their epochs outlive it, see
+:mod:`~strands_robots.serving.control_epochs`.
+
+Nothing foreign delays the end of a lease. The stop executor carries out the halt, its verdict and the observers come
+afterwards, and a robot whose state cannot be read in time counts as moving.
 """
 
 from __future__ import annotations
@@ -16,19 +20,26 @@ import secrets
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Protocol, cast
 from weakref import WeakKeyDictionary
 
 from strands_robots.contract import AT_REST, RUNNING, Robot, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
-from strands_robots.safety.resume import NEWEST_S, NONCES_MAX, OLDEST_S, configured_keys
+from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.utils import shown
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
+from strands_robots.serving.control_epochs import FirstEpoch
+from strands_robots.serving.lease_watch import LeaseWatch
+from strands_robots.serving.take_assertion import outdated, unproven
+from strands_robots.serving.workers import UNBOUNDED, BoundedCall, Share, ShareFullError
+from strands_robots.serving.world_stops import RobotStop, stop_within
 
 logger = logging.getLogger(__name__)
 
@@ -44,11 +55,17 @@ DISPLACED_MAX = 16
 FOLLOW = "teleop_receive"
 """The motion of a human: a leader's stream."""
 
-PURPOSE = "take-control"
-TAKE_FIELDS = frozenset({"v", "purpose", "robot", "epoch", "t", "nonce", "sig"})
-"""Fields of the operator's assertion; ``sig`` is the Ed25519 signature over the canonical JSON of the others."""
+STATUS_S = 0.25
+"""Longest wait of a call for the robot's own word that its motion has ended. Without it the motion goes on."""
 
-VERSION = 1
+EPOCH_S = 1.0
+"""Longest wait of a call for the disk to reserve the first epoch."""
+
+CHANGES_MAX = 256
+"""Changes that wait for an observer that hangs; the next is not told."""
+
+Halt = Callable[[str], Future[StopVerdict] | None]
+"""Orders a halt for a reason, and returns before it is carried out; None where there is no verdict to wait for."""
 
 
 class NotHolderError(StrandsRobotsError, RuntimeError):
@@ -84,53 +101,6 @@ class Lease:
         return None if self.until is None or self.one_motion else round(max(self.until - now, 0.0), 3)
 
 
-@dataclass(frozen=True, slots=True)
-class ControlChange:
-    """A change of the holder, as observers are told.
-
-    Attributes:
-        event: ``acquired``, ``released``, ``expired`` or ``taken``.
-        reason: the one that a human gave for taking control.
-    """
-
-    event: str
-    robot: str
-    holder: str
-    kind: str
-    epoch: int
-    reason: str = ""
-
-
-OnChange = Callable[[ControlChange], None]
-
-
-class _Observers:
-    """Observers of a holder's changes; thread-safe, and one that fails alone."""
-
-    def __init__(self) -> None:
-        self._changing = threading.Lock()
-        self._observers: tuple[OnChange, ...] = ()
-
-    def add(self, observer: OnChange) -> Callable[[], None]:
-        """Tell ``observer`` of every change; return what ends that."""
-        with self._changing:
-            self._observers = (*self._observers, observer)
-
-        def end() -> None:
-            with self._changing:
-                self._observers = tuple(each for each in self._observers if each is not observer)
-
-        return end
-
-    def tell(self, change: ControlChange) -> None:
-        """Hand a change to every observer."""
-        for observer in self._observers:
-            try:
-                observer(change)
-            except Exception:
-                logger.exception("An observer of the control lease failed.")
-
-
 class Admission:
     """Leave of one motion to begin; of a holder with a lease it is nothing to end.
 
@@ -149,62 +119,6 @@ class Admission:
             self._starting.discard(self)
 
 
-def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], float] = time.time) -> dict[str, Any]:
-    """Return the operator's assertion that takes ``robot`` from its holder."""
-    body = {
-        "v": VERSION,
-        "purpose": PURPOSE,
-        "robot": robot,
-        "epoch": epoch,
-        "t": clock(),
-        "nonce": secrets.token_hex(16),
-    }
-    return {**body, "sig": ed25519.encode(signing_key.sign(ed25519.canonical(body)))}
-
-
-class LeaseWatch:
-    """One thread that ends leases in time; it lives as long as there is one."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._leases: set[ControlLease] = set()
-        self._thread: threading.Thread | None = None
-
-    @property
-    def running(self) -> bool:
-        """True while there is a lease to end."""
-        return self._thread is not None
-
-    def add(self, lease: ControlLease) -> None:
-        """Watch a lease until it is over."""
-        with self._changed:
-            self._leases.add(lease)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._work, name="control-leases", daemon=True)
-                self._thread.start()
-            self._changed.notify_all()
-
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._leases = {each for each in self._leases if each.due is not None}
-                if not self._leases:
-                    self._thread = None
-                    return
-                due = [(at, each) for each in self._leases if (at := each.due) is not None]
-                wait = min((at for at, _ in due), default=time.monotonic()) - time.monotonic()
-                if wait > 0:
-                    self._changed.wait(wait)
-                    continue
-            for at, each in due:
-                if at <= time.monotonic():
-                    try:
-                        each.expire()
-                    except Exception:
-                        # The other leases must still end in time.
-                        logger.critical("What the holder of a lease moved was not halted at its end.", exc_info=True)
-
-
 watch: Callable[[ControlLease], None] = LeaseWatch().add
 """Ends a lease when its time is over."""
 
@@ -216,18 +130,19 @@ class ControlLease:
         robot: its name in messages.
         halt: stops what the robot does, without a lockout.
         moving: whether it moves now, None where its state is unknown; asked only while the lease of one motion is in
-            the way, and under no lock.
+            the way, on a thread of its own. It may hang.
         led_by: the leader at the robot's own machine that drives it, empty without one.
         hardware: False for a simulation, which a human may take without a key where none is configured.
         clock: monotonic seconds.
         wall: wall-clock seconds, against which an assertion's age is held.
         watched: has :meth:`expire` called at :attr:`due`.
+        first_epoch: where :attr:`epoch` begins when an operator's key is configured; at 0 by default.
     """
 
     def __init__(
         self,
         robot: str,
-        halt: Callable[[str], object],
+        halt: Halt,
         moving: Callable[[], bool | None],
         *,
         led_by: Callable[[], str] = lambda: "",
@@ -236,10 +151,12 @@ class ControlLease:
         clock: Callable[[], float] = time.monotonic,
         wall: Callable[[], float] = time.time,
         watched: Callable[[ControlLease], None] = watch,
+        first_epoch: FirstEpoch | None = None,
     ) -> None:
         self._robot = robot
         self._halt = halt
-        self._moving = moving
+        self._moving = BoundedCall(moving)
+        self._fault = ""
         self._led_by = led_by
         self._hardware = hardware
         self._keys = keys
@@ -248,10 +165,14 @@ class ControlLease:
         self._lease: Lease | None = None
         self._starting: set[Admission] = set()
         self._displaced: dict[str, str] = {}
-        self._nonces: dict[str, float] = {}
-        self._observers = _Observers()
-        self.epoch = 0
-        """Rises with every new holder."""
+        self._observers = Observers()
+        self._first_epoch = first_epoch
+        self._holders = 0
+
+    @property
+    def epoch(self) -> int:
+        """Number that rises with every new holder, over restarts of the process as well."""
+        return self._holders + (0 if self._first_epoch is None else self._first_epoch.value)
 
     @property
     def due(self) -> float | None:
@@ -266,6 +187,8 @@ class ControlLease:
     def facts(self) -> dict[str, Any]:
         """Return the holder as everyone may read it."""
         self._settle()
+        if self._keys():
+            self._unreserved()
         lease = self._lease
         if lease is None:
             return {"held": False, "epoch": self.epoch}
@@ -295,7 +218,10 @@ class ControlLease:
             lease = self._lease
             if lease is not None and not _owns(lease, holder, lease_id):
                 raise self._not_holder("acquireControl", lease)
-            return self._give(holder, kind, ttl_s, "acquired")
+            given = self._give(holder, kind, ttl_s)
+            answer = self._answer(given, self.epoch)
+        self._tell("acquired", given)
+        return answer
 
     def renew(self, lease_id: str) -> Envelope:
         """Start the lease's time anew.
@@ -326,23 +252,27 @@ class ControlLease:
 
         Args:
             robot: the name that the assertion has to bear.
-            assertion: of :func:`sign_take`.
+            assertion: of :func:`~strands_robots.serving.take_assertion.sign_take`.
         """
-        holder = _name(caller)
+        holder, keys = _name(caller), self._keys()
+        problem = self._unproven(robot, assertion, keys)
         with self._changing:
-            problem = self._unproven(robot, assertion)
-            if problem is not None:
-                logger.warning("%s: takeControl of %s refused: %s.", robot, holder, problem)
-                return error(f"takeControl is refused: {problem}.", code="not_proven", epoch=self.epoch)
+            if problem is None and keys:
+                problem = outdated(cast("dict[str, Any]", assertion), self.epoch, self._wall())
             before = self._lease
-            if before is not None:
+            lease = self._give(holder, HUMAN, TTL_S) if problem is None else None
+            epoch = self.epoch
+            if lease is not None and before is not None:
                 self._displaced[before.lease_id] = holder
                 while len(self._displaced) > DISPLACED_MAX:
                     del self._displaced[next(iter(self._displaced))]
-            answer = self._give(holder, HUMAN, TTL_S, "taken", reason)
+        if lease is None:
+            logger.warning("%s: takeControl of %s refused: %s.", robot, holder, problem)
+            return error(f"takeControl is refused: {problem}.", code="not_proven", epoch=epoch)
         # Before the answer: whoever took control must not meet the last write of the one who lost it.
-        self._halt(f"control taken by {holder}: {reason}")
-        return answer
+        halting = self._halt(f"control taken by {holder}: {reason}")
+        self._tell("taken", lease, reason)
+        return self._answer(lease, epoch, None if halting is None else halting.result())
 
     def admit(self, verb: str, caller: object, lease_id: str, ttl_s: float = 0.0) -> Admission:
         """Admit a motion of the holder, or hold a free robot for it.
@@ -371,8 +301,7 @@ class ControlLease:
             # Known by its name alone; without a lease_id nobody can renew it.
             self._lease = Lease(holder, kind, secrets.token_hex(16), one_motion=True)
             return
-        self._lease = Lease(holder, kind, lease_id, ttl_s, self._clock() + ttl_s, one_motion=True)
-        self._watched(self)
+        self._hold(Lease(holder, kind, lease_id, ttl_s, self._clock() + ttl_s, one_motion=True))
 
     def refuse_others(self, verb: str, caller: object, lease_id: str) -> None:
         """Refuse a motion of the whole world, unless it is the holder's.
@@ -386,54 +315,87 @@ class ControlLease:
             if lease is not None and not _owns(lease, _name(caller), lease_id):
                 raise self._not_holder(verb, lease)
 
-    def expire(self) -> None:
-        """End a lease whose time is over, and halt what its holder began."""
+    def expire(self, within: float = STATUS_S) -> None:
+        """End a lease whose time is over, and order the halt of what its holder began.
+
+        Args:
+            within: seconds to wait at most for the robot's state, where only its holder's one motion is to be halted.
+        """
         lease = self._lease
         if lease is None or lease.until is None or self._clock() < lease.until:
             return
         # An unknown state is no rest: what cannot be read is halted.
-        moves = not lease.one_motion or bool(self._starting) or self._activity() is not False
+        moves, fault = True, ""
+        if lease.one_motion and not self._starting:
+            state, fault = self._state(within)
+            moves = state is not False
         with self._changing:
             if self._lease is not lease:  # renewed or given to another meanwhile
                 return
             self._lease = None
-        if not moves:
-            return
-        logger.warning("%s: the control lease of %s is over; what it moved is halted.", self._robot, lease.holder)
         try:
-            self._halt(f"the control lease of {lease.holder} is over")
+            if moves:
+                self._halt(f"the control lease of {lease.holder} is over")
         finally:
-            self._tell("expired", lease)
+            # A log may block, so it is written when the halt was ordered.
+            self._note(fault)
+            if moves:
+                logger.warning("%s: the control lease of %s is over; its motion is halted.", self._robot, lease.holder)
+                self._tell("expired", lease)
 
-    def _activity(self) -> bool | None:
-        """Return whether it moves, None if unknown; an error counts as motion."""
+    def _state(self, within: float) -> tuple[bool | None, str]:
+        """Return whether it moves, None if unknown, and why it could not be read."""
         try:
-            return self._moving()
-        except Exception:
-            logger.exception("%s: its state could not be read, so it counts as moving.", self._robot)
-            return True
+            return self._moving(within), ""
+        except Exception as exc:  # noqa: BLE001 - a foreign status raises what it likes
+            return True, f"{type(exc).__name__}: {exc}"
+
+    def _note(self, fault: str) -> None:
+        """Log a fault of the robot's state, unless it is the last one still."""
+        last, self._fault = self._fault, fault
+        if fault and fault != last:
+            logger.error("%s: its state could not be read, so it counts as moving: %s", self._robot, fault)
 
     def _settle(self) -> None:
         """End a lease that is over, by its time or with its motion."""
         self.expire()
         lease = self._lease
-        if lease is None or not lease.one_motion or self._starting or self._activity():
+        if lease is None or not lease.one_motion or self._starting:
+            return
+        moves, fault = self._state(STATUS_S)
+        self._note(fault)
+        if moves:
             return
         with self._changing:
             if self._lease is lease and not self._starting:
                 self._lease = None
 
-    def _give(self, holder: str, kind: str, ttl_s: float, event: str, reason: str = "") -> Envelope:
-        lease = self._lease = Lease(holder, kind, secrets.token_hex(16), ttl_s, self._clock() + ttl_s)
-        self.epoch += 1
-        self._watched(self)
-        self._tell(event, lease, reason)
+    def _hold(self, lease: Lease) -> Lease:
+        """Make it the robot's lease, which ends in its time from now on."""
+        before, self._lease = self._lease, lease
+        try:
+            self._watched(self)
+        except RuntimeError:  # no thread can be started
+            self._lease = before
+            raise
+        return lease
+
+    def _give(self, holder: str, kind: str, ttl_s: float) -> Lease:
+        lease = self._hold(Lease(holder, kind, secrets.token_hex(16), ttl_s, self._clock() + ttl_s))
+        self._holders += 1
+        return lease
+
+    def _answer(self, lease: Lease, epoch: int, verdict: StopVerdict | None = None) -> Envelope:
+        held = f"{lease.holder} holds control for {lease.ttl_s:g} s"
+        text = f"{held}; give lease_id with every motion, each one renews it."
+        if verdict is not None and not verdict.stopped:
+            text = f"{text} {self._robot} may still move: {_doubts(verdict)}"
         return success(
-            f"{holder} holds control for {ttl_s:g} s; give lease_id with every motion, each one renews it.",
+            text,
             lease_id=lease.lease_id,
-            epoch=self.epoch,
-            kind=kind,
-            expires_in_s=ttl_s,
+            epoch=epoch,
+            kind=lease.kind,
+            expires_in_s=lease.ttl_s,
         )
 
     def _used(self, verb: str, lease_id: str, at_most_s: float = 0.0) -> Lease:
@@ -441,9 +403,10 @@ class ControlLease:
         if lease is not None and _is(lease, lease_id):
             if lease.ttl_s is not None:
                 ttl_s = min(lease.ttl_s, at_most_s or lease.ttl_s)
-                lease = self._lease = replace(lease, ttl_s=ttl_s, until=self._clock() + ttl_s)
+                lease = replace(lease, ttl_s=ttl_s, until=self._clock() + ttl_s)
                 if at_most_s:
-                    self._watched(self)  # which may wait for a later moment
+                    return self._hold(lease)  # the watch may wait for a later moment
+                self._lease = lease
             return lease
         taker = self._displaced.get(lease_id)
         if taker is not None:
@@ -464,39 +427,23 @@ class ControlLease:
             expires_in_s=left,
         )
 
-    def _unproven(self, robot: str, assertion: object) -> str | None:
-        keys = self._keys()
+    def _unproven(self, robot: str, assertion: object, keys: Sequence[bytes]) -> str | None:
+        """Return why the robot is not shown to be taken by an operator, or None."""
         if not keys:
-            if not self._hardware:
-                return None
-            return "no operator's key is configured here (STRANDS_MESH_RESUME_PUBLIC_KEY; strands-robots keys resume)"
-        if not assertion:
-            return "it needs the operator's signature (assertion; strands-robots take --key FILE)"
-        if not isinstance(assertion, Mapping) or set(assertion) != TAKE_FIELDS:
-            return f"assertion must have exactly the fields {', '.join(sorted(TAKE_FIELDS))}"
-        body = {name: value for name, value in assertion.items() if name != "sig"}
-        signature = ed25519.decode(assertion["sig"], 64)
-        try:
-            signed = signature is not None and ed25519.signed_by_one_of(keys, signature, ed25519.canonical(body))
-        except (ValueError, TypeError, RecursionError):
-            signed = False
-        if not signed:
-            return "no configured key made the signature"
-        if (body["v"], body["purpose"], body["robot"]) != (VERSION, PURPOSE, robot):
-            return f"the assertion is for something else than taking control of {robot}"
-        if body["epoch"] != self.epoch or isinstance(body["epoch"], bool):
-            return f"the assertion names epoch {shown(body['epoch'])}, and the lease has epoch {self.epoch}"
-        return self._stale(body["t"], body["nonce"])
-
-    def _stale(self, at: object, nonce: object) -> str | None:
-        if isinstance(at, bool) or not isinstance(at, int | float) or not -NEWEST_S < self._wall() - at < OLDEST_S:
-            return "the assertion is not fresh"
-        now = self._clock()
-        self._nonces = {key: used for key, used in self._nonces.items() if now - used <= OLDEST_S + NEWEST_S}
-        if not isinstance(nonce, str) or nonce in self._nonces or len(self._nonces) >= NONCES_MAX:
-            return "the assertion was used before"
-        self._nonces[nonce] = now
+            setting = "STRANDS_MESH_RESUME_PUBLIC_KEY; strands-robots keys resume"
+            return f"no operator's key is configured here ({setting})" if self._hardware else None
+        problem = unproven(assertion, robot, keys)
+        if problem is not None:
+            return problem
+        unreserved = self._unreserved()
+        if unreserved is not None:
+            return f"it could be taken again with this assertion after a restart, because {unreserved}"
         return None
+
+    def _unreserved(self) -> str | None:
+        """Reserve the first epoch; return what prevents it, or None."""
+        problem = None if self._first_epoch is None else self._first_epoch.reserved(EPOCH_S)
+        return None if problem is None else f"its epoch cannot be kept in the state directory ({problem})"
 
     def _tell(self, event: str, lease: Lease, reason: str = "") -> None:
         change = ControlChange(event, self._robot, lease.holder, lease.kind, self.epoch, reason)
@@ -524,7 +471,9 @@ class ControlLeases:
         self._served: list[weakref.ref[Robot]] = []
         self._by_name: dict[str, ControlLease] = {}
         self._changing = threading.Lock()
-        self._observers = _Observers()
+        self._observers, self._telling = Observers(), Share(1, CHANGES_MAX)
+        self._first_epoch = FirstEpoch()
+        self._first_robot = ""
         self._streams: weakref.WeakSet[InputStreams] = weakref.WeakSet()
 
     def attach(self, streams: InputStreams) -> None:
@@ -542,7 +491,7 @@ class ControlLeases:
             self._served = [*(each for each in self._served if each() is not None), weakref.ref(robot)]
 
     def observe(self, observer: OnChange) -> Callable[[], None]:
-        """Tell ``observer`` of every change of a holder; return what ends that."""
+        """Tell ``observer``, on another thread, of every change; return what ends that."""
         return self._observers.add(observer)
 
     def of(self, name: str = "") -> ControlLease:
@@ -550,20 +499,23 @@ class ControlLeases:
         robot = self._robot()
         if not isinstance(robot, WorldRobot):
             name = ""
-        elif not name:
-            name = next(iter(robot.list_robots()), "")
+        else:
+            # Kept: an expiry asks the world for nothing.
+            self._first_robot = next(iter(robot.list_robots()), "")
+            name = name or self._first_robot
         with self._changing:
             lease = self._by_name.get(name)
             if lease is None:
                 shown_as = name or ("" if robot is None else robot.tool_name_str)
                 lease = self._by_name[name] = ControlLease(
                     shown_as,
-                    lambda reason: self._halt(name, reason),
+                    lambda reason: self._halt(name, shown_as, reason),
                     lambda: self._moves(name),
                     led_by=lambda: self._led_by(name),
                     hardware=self._hardware,
+                    first_epoch=self._first_epoch,
                 )
-                lease.observe(self._observers.tell)
+                lease.observe(self._tell)
         return lease
 
     def admit(self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0) -> Admission:
@@ -588,10 +540,14 @@ class ControlLeases:
     def _robot(self) -> Robot | None:
         return next((robot for each in self._served if (robot := each()) is not None), None)
 
+    def _tell(self, change: ControlChange) -> None:
+        try:
+            self._telling.submit(partial(self._observers.tell, change))
+        except ShareFullError:
+            logger.warning("%s: an observer of its holder hangs and is not told: %s.", change.robot, change.event)
+
     def _streams_of(self, name: str) -> list[InputStreams]:
-        robot = self._robot()
-        first = next(iter(robot.list_robots()), "") if isinstance(robot, WorldRobot) else name
-        return list(self._streams) if name == first else []
+        return list(self._streams) if name == self._first_robot else []
 
     def _led_by(self, name: str) -> str:
         """Return the leader at this machine that drives the robot, empty without one."""
@@ -612,14 +568,17 @@ class ControlLeases:
         state = str(status().get("task_status", "")).lower()
         return state in RUNNING if state in RUNNING | AT_REST else None
 
-    def _halt(self, name: str, reason: str) -> None:
+    def _halt(self, name: str, shown_as: str, reason: str) -> Future[StopVerdict] | None:
+        """Order the halt of the robot, or of the named robot of the world."""
         for each in self._streams_of(name):
             each.void()
         robot = self._robot()
-        if isinstance(robot, WorldRobot):
-            robot.stop_policy(name)
-        elif robot is not None:
-            stop_executor().halt(robot, robot.tool_name_str, reason)
+        if robot is None:
+            return None
+        target = RobotStop(cast(WorldRobot, robot), name) if name else robot
+        halting = stop_executor().submit(target, shown_as, reason, within=stop_within(target))
+        halting.add_done_callback(partial(_report, shown_as))
+        return halting
 
 
 _LEASES: WeakKeyDictionary[Any, ControlLeases] = WeakKeyDictionary()
@@ -667,6 +626,19 @@ class _Strong(ControlLeases):
 
     def _robot(self) -> Robot | None:
         return self._kept
+
+
+def _report(robot: str, halted: Future[StopVerdict]) -> None:
+    """Log a robot that may still move, on another thread than the executor's."""
+    verdict = halted.result()
+    if not verdict.stopped:
+        doubts = _doubts(verdict)
+        UNBOUNDED.submit(lambda: logger.critical("%s may still move after the end of a lease: %s", robot, doubts))
+
+
+def _doubts(verdict: StopVerdict) -> str:
+    reasons = {**verdict.unknown, **verdict.not_stopped}
+    return "; ".join(f"{name}: {why}" for name, why in reasons.items())
 
 
 def _name(caller: object) -> str:

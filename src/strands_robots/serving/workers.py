@@ -12,11 +12,12 @@ import contextlib
 import queue
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
 from strands_robots.contract import body_of
@@ -149,6 +150,39 @@ class Share:
 
 UNBOUNDED = Share(sys.maxsize)
 """Work of the process itself, which belongs to no robot."""
+
+
+class BoundedCall(Generic[T]):
+    """Call of something foreign on a thread of the pool, awaited within a bound.
+
+    One call runs at a time. While it hangs, no second thread is given to it and nobody waits for it again.
+    """
+
+    def __init__(self, call: Callable[[], T]) -> None:
+        self._call = call
+        self._starting = threading.Lock()
+        self._latest: tuple[Future[T], float] | None = None
+
+    def __call__(self, within: float) -> T:
+        """Return what a call that began after this one returns, or raise its error.
+
+        Raises:
+            TimeoutError: no answer within ``within`` seconds, or one has been awaited for as long already.
+        """
+        asked = time.monotonic()
+        while True:
+            with self._starting:
+                latest = self._latest
+                if latest is None or latest[0].done():
+                    began = time.monotonic()
+                    latest = self._latest = (UNBOUNDED.call(self._call), began)
+            future, began = latest
+            try:
+                future.exception(max(0.0, min(asked, began) + within - time.monotonic()))
+            except TimeoutError:
+                raise TimeoutError(f"no answer in {within:g} s") from None
+            if began >= asked:
+                return future.result()
 
 
 class Shares:
