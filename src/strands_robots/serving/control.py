@@ -58,6 +58,9 @@ FOLLOW = "teleop_receive"
 STATUS_S = 0.25
 """Longest wait of a call for the robot's own word that its motion has ended. Without it the motion goes on."""
 
+LATE_STATUS_S = 0.03
+"""Least time for it at the end of a lease."""
+
 EPOCH_S = 1.0
 """Longest wait of a call for the disk to reserve the first epoch."""
 
@@ -315,20 +318,22 @@ class ControlLease:
             if lease is not None and not _owns(lease, _name(caller), lease_id):
                 raise self._not_holder(verb, lease)
 
-    def expire(self, within: float = STATUS_S) -> None:
+    def expire(self, ahead: float = 0.0) -> None:
         """End a lease whose time is over, and order the halt of what its holder began.
 
         Args:
-            within: seconds to wait at most for the robot's state, where only its holder's one motion is to be halted.
+            ahead: seconds before that time from which the robot's state may be read. The call then lasts until it.
         """
         lease = self._lease
-        if lease is None or lease.until is None or self._clock() < lease.until:
+        if lease is None or lease.until is None or (left := lease.until - self._clock()) > ahead:
             return
         # An unknown state is no rest: what cannot be read is halted.
         moves, fault = True, ""
         if lease.one_motion and not self._starting:
-            state, fault = self._state(within)
+            state, fault = self._state(max(left, LATE_STATUS_S) if ahead else STATUS_S)
             moves = state is not False
+        # A motion that is admitted meanwhile renews the lease, so a robot that was at rest still is.
+        time.sleep(max(0.0, lease.until - self._clock()))
         with self._changing:
             if self._lease is not lease:  # renewed or given to another meanwhile
                 return
