@@ -15,7 +15,6 @@ afterwards, and a robot whose state cannot be read in time counts as moving.
 from __future__ import annotations
 
 import hmac
-import logging
 import secrets
 import threading
 import time
@@ -33,15 +32,16 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
 from strands_robots.serving.control_epochs import FirstEpoch
 from strands_robots.serving.lease_watch import LeaseWatch
 from strands_robots.serving.take_assertion import outdated, unproven
-from strands_robots.serving.workers import UNBOUNDED, BoundedCall, Share, ShareFullError
+from strands_robots.serving.workers import BoundedCall, Share, ShareFullError
 from strands_robots.serving.world_stops import RobotStop, stop_within
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 HUMAN, AGENT, POLICY = "human", "agent", "policy"
 KINDS = (HUMAN, AGENT, POLICY)
@@ -342,7 +342,6 @@ class ControlLease:
             if moves:
                 self._halt(f"the control lease of {lease.holder} is over")
         finally:
-            # A log may block, so it is written when the halt was ordered.
             self._note(fault)
             if moves:
                 logger.warning("%s: the control lease of %s is over; its motion is halted.", self._robot, lease.holder)
@@ -634,11 +633,10 @@ class _Strong(ControlLeases):
 
 
 def _report(robot: str, halted: Future[StopVerdict]) -> None:
-    """Log a robot that may still move, on another thread than the executor's."""
+    """Log a robot that may still move."""
     verdict = halted.result()
     if not verdict.stopped:
-        doubts = _doubts(verdict)
-        UNBOUNDED.submit(lambda: logger.critical("%s may still move after the end of a lease: %s", robot, doubts))
+        logger.critical("%s may still move after the end of a lease: %s", robot, _doubts(verdict))
 
 
 def _doubts(verdict: StopVerdict) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-logger = logging.getLogger(__name__)
+from strands_robots.safety.stop_log import stop_logger
+
+logger = stop_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,15 +6,15 @@ that neither the robot of another lease nor its observer is waited for.
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from functools import partial
 from typing import Protocol
 
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import UNBOUNDED
 
-logger = logging.getLogger(__name__)
+logger = stop_logger(__name__)
 
 AHEAD_S = 0.25
 """Time before the end of a lease in which its robot is read: one at rest by its own word is not halted."""
