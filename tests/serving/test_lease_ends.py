@@ -201,7 +201,7 @@ def test_lease_that_is_renewed_while_it_ends_is_watched_again() -> None:
         def __init__(self) -> None:
             self.due: float | None = time.monotonic()
 
-        def expire(self, within: float) -> None:
+        def expire(self, ahead: float) -> None:
             if asked.is_set():
                 self.due = None
                 halts.set()

@@ -39,7 +39,7 @@ from strands_robots.serving.control_changes import ControlChange, Observers, OnC
 from strands_robots.serving.control_epochs import FirstEpoch
 from strands_robots.serving.lease_watch import LeaseWatch
 from strands_robots.serving.take_assertion import outdated, unproven
-from strands_robots.serving.workers import UNBOUNDED, BoundedCall, Share, ShareFullError
+from strands_robots.serving.workers import BoundedCall, Share, ShareFullError
 from strands_robots.serving.world_stops import RobotStop, stop_within
 
 logger = stop_logger(__name__)
@@ -58,6 +58,9 @@ FOLLOW = "teleop_receive"
 
 STATUS_S = 0.25
 """Longest wait of a call for the robot's own word that its motion has ended. Without it the motion goes on."""
+
+LATE_STATUS_S = 0.03
+"""Least time for it at the end of a lease."""
 
 EPOCH_S = 1.0
 """Longest wait of a call for the disk to reserve the first epoch."""
@@ -337,20 +340,22 @@ class ControlLease:
             if lease is not None and not _owns(lease, _name(caller), lease_id):
                 raise self._not_holder(verb, lease)
 
-    def expire(self, within: float = STATUS_S) -> None:
+    def expire(self, ahead: float = 0.0) -> None:
         """End a lease whose time is over, and order the halt of what its holder began.
 
         Args:
-            within: seconds to wait at most for the robot's state, where only its holder's one motion is to be halted.
+            ahead: seconds before that time from which the robot's state may be read. The call then lasts until it.
         """
         lease = self._lease
-        if lease is None or lease.until is None or self._clock() < lease.until:
+        if lease is None or lease.until is None or (left := lease.until - self._clock()) > ahead:
             return
         # An unknown state is no rest: what cannot be read is halted.
         moves, fault = True, ""
         if lease.one_motion and not self._starting:
-            state, fault = self._state(within)
+            state, fault = self._state(max(left, LATE_STATUS_S) if ahead else STATUS_S)
             moves = state is not False
+        # A motion that is admitted meanwhile renews the lease, so a robot that was at rest still is.
+        time.sleep(max(0.0, lease.until - self._clock()))
         with self._changing:
             if self._lease is not lease:  # renewed or given to another meanwhile
                 return
@@ -359,7 +364,6 @@ class ControlLease:
             if moves:
                 self._halt(f"the control lease of {lease.holder} is over")
         finally:
-            # A log may block, so it is written when the halt was ordered.
             self._note(fault)
             if moves:
                 logger.warning("%s: the control lease of %s is over; its motion is halted.", self._robot, lease.holder)
@@ -659,11 +663,10 @@ class _Strong(ControlLeases):
 
 
 def _report(robot: str, halted: Future[StopVerdict]) -> None:
-    """Log a robot that may still move, on another thread than the executor's."""
+    """Log a robot that may still move."""
     verdict = halted.result()
     if not verdict.stopped:
-        doubts = _doubts(verdict)
-        UNBOUNDED.submit(lambda: logger.critical("%s may still move after the end of a lease: %s", robot, doubts))
+        logger.critical("%s may still move after the end of a lease: %s", robot, _doubts(verdict))
 
 
 def _doubts(verdict: StopVerdict) -> str:

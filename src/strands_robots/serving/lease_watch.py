@@ -1,7 +1,7 @@
 """Watch of control leases: it ends each one when its time is over.
 
-The watch thread keeps the time and nothing else. A lease ends on a thread of the pool, so that neither the robot of
-another lease nor its observer is waited for.
+The watch thread keeps the time and nothing else. Each lease ends on a thread of the pool, which stands ready for it, so
+that neither the robot of another lease nor its observer is waited for.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from strands_robots.serving.workers import UNBOUNDED
 
 logger = stop_logger(__name__)
 
-STATUS_S = 0.03
-"""Longest wait at the end of a lease for the robot's own word that it is at rest."""
+AHEAD_S = 0.25
+"""Time before the end of a lease in which its robot is read: one at rest by its own word is not halted."""
 
 
 class TimedLease(Protocol):
@@ -27,8 +27,8 @@ class TimedLease(Protocol):
     def due(self) -> float | None:
         """The monotonic moment at which it is over; None where there is none."""
 
-    def expire(self, within: float) -> None:
-        """End it if its time is over; its robot is read for ``within`` s at most."""
+    def expire(self, ahead: float) -> None:
+        """End it in its time; return at once where that is more than ``ahead`` s away."""
 
 
 class LeaseWatch:
@@ -63,19 +63,19 @@ class LeaseWatch:
             with self._changed:
                 due = {each: at for each in self._leases if (at := each.due) is not None}
                 now = time.monotonic()
-                over = [each for each, at in due.items() if at <= now]
-                self._leases = set(due).difference(over)
+                ending = [each for each, at in due.items() if at - AHEAD_S <= now]
+                self._leases = set(due).difference(ending)
                 if not due:
                     self._thread = None
                     return
-                if not over:
-                    self._changed.wait(min(due.values()) - now)
-            for each in over:
+                if not ending:
+                    self._changed.wait(min(due.values()) - AHEAD_S - now)
+            for each in ending:
                 UNBOUNDED.submit(partial(self._end, each))
 
     def _end(self, lease: TimedLease) -> None:
         try:
-            lease.expire(STATUS_S)
+            lease.expire(AHEAD_S)
         except Exception:
             logger.critical("What the holder of a lease moved was not halted at its end.", exc_info=True)
         finally:
