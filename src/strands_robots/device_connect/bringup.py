@@ -40,7 +40,7 @@ from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.serving.workers import called
-from strands_robots.utils import ValidationError, choice, device_id, redacted
+from strands_robots.utils import ValidationError, choice, own_device_id, redacted
 
 logger = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         TimeoutError: not callable in time, or the broker not reached; nothing is left running.
     """
     choice("peer_type", peer_type, ("robot", "sim"))
-    name = default_id(robot) if peer_id is None else device_id("peer_id", peer_id)
+    name = default_id(robot) if peer_id is None else own_device_id("peer_id", peer_id)
     reach = link_for(messaging_url, messaging_backend, tenant, link)
     insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
     driver = driver_for(robot, peer_type)

@@ -25,6 +25,7 @@ from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import Share
+from strands_robots.utils import RESERVED_DEVICE_IDS, unreserved
 
 logger = stop_logger(__name__)
 
@@ -63,10 +64,11 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     """Register a driver that a runtime serves without :mod:`.bringup`; open its link.
 
     Raises:
-        ValidationError: another robot of this process has its name, or only signed stops count and no key is known.
+        ValidationError: its id is reserved or taken in this process, or only signed stops count and no key is known.
     """
     link = link_of(runtime)
-    made = register_safety(runtime.device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant)
+    device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
+    made = register_safety(device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant)
     if made is not None:
         made.open()
     if link is None:
