@@ -8,37 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.access_rules import CMD, DENY, NO_COMMANDS, NOBODY, OPEN, rules
 
 from strands_robots.mesh import keys, topics
 from strands_robots.mesh.transport import TransportError, access
 from strands_robots.mesh.transport.zenoh_config import Posture
-
-PUT = ["put", "declare_subscriber"]
-BOTH = ["ingress", "egress"]
-ESTOP = access.allow("stops", PUT, BOTH, ["strands/strands/safety/*"])
-DENY = {"id": "no", "permission": "deny", "messages": ["put"], "flows": ["ingress"], "key_exprs": ["**"]}
-NO_COMMANDS = DENY | {"key_exprs": ["**/cmd", "**/broadcast", "strands/strands/*/input/*"]}
-
-
-def rules(
-    keys_of_rule: list[str],
-    subject: dict[str, Any] | None = None,
-    *,
-    messages: list[str] = PUT,
-    flows: list[str] | None = BOTH,
-    more: list[dict[str, Any]] | None = None,
-    **fields: Any,
-) -> dict[str, Any]:
-    """Rules by which ``subject`` may what one rule says, and everyone may stop the fleet."""
-    rule = {"id": "r", "permission": "allow", "messages": messages, "key_exprs": keys_of_rule}
-    rule |= {} if flows is None else {"flows": flows}
-    others = more or []
-    made = access.deny_by_default(
-        [rule, ESTOP, *others],
-        [{"id": "who", **(subject or {})}, {"id": "all"}],
-        [{"rules": ["r"], "subjects": ["who"]}, {"rules": ["stops", *(r["id"] for r in others)], "subjects": ["all"]}],
-    )
-    return made | fields
 
 
 @pytest.fixture
@@ -57,40 +31,6 @@ def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     return posture
 
 
-CMD = "strands/strands/*/cmd"
-OPEN = {
-    "everything": rules(["**"]),
-    "everything under the namespace": rules(["strands/**"]),
-    "every topic of ours": rules(["strands/strands/**"]),
-    "every command, at any depth": rules(["**/cmd"]),
-    "every command": rules([CMD]),
-    "the commands of one robot": rules(["strands/strands/arm-1/cmd"]),
-    "part of a level": rules(["strands/st$*/arm-$*/c$*"]),
-    "single levels": rules(["*/*/*/*"]),
-    "the broadcast": rules(["**/broadcast"]),
-    "the streams of leaders": rules(["strands/strands/*/input/*"]),
-    "all that is one robot's": rules(["strands/strands/arm-1/**"]),
-    "the second of two keys": rules(["strands/strands/*/presence", CMD]),
-    "no flow stated": rules([CMD], flows=None),
-    "incoming alone": rules([CMD], flows=["ingress"]),
-    "put alone": rules([CMD], messages=["put"]),
-    "null for a subject": rules([CMD], {"cert_common_names": None}),
-    "every process of the machine": rules(["**"], {"interfaces": ["lo"]}),
-    "an interface": rules([CMD], {"interfaces": ["eth0"]}),
-    "a kind of link": rules([CMD], {"link_protocols": ["tls"]}),
-    "a session id, which a peer chooses": rules([CMD], {"zids": ["a1b2"]}),
-    "a user name, which no link of ours proves": rules([CMD], {"usernames": ["operator"]}),
-    "a policy that joins everyone to a named rule": rules([CMD], {"cert_common_names": ["console"]})
-    | {"policies": [{"rules": ["r", "stops"], "subjects": ["who", "all"]}]},
-    "a deny that leaves a robot open": rules(["**"], more=[NO_COMMANDS | {"key_exprs": ["strands/strands/arm-1/cmd"]}]),
-    "a deny of what goes out": rules([CMD], more=[NO_COMMANDS | {"flows": ["egress"]}]),
-    "allowed by default": rules(["strands/strands/*/presence"], default_permission="allow"),
-    "allowed by default, one topic denied": rules(
-        ["strands/strands/*/presence"], default_permission="allow", more=[NO_COMMANDS | {"key_exprs": ["**/cmd"]}]
-    ),
-}
-
-
 @pytest.mark.parametrize("made", OPEN.values(), ids=OPEN)
 def test_rules_by_which_anyone_may_command_need_the_opt_in_and_are_said(
     start: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path, made: dict[str, Any]
@@ -103,15 +43,6 @@ def test_rules_by_which_anyone_may_command_need_the_opt_in_and_are_said(
     for told in (str(refused.value), line):
         assert str(tmp_path / "acl.json5") in told
         assert ("rule 'r'" in told and ("'who'" in told or "'all'" in told)) or "default_permission" in told
-
-
-NOBODY = {
-    "every certificate": ("cert_common_names", ["*"]),
-    "the second of two names": ("cert_common_names", ["console", "*"]),
-    "part of a name": ("cert_common_names", ["arm-*"]),
-    "every user": ("usernames", ["*"]),
-    "every interface": ("interfaces", ["*"]),
-}
 
 
 @pytest.mark.parametrize(("field", "names"), NOBODY.values(), ids=NOBODY)
