@@ -485,6 +485,9 @@ class RobotDriver(CollectedOnce):
         if self.runtime is None or self._watchers:
             return
         await self._register()
+        opened = self.authorization.opened()
+        if opened is not None:
+            logger.warning("%s is real hardware, and callers that are not named may move it: %s.", self.peer_id, opened)
         if self._stops_are_shared:
             await stops_of(self.runtime.link).join(self)
         if not self._looked_once:
