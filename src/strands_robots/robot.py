@@ -16,7 +16,8 @@ from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import ValidationError, choice, device_id, identifier, shown
+from strands_robots.utils import ValidationError, choice, own_device_id, shown
+from strands_robots.utils import peer_id as valid_peer_id
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +86,7 @@ def Robot(  # the factory reads as the class it stands for
     if mesh is not None and not isinstance(mesh, bool):
         raise ValidationError(f"mesh must be true, false or None, not {shown(mesh)}.")
     if peer_id is not None:
-        identifier("peer_id", peer_id)
+        valid_peer_id("peer_id", peer_id)
     robot = _simulated(name, tool_name, options) if kind == "sim" else _real(name, tool_name, options)
     robot.peer_id = peer_id
     if mesh or (mesh is None and mesh_env_request()):
@@ -122,7 +123,7 @@ def run(
     from strands_robots.device_connect.links import usual_link  # noqa: PLC0415
 
     if peer_id is not None:
-        device_id("peer_id", peer_id)
+        own_device_id("peer_id", peer_id)
     if not {"messaging_url", "messaging_backend", "link"} & network.keys():
         network["link"] = usual_link(network.get("tenant"))
     body: Any = robot if callable(getattr(robot, "halt", None)) else adapt(robot)

@@ -152,7 +152,7 @@ _declare(
     Setting("STRANDS_MESH_TLS_CERT", "path", "", "This peer's certificate (PEM)."),
     Setting("STRANDS_MESH_TLS_KEY", "path", "", "This peer's private key (PEM, mode 0600)."),
     Setting("STRANDS_MESH_ACL_FILE", "path", "", "Zenoh access control of the mesh (JSON5)."),
-    Setting("STRANDS_MESH_ACCEPT_PERMISSIVE_ACL", "boolean", "false", "Accept access control that allows by default."),
+    Setting("STRANDS_MESH_ACCEPT_PERMISSIVE_ACL", "boolean", "false", "Accept access rules that let anyone command."),
     Setting("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY", "text", "auto", "Signed messages only: 1, 0 or auto."),
     Setting(
         "STRANDS_MESH_CONSOLE_PUBLIC_KEYS",

@@ -29,6 +29,12 @@ WAIT_S = 25.0
 IDENTIFIER_MAX = 128
 """Longest peer id and message identifier, in characters (the mesh wire's bound)."""
 
+RESERVED_IDS = ("broadcast", "safety")
+"""Words that stand where a peer id does in the mesh's topics."""
+
+RESERVED_DEVICE_IDS = (*RESERVED_IDS, "discovery", "registry")
+"""Words that stand there in the topics of either network."""
+
 _IDENTIFIER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")
 _DEVICE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*\Z")
 _HOSTNAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?\Z")
@@ -190,6 +196,25 @@ def device_id(name: str, value: object) -> str:
     domain = f"1 to {IDENTIFIER_MAX} letters, digits, '_' or '-', the first one alphanumeric, without dots"
     if not isinstance(value, str) or len(value) > IDENTIFIER_MAX or not _DEVICE_ID.match(value):
         raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
+    return value
+
+
+def peer_id(name: str, value: object) -> str:
+    """Return an id that a peer of the mesh may take."""
+    return unreserved(name, identifier(name, value), RESERVED_IDS)
+
+
+def own_device_id(name: str, value: object) -> str:
+    """Return an id that a device of ours may take on Device Connect."""
+    return unreserved(name, device_id(name, value), RESERVED_DEVICE_IDS)
+
+
+def unreserved(name: str, value: str, reserved: tuple[str, ...]) -> str:
+    """Return ``value``, which is none of the words that networks use for themselves."""
+    if value in reserved:
+        raise ValidationError(
+            f"{name} must not be {' or '.join(reserved)}, which are levels of the network's topics, not {shown(value)}."
+        )
     return value
 
 

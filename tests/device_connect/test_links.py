@@ -163,3 +163,13 @@ def test_agent_disconnects_at_the_end_of_its_process(monkeypatch: pytest.MonkeyP
     for _ in range(2):
         connect_agent()
     assert at_exit == [device_connect_agent_tools.disconnect]
+
+
+def test_server_whose_name_is_not_checked_is_said(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    own = Authority(tmp_path).issue("arm-1")
+    files = {"ca": str(own.ca), "cert": str(own.cert), "key": str(own.key)}
+    assert insecure_opt_in(None, LinkConfig(connect=("tls/router:7447",), **files), stated=True) is False
+    assert caplog.text == ""
+    link = LinkConfig(connect=("tls/router:7447",), verify_hostname=False, **files)
+    assert insecure_opt_in(None, link, stated=True) is False
+    assert "verify_hostname is False" in caplog.text

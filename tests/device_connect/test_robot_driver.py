@@ -344,3 +344,11 @@ async def test_rpc_that_a_subclass_overrides_is_the_one_that_is_called(robot: To
         async with DriverBench(driver) as bench:
             assert (await bench.call("stop"))["stopped"] is True
     assert called == ["stop", "stop"]
+
+
+@pytest.mark.parametrize(("allow", "said"), [(("*",), True), (("op", "anonymous"), True), (("operator-*",), False)])
+async def test_hardware_that_callers_without_a_stated_name_move_says_so_at_start(
+    robot: ToyRobot, caplog: pytest.LogCaptureFixture, allow: tuple[str, ...], said: bool
+) -> None:
+    async with DriverBench(drive(robot, DEVICE_CONNECT_RPC_ALLOW=allow)):
+        assert ("callers that are not named may move it: DEVICE_CONNECT_RPC_ALLOW holds" in caplog.text) is said

@@ -5,12 +5,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+from pathlib import Path
 
 import pytest
 from fixtures.driver_bench import DriverBench, drive
 from fixtures.toy_robots import ToyRobot
 
 from strands_robots.device_connect import base_driver
+from strands_robots.mesh.resume_authority import keygen
+from strands_robots.safety.ed25519 import load_signing_key
+from strands_robots.safety.plane import plane
+from strands_robots.safety.resume import sign
 from strands_robots.serving.workers import RUNNING_MAX, WAITING_MAX
 
 
@@ -150,6 +155,49 @@ async def test_without_a_list_every_named_source_stops_whatever_the_rpc_list_say
         await bench.call("execute", instruction="wave")
         await bench.driver.onEmergencyStop("anybody", "emergencyStop", {})
         await bench.until(lambda: not robot.rollouts["toy"].running)
+
+
+async def test_emergency_stop_locks_a_driver_that_no_plane_has(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.call("execute", instruction="wave", duration=300)
+        await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {"estop_id": "ab" * 16, "reason": "test"})
+        await bench.until(lambda: not robot.rollouts["toy"].running)
+        refused = await bench.call("execute", instruction="wave")
+        assert (refused["status"], refused["locked"], refused["epochs"]) == ("error", True, ["ab" * 16])
+        told = await bench.call("getStatus")
+        assert (told["locked"], told["lockout"][0]["source"]) == (True, "safety-1")
+
+
+async def test_lockout_without_a_plane_is_taken_over_by_the_first_one_and_resumed_there(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {"estop_id": "ab" * 16})
+        entry = plane().register("bench-1", robot)
+        try:
+            assert entry.epochs == ("ab" * 16,)
+            assert plane().clear_local("the test")
+            assert robot.gate.refusal("execute") is None
+        finally:
+            entry.close()
+        assert robot.gate.refusal("execute") is None
+        await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {"estop_id": "cd" * 16})
+        assert (await bench.call("execute", instruction="wave"))["epochs"] == ["cd" * 16], "the old one stays resumed"
+
+
+async def test_resume_of_a_driver_that_no_plane_has_is_checked(
+    robot: ToyRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = str(tmp_path / "operator.pem")
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", keygen(file, "Correct-Horse-7-Battery"))
+    key = load_signing_key(file, "Correct-Horse-7-Battery")
+    async with DriverBench(drive(robot)) as bench:
+        await bench.driver.onEmergencyStop("safety-1", "emergencyStop", {"estop_id": "ab" * 16})
+        (wrong,) = sign(key, "cd" * 16, ["bench-1"])
+        assert (await bench.call("resume", assertion=wrong))["status"] == "error"
+        assert robot.gate.refusal("execute") is not None
+        (right,) = sign(key, "ab" * 16, ["bench-1"])
+        assert (await bench.call("resume", assertion=right))["status"] == "success"
+        assert robot.gate.refusal("execute") is None
+    assert "bench-1" not in plane().robots
 
 
 def test_a_robot_that_did_not_stop_is_named_at_critical(robot: ToyRobot, caplog: pytest.LogCaptureFixture) -> None:

@@ -29,7 +29,7 @@ from strands_robots.envelope import text_of
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
-from strands_robots.utils import ValidationError, device_id, number, redacted, shown, text
+from strands_robots.utils import ValidationError, number, own_device_id, redacted, shown, text
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -127,7 +127,7 @@ def serve(
     if policies is not None:
         load_profiles(policies.expanduser())
         settings.put("STRANDS_POLICIES", str(policies))
-    peer_id = None if peer_id is None else device_id("--peer-id", peer_id)
+    peer_id = None if peer_id is None else own_device_id("--peer-id", peer_id)
     tcp_port, serial_port = parse_ports(port or [])
     network = replace(network, port=tcp_port)
     if on_mesh:

@@ -11,6 +11,7 @@ import contextvars
 import functools
 import inspect
 import logging
+import re
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import Future
 from typing import Any, TypeVar, cast
@@ -22,6 +23,7 @@ from device_connect_edge.drivers import DeviceDriver, decorators
 from device_connect_edge.messaging.exceptions import AuthenticationError, MessagingError, NotConnectedError
 
 from .. import settings
+from ..utils import ValidationError
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
 from .beat import Beating, beat_of
@@ -35,6 +37,8 @@ CONNECT_AGAIN_S = 1.0
 
 MAX_REFUSALS = 3
 """Attempts with credentials that the server refuses; then the start ends with its reason."""
+
+_MADE_UP = re.compile("device-[0-9a-f]{8}")
 
 F = TypeVar("F", bound=Callable[..., Any])
 Labels = dict[str, str | list[str]]
@@ -350,6 +354,30 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         left = self._lost_at + HOLD_EVENTS_S - self._loop.time()
         with contextlib.suppress(TimeoutError):  # the caller checks whether the link is back
             await asyncio.wait_for(self._linked.wait(), max(left, 0.0))
+
+
+def link_of(runtime: Any) -> LinkConfig | None:
+    """Return the link that a runtime uses, None where we have no such link."""
+    stated = getattr(runtime, "link", None) or getattr(runtime.messaging, "link", None)
+    if isinstance(stated, LinkConfig):
+        return stated
+    transport, urls = runtime._messaging_backend, runtime.messaging_urls
+    if transport not in ("zenoh", "nats"):
+        return None
+    # The framework's own peers that scout speak plain TCP, whatever certificates they are given.
+    tls = runtime.messaging_tls if urls else None
+    listen = settings.items("ZENOH_LISTEN") if transport == "zenoh" and not urls else ()
+    try:
+        link = LinkConfig(transport, listen=listen, multicast=None if urls else True, tenant=runtime.tenant)
+        return link.filled(urls, runtime.messaging_auth, tls)
+    except ValidationError as problem:
+        _log.warning("%s: its network is none that an e-stop connection can take: %s", runtime.device_id, problem)
+        return None
+
+
+def stated_id(runtime: Any) -> bool:
+    """Return False where the framework made the device's id up, anew at each start."""
+    return bool(runtime._explicit_device_id) or _MADE_UP.fullmatch(runtime.device_id) is None
 
 
 class _NoTelemetry:

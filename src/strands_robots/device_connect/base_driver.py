@@ -16,20 +16,30 @@ from functools import partial
 from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
+from device_connect_edge.device import DeviceRuntime
 from device_connect_edge.drivers.decorators import get_rpc_source_device
 from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
-from strands_robots.device_connect._compat import CollectedOnce, Labels, emit, observed, on, rpc
+from strands_robots.device_connect._compat import CollectedOnce, Labels, Runtime, emit, observed, on, rpc
 from strands_robots.device_connect.runtime_stops import stops_of
-from strands_robots.device_connect.safety_registration import SafetyRegistration
+from strands_robots.device_connect.safety_registration import (
+    LEAVE_TIMEOUT_S,
+    REGISTER_S,
+    REGISTRATIONS,
+    SafetyRegistration,
+    register_safety,
+    register_served,
+)
 from strands_robots.device_connect.state_reports import report_changes, sweep
 from strands_robots.device_connect.telemetry import RolloutPump
 from strands_robots.envelope import Envelope, error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name
 from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.lockout import LockoutLatch
+from strands_robots.safety.orders import REASON_MAX, epoch_of
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
@@ -151,6 +161,8 @@ class RobotDriver(CollectedOnce):
         self.hardware = hardware
         self.authorization = authorization or Authorization(hardware=hardware, robot=robot.tool_name_str)
         self.registration: SafetyRegistration | None = None
+        self._registered_here: SafetyRegistration | None = None
+        self._unregistered: LockoutLatch | None = None
         self.pipeline = Pipeline.of(
             robot,
             lambda: self.peer_id,
@@ -222,6 +234,8 @@ class RobotDriver(CollectedOnce):
         return (caller_name(command.caller) or ANONYMOUS,)
 
     def _resume(self, arguments: Arguments) -> Envelope:
+        if self.registration is None and self._unregistered is not None:
+            self._registered_here = register_safety(self.peer_id, self, None, named=False)
         registration = self.registration
         return error("resume rejected") if registration is None else registration.resume(arguments["assertion"])
 
@@ -231,7 +245,10 @@ class RobotDriver(CollectedOnce):
         answer = verb.run(self.robot, arguments) if verb.run is not None else getattr(self.robot, verb.method)()
         if not isinstance(answer, dict):
             return answer
-        lockouts = {} if self.registration is None else self.registration.facts(arguments.get("nonce", ""))
+        if self.registration is not None:
+            lockouts = self.registration.facts(arguments.get("nonce", ""))
+        else:
+            lockouts = lock_facts(self._unregistered) if self._unregistered in self.robot.gate.latches else {}
         control = {} if self.pipeline.leases is None else {"control": self.pipeline.leases.facts()}
         return {**answer, **lockouts, **control}
 
@@ -293,7 +310,8 @@ class RobotDriver(CollectedOnce):
     @property
     def _stops_are_shared(self) -> bool:
         """True where one subscription receives the stops for all devices of the link."""
-        return self.registration is not None and type(self).onEmergencyStop is RobotDriver.onEmergencyStop
+        ours = self.registration is not None and isinstance(self.runtime, Runtime)
+        return ours and type(self).onEmergencyStop is RobotDriver.onEmergencyStop
 
     def _collect_event_subscriptions(self) -> list[dict[str, Any]]:
         """Return the subscriptions of this device alone."""
@@ -329,7 +347,15 @@ class RobotDriver(CollectedOnce):
         if refusal is not None:
             logger.warning("%s: emergency stop ignored: %s.", self.peer_id, refusal)
             return None
-        why = payload.get("reason", "") if isinstance(payload, Mapping) else ""
+        params = payload if isinstance(payload, Mapping) else {}
+        why = params.get("reason", "")
+        # No plane has this robot; the one that it is registered with takes the lockout over.
+        latch = self._unregistered
+        if latch is None or latch not in self.robot.gate.latches:
+            latch = self._unregistered = LockoutLatch(self.peer_id)
+            self.robot.gate.attach(latch)
+        epoch = epoch_of(str(device_id), params, json.dumps(params, default=repr, skipkeys=True).encode())
+        latch.engage(epoch, str(device_id), why[:REASON_MAX] if isinstance(why, str) else "")
         return stop_executor().submit(self.robot, self.peer_id, f"emergency stop of {device_id}: {shown(why)}")
 
     def _log_estop(self, device_id: object, verdict: StopVerdict) -> None:
@@ -462,6 +488,10 @@ class RobotDriver(CollectedOnce):
         """Start telling the state; the robot manages its own hardware connection."""
         if self.runtime is None or self._watchers:
             return
+        await self._register()
+        opened = self.authorization.opened()
+        if opened is not None:
+            logger.warning("%s is real hardware, and callers that are not named may move it: %s.", self.peer_id, opened)
         if self._stops_are_shared:
             await stops_of(self.runtime.link).join(self)
         if not self._looked_once:
@@ -473,6 +503,18 @@ class RobotDriver(CollectedOnce):
         sweep(settings.number("STRANDS_DC_STATE_HZ")).add(self)
         if self.pipeline.leases is not None:
             self._end_control = self.pipeline.leases.observe(self._on_control)
+
+    async def _register(self) -> None:
+        """Register with the safety plane, unless what serves this driver has done so."""
+        await self._unregister()
+        if self.registration is None and isinstance(self.runtime, DeviceRuntime):
+            made = partial(register_served, self, self.runtime)
+            self._registered_here = await called(REGISTRATIONS, made, REGISTER_S)
+
+    async def _unregister(self) -> None:
+        made, self._registered_here = self._registered_here, None
+        if made is not None:
+            await called(REGISTRATIONS, made.leave, LEAVE_TIMEOUT_S)
 
     def watches(self) -> list[Any]:
         """Return the coroutines that run while the device is connected."""
@@ -550,6 +592,7 @@ class RobotDriver(CollectedOnce):
                 await called(self.pipeline.shares.read, unsubscribe, READ_DEADLINE_S)
             except Exception as exc:  # noqa: BLE001 - whatever a robot raises, its device leaves
                 logger.warning("%s: its events could not be unsubscribed: %s", self.peer_id, exc)
+        await self._unregister()
 
     async def read_activity(self) -> None:
         """Ask the robot for its activity, which the status tells from now on."""
@@ -593,6 +636,13 @@ class RobotDriver(CollectedOnce):
             return self.pipeline.shares.read.call(self.glance).result(1.0)
         except Exception as exc:  # noqa: BLE001 - a robot that cannot answer is shown with its fault
             return Activity(fault=f"{type(exc).__name__}: {exc}")
+
+
+def lock_facts(latch: LockoutLatch | None) -> dict[str, Any]:
+    """Return the lockouts of a robot that no plane has; nothing without any."""
+    if latch is None:
+        return {}
+    return {"locked": latch.state.locked, "lockout": [each.fields() for each in latch.state.all]}
 
 
 def _status_fields(activity: Activity) -> dict[str, Any]:

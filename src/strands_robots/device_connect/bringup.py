@@ -30,12 +30,17 @@ from strands_robots.device_connect.device_loop import DeviceLoop, enter_loop
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.presence import encoded_capabilities
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
-from strands_robots.device_connect.safety_registration import SafetyRegistration, register_safety
+from strands_robots.device_connect.safety_registration import (
+    LEAVE_TIMEOUT_S,
+    REGISTRATIONS,
+    SafetyRegistration,
+    register_safety,
+)
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.serving.workers import Share, called
-from strands_robots.utils import ValidationError, choice, device_id, redacted
+from strands_robots.serving.workers import called
+from strands_robots.utils import ValidationError, choice, own_device_id, redacted
 
 logger = logging.getLogger(__name__)
 
@@ -56,9 +61,6 @@ PRESENCE_WAIT_S = 0.25
 
 EXIT_TIMEOUT_S = 3.0
 """Seconds that the interpreter's end waits for the devices to announce their departure."""
-
-LEAVE_TIMEOUT_S = 15.0
-"""Seconds that a device's end waits for the link of its e-stop listener to close."""
 
 
 RUNTIME_LOGGER = "device_connect_edge.device."
@@ -87,7 +89,6 @@ class Host:
 
 
 _hosts: dict[Runtime, Host] = {}
-_REGISTRATIONS = Share(running=1000)
 
 # Devices of this process by id, from before their bring-up until they have left; two tenants may use one id.
 _named: Counter[str] = Counter()
@@ -128,7 +129,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         TimeoutError: not callable in time, or the broker not reached; nothing is left running.
     """
     choice("peer_type", peer_type, ("robot", "sim"))
-    name = default_id(robot) if peer_id is None else device_id("peer_id", peer_id)
+    name = default_id(robot) if peer_id is None else own_device_id("peer_id", peer_id)
     reach = link_for(messaging_url, messaging_backend, tenant, link)
     insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
     driver = driver_for(robot, peer_type)
@@ -136,7 +137,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     warnings = _framework_warnings(name)
     registration = asyncio.create_task(
         called(
-            _REGISTRATIONS,
+            REGISTRATIONS,
             lambda: register_safety(name, driver, reach, named=peer_id is not None),
             bringup_timeout,
         )
@@ -173,7 +174,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         registered = registration.result()
         if registered is not None:
             # A connection of its own, which would take the interpreter from the one that comes up until here.
-            await called(_REGISTRATIONS, registered.open, bringup_timeout)
+            await called(REGISTRATIONS, registered.open, bringup_timeout)
     except BaseException as exc:
         await asyncio.shield(_put_down(runtime, task))
         if isinstance(exc, TimeoutError):
@@ -431,7 +432,7 @@ async def _leave(name: str, registration: asyncio.Task[SafetyRegistration | None
     (taken,) = await asyncio.gather(registration, return_exceptions=True)
     try:
         if isinstance(taken, SafetyRegistration):
-            await called(_REGISTRATIONS, taken.leave, LEAVE_TIMEOUT_S)
+            await called(REGISTRATIONS, taken.leave, LEAVE_TIMEOUT_S)
     finally:
         _forget_warnings(name)
 

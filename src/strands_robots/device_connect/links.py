@@ -94,6 +94,8 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
             f"allow_insecure must be True, False or None, not {shown(allow_insecure)}; "
             "spellings belong to DEVICE_CONNECT_ALLOW_INSECURE."
         )
+    if link.encrypted and not link.verify_hostname:
+        logger.warning("verify_hostname is False: any holder of a certificate of the authority can pose as the server.")
     if link.authenticated:
         return False
     opted_in = settings.boolean("DEVICE_CONNECT_ALLOW_INSECURE") if allow_insecure is None else allow_insecure

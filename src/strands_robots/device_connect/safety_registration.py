@@ -11,28 +11,40 @@ from typing import Any
 from device_connect_edge.drivers import DeviceDriver
 
 from strands_robots.contract import Haltable
+from strands_robots.device_connect._compat import link_of, stated_id
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.stop_link import stop_link
+from strands_robots.device_connect.stop_link import NoStopLink, stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.identity import SigningIdentity, local_name, robot_identity
+from strands_robots.safety.identity import DEFAULT_TENANT, SigningIdentity, local_name, robot_identity
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
+from strands_robots.serving.workers import Share
+from strands_robots.utils import RESERVED_DEVICE_IDS, unreserved
 
 logger = stop_logger(__name__)
 
+REGISTRATIONS = Share(running=1000)
+"""The threads on which devices are registered and leave: a store or a link that hangs delays no other device."""
+
+REGISTER_S = 30.0
+LEAVE_TIMEOUT_S = 15.0
+"""Seconds that a device's end waits for the link of its e-stop listener to close."""
+
 
 def register_safety(
-    device_id: str, driver: DeviceDriver, link: LinkConfig, *, named: bool
+    device_id: str, driver: DeviceDriver, link: LinkConfig | None, *, named: bool, tenant: str = DEFAULT_TENANT
 ) -> SafetyRegistration | None:
     """Register a driver's robot with the safety plane; None without a robot.
 
     Args:
+        link: the device's; None where it is none that a connection of the listener's own can take.
+        tenant: the device's, where there is no ``link``.
         named: the operator gave ``device_id``; a simulation's lockout is kept only then.
     """
     robot = getattr(driver, "robot", driver)
@@ -40,10 +52,32 @@ def register_safety(
     if not isinstance(robot, Haltable) or not isinstance(gate, MotionGate):
         logger.warning("%s has no robot that the safety plane could halt; it hears no emergency stop.", device_id)
         return None
-    registration = SafetyRegistration(device_id, robot, link, _key(device_id, driver, robot, named=named))
+    key = _key(device_id, driver, robot, named=named)
+    registration = SafetyRegistration(device_id, robot, link, key, link.tenant if link else tenant)
     if hasattr(driver, "registration"):
         driver.registration = registration
+        registration.driver = driver
     return registration
+
+
+def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | None:
+    """Register a driver that a runtime serves without :mod:`.bringup`; open its link.
+
+    Raises:
+        ValidationError: its id is reserved or taken in this process, or only signed stops count and no key is known.
+    """
+    link = link_of(runtime)
+    device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
+    made = register_safety(device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant)
+    if made is not None:
+        made.open()
+    if link is None:
+        logger.warning(
+            "%s has no e-stop connection of its own: its runtime's backend is not one of ours. It is stopped and "
+            "locked by the runtime's events, and answers no controller.",
+            runtime.device_id,
+        )
+    return made
 
 
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
@@ -58,21 +92,28 @@ def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> st
 class SafetyRegistration:
     """One robot in the safety plane and on the e-stop listener."""
 
-    def __init__(self, device_id: str, robot: Any, link: LinkConfig, key: str | None) -> None:
+    def __init__(
+        self, device_id: str, robot: Any, link: LinkConfig | None, key: str | None, tenant: str = DEFAULT_TENANT
+    ) -> None:
         self.device_id = device_id
         # Two tenants may each have a device of this id in one process.
-        name = local_name(link.tenant, device_id)
+        name = local_name(tenant, device_id)
         self._name = name
+        self.driver: Any = None
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
         self._held: Registered | None = self.entry
         try:
             self._listener: ListenerRegistration = estop_listener().register(
-                name, ("device-connect", link), lambda: stop_link(link), lambda: self.identity, opened=False
+                name,
+                ("device-connect", link),
+                lambda: NoStopLink() if link is None else stop_link(link),
+                lambda: self.identity,
+                opened=False,
             )
         except BaseException:
             self.entry.close()
             raise
-        if not link.loopback_only and not estop_listener().signed:
+        if not (link and link.loopback_only) and not estop_listener().signed:
             logger.warning(
                 "%s: the source of an emergency stop is what it says it is. DEVICE_CONNECT_ESTOP_PUBLIC_KEYS is not "
                 "set, so only a broker's access rules can vouch for it.",
@@ -143,6 +184,9 @@ class SafetyRegistration:
     def leave(self) -> None:
         """Leave listener and plane; block while a link closes. Safe to call twice."""
         self._listener.close()
+        if getattr(self.driver, "registration", None) is self:
+            # Whatever serves the driver next registers it anew.
+            self.driver.registration = None
         entry, self._held = self._held, None
         if entry is not None:
             entry.close()

@@ -48,6 +48,21 @@ def stop_link(link: LinkConfig) -> StopLink:
     return NatsStopLink(link) if link.transport == "nats" else ZenohStopLink(link)
 
 
+class NoStopLink:
+    """Stop link of a device whose network is none of ours; it carries nothing."""
+
+    up = False
+
+    def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
+        """Stops come by the device's own runtime."""
+
+    def publish(self, source: str, event: str, payload: bytes) -> bool:
+        return False
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
 def _apart(link: LinkConfig) -> LinkConfig:
     """Return ``link`` without the ports that only one session can listen on.
 

@@ -27,7 +27,7 @@ from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
 from strands_robots.serving.world_stops import robot_stop, stop_within
-from strands_robots.utils import ValidationError, shown
+from strands_robots.utils import RESERVED_IDS, ValidationError, shown
 
 logger = stop_logger(__name__)
 
@@ -36,6 +36,7 @@ REPLAYED = "replay rejected"
 LOCKED = "command rejected"
 DISPATCH = "dispatch error"
 BUSY = "busy"
+RETAINED = "the broker stored it; a command is never retained"
 PING = {"action": "ping"}
 """The command of a bare ping: nothing in it needs checking."""
 
@@ -68,6 +69,8 @@ class SenderCheck:
     def __call__(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
         """Return the sender's proven names; raise :class:`Refused` where it may not."""
         request: wire.Request = command.proof
+        if command.verb.kind is Kind.MOTION and request.sender_id in RESERVED_IDS:
+            raise Refused(RefusalReason.CALLER, f"no peer is called {request.sender_id}")
         # What only takes energy away is done twice, and whatever the sender's clock says: refusing one as a replay
         # could only leave a robot moving.
         if command.verb.kind in (Kind.MOTION, Kind.RESUME):
@@ -167,6 +170,7 @@ class CommandReceiver:
         self._before_stop, self._after_stop = before_stop, after_stop
         self.stops = StopRequests(self._answer_stops)
         self._logged = ("", 0.0)
+        self._retained_at = float("-inf")
 
     def on_command(self, sample: Sample) -> None:
         """Take a sample on our command topic or on the broadcast topic; returns at once."""
@@ -178,6 +182,9 @@ class CommandReceiver:
             request = wire.Request.of(body)
         except wire.WireError as exc:
             context.audit("command_rejected", reason=str(exc))
+            return
+        if sample.retained and not _is_stop(request.command):
+            self._refuse_retained(request, sample.key)
             return
         if request.command == PING:
             self._reply(request.sender_id, request.turn_id, result=pong(context))
@@ -200,6 +207,19 @@ class CommandReceiver:
             self._pipeline.share(verb).submit(partial(self._pipeline.serve, command, answered))
         except ShareFullError:
             answered(busy(command))
+
+    def _refuse_retained(self, request: wire.Request, key: str) -> None:
+        """Refuse a command that a broker stored; no peer waits for its answer.
+
+        It was meant for another moment. A stop is carried out all the same, because it only takes energy away.
+        """
+        action = request.command.get("action") if isinstance(request.command, dict) else None
+        self._context.audit("command_refused", request.sender_id, action=str(action)[:32], reason=RETAINED)
+        now = time.monotonic()
+        if now - self._retained_at >= LOG_EVERY_S:
+            self._retained_at = now
+            name = self._context.peer_id
+            logger.warning("%s: %s of %s on %s is refused: %s.", name, shown(action), request.sender_id, key, RETAINED)
 
     def _verb_of(self, request: wire.Request) -> Verb | None:
         if not isinstance(request.command, dict):
@@ -280,6 +300,8 @@ class CommandReceiver:
 
     def _reply(self, sender: str, turn: str, *, result: Any = None, error: str = "") -> None:
         context = self._context
+        if sender in RESERVED_IDS:
+            return  # a reply below the safety topics would make 0.5.3 peers drop e-stops
         reply = wire.Reply("error" if error else "response", context.peer_id, turn, result, error, context.clock())
         key = topics.response(sender, context.peer_id, turn)
         try:
@@ -290,6 +312,12 @@ class CommandReceiver:
                 self._reply(sender, turn, error=DISPATCH)
         except TransportError as exc:
             logger.warning("%s: the reply to %s was not sent: %s", context.peer_id, sender, exc)
+
+
+def _is_stop(command: object) -> bool:
+    action = command.get("action") if isinstance(command, dict) else None
+    verb = PEER_VERBS.get(action) if isinstance(action, str) else None
+    return verb is not None and verb.kind is Kind.STOP
 
 
 def _wire_text(refusal: Refused) -> str:

@@ -195,8 +195,8 @@ class InputReceiver:
     def on_frame(self, sample: Sample) -> None:
         """A frame on the transport's thread: queued for the stream's own."""
         executor = self._executor
-        if not self._running or executor is None:
-            return
+        if not self._running or executor is None or sample.retained:
+            return  # a frame that a broker stored is of another moment
         if sample.session != self._session:
             # Not queued, so that a stranger's flood displaces none of the leader's frames.
             self._counts["source"] += 1

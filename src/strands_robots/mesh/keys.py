@@ -16,7 +16,8 @@ from typing import Any
 
 from strands_robots.mesh import topics
 from strands_robots.mesh.security import validate_peer_id
-from strands_robots.mesh.transport.zenoh_config import MESSAGES, TlsCredentials, allow, deny_by_default
+from strands_robots.mesh.transport.access import MESSAGES, allow, deny_by_default
+from strands_robots.mesh.transport.zenoh_config import TlsCredentials
 from strands_robots.mesh.wire_identity import cryptography
 from strands_robots.utils import ValidationError, text, whole
 

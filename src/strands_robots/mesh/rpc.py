@@ -21,7 +21,7 @@ from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.verbs import Kind
-from strands_robots.utils import ValidationError, number, shown
+from strands_robots.utils import RESERVED_IDS, ValidationError, number, shown
 
 logger = logging.getLogger(__name__)
 
@@ -252,7 +252,7 @@ class Requester:
             seconds = number("timeout", timeout, above=0)
         except ValidationError as exc:
             return f"validation: {exc}"
-        if not _NO_ID.isdisjoint(target):
+        if not _NO_ID.isdisjoint(target) or target in RESERVED_IDS:
             return f"target must be a peer id, not {shown(target)}."
         return target, clean, seconds
 

@@ -631,6 +631,10 @@ class FleetSafety:
             context.audit(rejected, reason=str(exc))
             return None
         bound = context.registry.session_of(source)
+        if sample.retained:
+            # A stored check-in says nothing of who is there now.
+            context.audit(rejected, source, reason="the broker stored it")
+            return None
         if sample.key != key(source) or (bound is not None and bound != sample.session):
             context.audit(rejected, source, reason="the topic or the session is another peer's")
             return None

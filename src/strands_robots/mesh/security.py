@@ -10,7 +10,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.utils import ValidationError, identifier, mapping, number, shown
+from strands_robots.utils import ValidationError, identifier, mapping, number, peer_id, shown
 
 __all__ = [
     "ValidationError",
@@ -22,7 +22,6 @@ __all__ = [
 
 TELEOP_VALUE_OUT_OF_RANGE = "TELEOP_VALUE_OUT_OF_RANGE"
 
-RESERVED_IDS = frozenset({"broadcast", "safety"})
 INPUT_KEYS = 64
 INPUT_KEY_CHARACTERS = 64
 INPUT_VALUE_ABS = 720.0
@@ -39,10 +38,7 @@ def validate_mesh_identifier(value: object, name: str = "identifier") -> str:
 
 def validate_peer_id(value: object) -> str:
     """A peer id: an identifier that is none of the reserved words."""
-    peer = identifier("peer_id", value)
-    if peer in RESERVED_IDS:
-        raise ValidationError(f"peer_id must not be one of {', '.join(sorted(RESERVED_IDS))}, not {shown(value)}.")
-    return peer
+    return peer_id("peer_id", value)
 
 
 def validate_command(command: object) -> dict[str, Any]:

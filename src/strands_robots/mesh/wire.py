@@ -15,7 +15,7 @@ from typing import Any, Literal
 from strands_robots.bounded_json import OutOfBoundsError, parsed
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.resume import is_epoch
-from strands_robots.utils import ValidationError, identifier, shown
+from strands_robots.utils import ValidationError, identifier, peer_id, shown
 
 FRESH_S = 60.0
 AHEAD_S = 5.0
@@ -129,7 +129,7 @@ class Presence:
     def of(cls, body: Mapping[str, Any]) -> Presence:
         """Parse ``body``; type and host are cut to 256 characters. Raises WireError."""
         return cls(
-            _identifier(body, "robot_id"),
+            _peer(body, "robot_id"),
             _label(body.get("robot_type"), "robot"),
             _label(body.get("hostname"), ""),
             _time(body, "timestamp"),
@@ -254,6 +254,13 @@ class ResumeRelay:
             body.get("assertion"),
             zid if isinstance(zid, str) else None,
         )
+
+
+def _peer(body: Mapping[str, Any], name: str) -> str:
+    try:
+        return peer_id(name, body.get(name))
+    except ValidationError as exc:
+        raise WireError(str(exc)) from None
 
 
 def _identifier(body: Mapping[str, Any], name: str) -> str:

@@ -125,6 +125,12 @@ class Authorization:
             )
         return refusal
 
+    def opened(self) -> str | None:
+        """Return the entries by which callers that nobody named move real hardware."""
+        allow = entries(self._read("DEVICE_CONNECT_RPC_ALLOW")) if self.hardware else ()
+        wide = [each for each in allow if each == ANONYMOUS or not each.strip("*?")]
+        return f"DEVICE_CONNECT_RPC_ALLOW holds {', '.join(wide)}" if wide else None
+
     def estop(self, source: object) -> str | None:
         """Return the reason why an emergency stop of ``source`` does not count, or None."""
         return estop_refusal(source, self._read("DEVICE_CONNECT_ESTOP_ALLOW"))

@@ -8,11 +8,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from fixtures.mesh_peer import MeshPeer
+from fixtures.mesh_peer import MeshPeer, share_console_key
 from fixtures.mqtt_broker import PROGRAM, MqttBroker
+from fixtures.mqtt_retainer import Retainer, command
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.mesh import keys
+from strands_robots.mesh.console_keys import MOTION, ConsoleSigner
 from strands_robots.mesh.resume_authority import keygen
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport, filter_of
@@ -153,6 +155,44 @@ def test_resumed_stop_locks_no_newcomer_and_leaves_the_broker(
     newcomer = join("sim-3", **trusted)
     newcomer.sees("sim-1")
     assert newcomer.ask("epoch") is None
+
+
+@pytest.fixture
+def retainer(broker: MqttBroker, folder: Path) -> Iterator[Retainer]:
+    with Retainer(broker.port, keys.issue(folder, "retainer")) as client:
+        yield client
+
+
+START = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("topic", ["strands/sim-1/cmd", "strands/broadcast"])
+def test_stored_command_moves_nothing_at_a_join_and_the_same_one_live_does(
+    join: Join, retainer: Retainer, topic: str
+) -> None:
+    retainer.store(topic, command(START))
+    sim = join("sim-1")
+    eventually(lambda: "command_refused" in sim.ask("audited"), what="the refusal")
+    assert sim.ask("moving") == []
+    retainer.send(topic, command(START))
+    eventually(lambda: sim.ask("moving") == ["left"], what="a live one moves it")
+
+
+@pytest.mark.system
+def test_stored_command_of_an_approved_console_moves_no_hardware(
+    join: Join, retainer: Retainer, tmp_path: Path
+) -> None:
+    folder = tmp_path / "arm-1"
+    folder.mkdir(mode=0o700)
+    share_console_key(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STRANDS_STATE_DIR", str(folder))
+        signed = ConsoleSigner().sign({**command(START), "target_id": "arm-1"}, MOTION)
+    retainer.store("strands/arm-1/cmd", signed)
+    arm = join("arm-1", "arm", BYPASS_TOOL_CONSENT="true")
+    eventually(lambda: "command_refused" in arm.ask("audited"), what="the refusal")
+    assert arm.ask("moving") is False
 
 
 @pytest.mark.system

@@ -192,7 +192,7 @@ class BridgeTransport(Transport):
         once = topic.name in ("cmd", "broadcast")
 
         def deliver(sample: Sample) -> None:
-            if not once or self._seen.first(sample.payload):
+            if not once or sample.retained or self._seen.first(sample.payload):
                 callback(sample)
 
         def from_local(sample: Sample) -> None:

@@ -10,10 +10,8 @@ and only on the way in, where each link has a clock of its own and a flood starv
 
 from __future__ import annotations
 
-import json
 import logging
 import stat
-from collections.abc import Iterable
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
@@ -21,28 +19,18 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics
-from strands_robots.mesh.transport import TransportError
+from strands_robots.mesh.transport import TransportError, access
 
 logger = logging.getLogger(__name__)
 
-ACL_MAX_BYTES = 256 * 1024
 KEYS_COMMAND = "strands-robots mesh keys init"
-PERMISSIVE_ACL = "STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"
+TLS_FILES = ("STRANDS_MESH_TLS_CA", "STRANDS_MESH_TLS_CERT", "STRANDS_MESH_TLS_KEY")
 
 RETRY_MS = 250
 LEASE_MS = 4000
 HANDSHAKE_MS = 2000
 WAIT_BEFORE_DROP_US = 10_000
 _RETRY = {"period_init_ms": RETRY_MS, "period_max_ms": RETRY_MS, "period_increase_factor": 1}
-
-MESSAGES = (
-    "put",
-    "delete",
-    "declare_subscriber",
-    "liveliness_token",
-    "liveliness_query",
-    "declare_liveliness_subscriber",
-)
 
 DISCOVERY_S = 1.1
 """Two heartbeats: within these seconds a peer that is linked to us is in the registry."""
@@ -66,13 +54,12 @@ class TlsCredentials:
         Raises:
             TransportError: only some are stated, or one is missing, a symbolic link, or a key open to others.
         """
-        names = ("STRANDS_MESH_TLS_CA", "STRANDS_MESH_TLS_CERT", "STRANDS_MESH_TLS_KEY")
-        stated = {name: settings.raw(name) for name in names}
+        stated = {name: settings.raw(name) for name in TLS_FILES}
         if not any(stated.values()):
             return None
         missing = [name for name, value in stated.items() if not value]
         if missing:
-            raise TransportError(f"mutual TLS needs {', '.join(names)}; {', '.join(missing)} is not set.")
+            raise TransportError(f"mutual TLS needs {', '.join(TLS_FILES)}; {', '.join(missing)} is not set.")
         ca, cert, key = (_plain_file(name, Path(value).expanduser()) for name, value in stated.items())
         if stat.S_IMODE(key.stat().st_mode) & 0o077:
             raise TransportError(f"STRANDS_MESH_TLS_KEY: others may read {key}; run chmod 600 on it.")
@@ -93,7 +80,7 @@ class Posture:
 
     Attributes:
         hub: loopback endpoint of the automatic hub; None where endpoints are stated.
-        access_control: JSON5 text; None for the rules made from the topic table.
+        access_control: Zenoh's access rules; None without certificates.
     """
 
     namespace: str
@@ -101,7 +88,7 @@ class Posture:
     listen: tuple[str, ...]
     hub: str | None
     credentials: TlsCredentials | None
-    access_control: str | None
+    access_control: dict[str, Any] | None
     multicast: bool
     max_sessions: int
 
@@ -111,7 +98,7 @@ class Posture:
 
         Raises:
             TransportError: it would leave loopback without certificates and without the opt-in, or a certificate
-                file is missing, a link, or a key that others can read.
+                file is missing, a link, or a key that others can read, or the access rules are refused.
         """
         connect, listen = settings.items("ZENOH_CONNECT"), settings.items("ZENOH_LISTEN")
         multicast = settings.boolean("STRANDS_MESH_MULTICAST")
@@ -120,14 +107,16 @@ class Posture:
             _refuse_to_leave_loopback(connect + listen, multicast)
         if multicast:
             logger.warning("Multicast scouting is on: every Zenoh process on this network learns of this peer.")
-        scheme = "tls" if credentials else "tcp"
+        if credentials is None:
+            _say_unused()
+        namespace, scheme = settings.raw("STRANDS_MESH_NAMESPACE"), "tls" if credentials else "tcp"
         return cls(
-            namespace=settings.raw("STRANDS_MESH_NAMESPACE"),
+            namespace=namespace,
             connect=connect,
             listen=listen,
             hub=None if connect or listen else f"{scheme}/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}",
             credentials=credentials,
-            access_control=_access_control_file() if credentials else None,
+            access_control=_access_control(_prefix(namespace)) if credentials else None,
             multicast=multicast,
             max_sessions=settings.integer("STRANDS_MESH_MAX_SESSIONS"),
         )
@@ -196,7 +185,7 @@ def explicit(posture: Posture, session: str | None = None) -> dict[str, Any]:
 
 
 def _base(posture: Posture, session: str | None) -> dict[str, Any]:
-    prefix = f"{posture.namespace}/" if posture.namespace else ""
+    prefix = _prefix(posture.namespace)
     # A burst of replies or stops must find room: Zenoh's own queues hold two batches and wait one millisecond.
     queue = {
         "size": {"real_time": 16, "interactive_high": 16, "data": 16},
@@ -233,52 +222,12 @@ def _base(posture: Posture, session: str | None) -> dict[str, Any]:
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
         }
-        config["access_control"] = _access_control(posture, prefix)
+        config["access_control"] = posture.access_control
     return config
 
 
-def allow(name: str, messages: Iterable[str], flows: Iterable[str], keys: Iterable[str]) -> dict[str, Any]:
-    """Return one access rule that allows messages on key expressions."""
-    return {"id": name, "permission": "allow", "messages": [*messages], "flows": [*flows], "key_exprs": [*keys]}
-
-
-def deny_by_default(
-    rules: list[dict[str, Any]], subjects: list[dict[str, Any]], policies: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """Return an access control that denies what no rule allows."""
-    parts = {"rules": rules, "subjects": subjects, "policies": policies}
-    return {"enabled": True, "default_permission": "deny", **parts}
-
-
-def _access_control(posture: Posture, prefix: str) -> dict[str, Any]:
-    """The operator's rules, or by default every topic for certified peers.
-
-    Raises:
-        TransportError: rules that cannot be read, are switched off, or allow by default without the opt-in.
-    """
-    if posture.access_control is None:
-        rule = allow("mesh", MESSAGES, ["ingress", "egress"], [f"{prefix}{topics.ROOT}/**"])
-        return deny_by_default([rule], [{"id": "certified"}], [{"rules": ["mesh"], "subjects": ["certified"]}])
-    rules = _parsed(posture.access_control)
-    if rules.get("enabled") is not True:
-        raise TransportError("STRANDS_MESH_ACL_FILE: access control must have enabled: true.")
-    if rules.get("default_permission") != "deny" and not settings.boolean(PERMISSIVE_ACL):
-        raise TransportError(
-            f"STRANDS_MESH_ACL_FILE allows by default; set default_permission to deny, or {PERMISSIVE_ACL}=true."
-        )
-    return rules
-
-
-def _parsed(text: str) -> dict[str, Any]:
-    import zenoh  # noqa: PLC0415 - the JSON5 reader is Zenoh's own
-
-    try:
-        config = zenoh.Config()
-        config.insert_json5("access_control", text)
-        rules = json.loads(config.get_json("access_control"))
-    except (zenoh.ZError, ValueError) as exc:
-        raise TransportError(f"STRANDS_MESH_ACL_FILE is no access control of Zenoh's: {exc}") from None
-    return rules if isinstance(rules, dict) else {}
+def _prefix(namespace: str) -> str:
+    return f"{namespace}/" if namespace else ""
 
 
 def _downsampling(prefix: str) -> list[dict[str, Any]]:
@@ -342,11 +291,38 @@ def _plain_file(name: str, path: Path) -> Path:
     return path
 
 
-def _access_control_file() -> str | None:
-    stated = settings.raw("STRANDS_MESH_ACL_FILE")
+def _access_control(prefix: str) -> dict[str, Any]:
+    """The operator's rules, or by default every topic for certified peers.
+
+    Raises:
+        TransportError: rules that cannot be read, are switched off or name nobody, or that let a peer command which no
+            certificate names, without the opt-in.
+    """
+    stated = settings.raw(access.ACL_FILE)
     if not stated:
-        return None
-    path = _plain_file("STRANDS_MESH_ACL_FILE", Path(stated).expanduser())
-    if path.stat().st_size > ACL_MAX_BYTES:
-        raise TransportError(f"STRANDS_MESH_ACL_FILE: {path} is above {ACL_MAX_BYTES // 1024} KiB.")
-    return path.read_text(encoding="utf-8")
+        logger.info("%s is not set: every peer with a certificate of the fleet may send commands.", access.ACL_FILE)
+        return access.certified_peers(prefix)
+    path = _plain_file(access.ACL_FILE, Path(stated).expanduser())
+    rules = access.read_rules(path)
+    dead, opened = access.literal_wildcard(rules), access.open_rules(rules, prefix)
+    if dead is not None:
+        raise TransportError(f"{access.ACL_FILE}: in {path} {dead}; leave the field out, or name each.")
+    if opened and not settings.boolean(access.PERMISSIVE_ACL):
+        raise TransportError(
+            f"{access.ACL_FILE}: in {path} {access.shortened(opened)}. Deny by default and name who may command in "
+            f"cert_common_names ('strands-robots mesh keys acl' writes such rules) or set {access.PERMISSIVE_ACL}=true."
+        )
+    if opened:
+        logger.warning(
+            "%s: in %s %s; accepted by %s.", access.ACL_FILE, path, access.shortened(opened), access.PERMISSIVE_ACL
+        )
+    if not access.stops_get_in(rules, prefix):
+        logger.warning("%s: in %s no rule lets an emergency stop in; none over the mesh stops.", access.ACL_FILE, path)
+    return rules
+
+
+def _say_unused() -> None:
+    """Log the certificates and rules that are stated and have no effect."""
+    unused = [name for name in (*TLS_FILES, access.ACL_FILE) if settings.raw(name)]
+    if unused:
+        logger.warning("The mesh is without certificates, so that %s has no effect.", ", ".join(unused))
