@@ -31,7 +31,7 @@ from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Connections, Room, listener
 from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.server import GONE, build
+from strands_robots.mcp.server import GONE, STOPS, build
 from strands_robots.mcp.sessions import Sessions
 from strands_robots.mcp.tokens import Token, TokenFile
 from strands_robots.utils import is_loopback_host
@@ -46,7 +46,6 @@ LEFT_S = 1.0
 """Seconds without a request after a client closed its standing stream; then it has gone away."""
 
 CLOSE = {"connection": "close"}
-STOPS = ("stop", "emergency_stop")
 BEFORE_A_STOP = ("initialize", "notifications/initialized", "server/discover", "ping", "tools/list")
 """Methods that a client calls before its first stop."""
 

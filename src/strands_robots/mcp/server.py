@@ -22,12 +22,16 @@ from strands_robots.mcp.access import AccessOf, ClientAccess, PictureFiles
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.results import refused_arguments, result, unknown_arguments
+from strands_robots.mcp.results import refused_arguments, result, unknown_arguments, with_note
 from strands_robots.mcp.tools import add_control, add_motions, add_reads, add_stops
+from strands_robots.serving.stop_arguments import network_emergency_stop, network_stop
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+STOPS = {"stop": network_stop, "emergency_stop": network_emergency_stop}
+"""Tools that stop: what reads their arguments."""
 
 INSTRUCTIONS = """Robots on a network. Look before you move: list_robots, describe_robot, then get_picture,
 get_objects or get_state. Units are metres and degrees in the robot's base frame, x forward, y left, z up.
@@ -49,6 +53,11 @@ class RobotServer(MCPServer[Any]):
         self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
     ) -> CallToolResult | InputRequiredResult:
         """Call a tool; as the SDK's."""
+        stop = STOPS.get(name)
+        if stop is not None:
+            # Its arguments refuse no stop, and nothing else is looked up before it.
+            readable, ignored = stop(arguments)
+            return with_note(await super().call_tool(name, readable, context), ignored)
         tool = next((each for each in await self.list_tools() if each.name == name), None)
         unknown = unknown_arguments(name, arguments, tool.input_schema.get("properties", {})) if tool else ""
         if unknown:
