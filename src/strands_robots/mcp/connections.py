@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import ipaddress
 import logging
+import re
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -51,6 +52,16 @@ TOTAL_MAX = 448
 
 RESERVE = 64
 """Connections of one token, and of all tokens, that are left for stops."""
+
+HEADER_MAX = 16 * 1024
+"""Bytes of a header."""
+
+MESSAGE_MAX = 128 * 1024
+"""Bytes of a request's body; beyond it nothing of it is parsed."""
+
+_BLANK = re.compile(rb"\n\r?\n")
+_LENGTH = re.compile(rb"\ncontent-length:[ \t]*([0-9]{1,12})[ \t]*\r?\n")
+_AS_IT_COMES = re.compile(rb"\n(transfer-encoding|expect):")
 
 BACKLOG = 1024
 RETRY_S = 0.05
@@ -100,6 +111,7 @@ class HttpConnection(H11Protocol):
         self.opening: asyncio.Task[None] | None = None
         self.open = False
         self._closed = closed
+        self._held, self._length = bytearray(), 0
         self._deadline: asyncio.TimerHandle | None = self.loop.call_later(HEADER_S, self.cut)
 
     def connection_made(self, transport: Any) -> None:
@@ -108,7 +120,13 @@ class HttpConnection(H11Protocol):
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes of requests."""
+        """Take bytes of requests; nothing of a request is read before all of it is here."""
+        if self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]:
+            self._held += data
+            if not self._whole():
+                self._enter(Phase.BODY if self._length else Phase.HEADER)
+                return
+            data, self._held, self._length = bytes(self._held), bytearray(), 0
         super().data_received(data)
         self._follow(received=True)
 
@@ -134,6 +152,20 @@ class HttpConnection(H11Protocol):
         self._set_deadline(None)
         self._closed(self)
 
+    def _whole(self) -> bool:
+        """Return whether what is held is a whole request, or one that is refused as it is."""
+        if not self._length:
+            blank = _BLANK.search(self._held)
+            if blank is None:
+                return len(self._held) > HEADER_MAX
+            header = bytes(self._held[: blank.end()]).lower()
+            lengths = _LENGTH.findall(header)
+            # A client that asks first, sends chunks or states no single length is read as it sends.
+            if len(lengths) != 1 or _AS_IT_COMES.search(header) or int(lengths[0]) > MESSAGE_MAX:
+                return True
+            self._length = blank.end() + int(lengths[0])
+        return len(self._held) >= self._length
+
     def _follow(self, *, received: bool) -> None:
         if self.transport.is_closing():
             return
@@ -144,6 +176,9 @@ class HttpConnection(H11Protocol):
             phase = Phase.HEADER if received or self.conn.trailing_data[0] else Phase.IDLE
         else:
             phase = Phase.SERVING
+        self._enter(phase)
+
+    def _enter(self, phase: Phase) -> None:
         if phase is not self.phase:
             self.phase = phase
             self._set_deadline(DEADLINES.get(phase))

@@ -29,7 +29,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
-from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Connections, Room, listener
+from strands_robots.mcp.connections import CONNECTION, IDLE_S, MESSAGE_MAX, BoundedServer, Connections, Room, listener
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.server import GONE, STOPS, build
 from strands_robots.mcp.sessions import Sessions
@@ -39,8 +39,6 @@ from strands_robots.utils import is_loopback_host
 PATH = "/mcp"
 PICTURES = "/pictures/"
 PICTURES_MAX = 16
-MESSAGE_MAX = 128 * 1024
-"""Bytes of a request's body; beyond it nothing of it is parsed."""
 
 LEFT_S = 1.0
 """Seconds without a request after a client closed its standing stream; then it has gone away."""
