@@ -24,6 +24,8 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from strands_robots.mcp.server import MESSAGE_MAX
+
 logger = logging.getLogger(__name__)
 
 CONNECTION = "strands_robots.connection"
@@ -55,9 +57,6 @@ RESERVE = 64
 
 HEADER_MAX = 16 * 1024
 """Bytes of a header."""
-
-MESSAGE_MAX = 128 * 1024
-"""Bytes of a request's body; beyond it nothing of it is parsed."""
 
 _BLANK = re.compile(rb"\n\r?\n")
 _LENGTH = re.compile(rb"\ncontent-length:[ \t]*([0-9]{1,12})[ \t]*\r?\n")
@@ -153,7 +152,7 @@ class HttpConnection(H11Protocol):
         self._closed(self)
 
     def _whole(self) -> bool:
-        """Return whether what is held is a whole request, or one that is refused as it is."""
+        """Return whether a whole request is held, or one that is refused as it is."""
         if not self._length:
             blank = _BLANK.search(self._held)
             if blank is None:

@@ -29,9 +29,9 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
-from strands_robots.mcp.connections import CONNECTION, IDLE_S, MESSAGE_MAX, BoundedServer, Connections, Room, listener
+from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Connections, Room, listener
 from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.server import GONE, STOPS, build
+from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, build
 from strands_robots.mcp.sessions import Sessions
 from strands_robots.mcp.tokens import Token, TokenFile
 from strands_robots.utils import is_loopback_host

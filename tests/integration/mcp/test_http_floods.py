@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import resource
+import ssl
 import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack
+from pathlib import Path
 
 import pytest
 from fixtures.half_sent import KINDS, beginning, closed, half_sent
@@ -19,6 +21,7 @@ pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_ty
 import httpx2
 
 from strands_robots.mcp import connections, http, sessions
+from strands_robots.mesh.keys import CA_CERT, init, issue
 from strands_robots.serving.control import leases_of
 
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
@@ -172,3 +175,19 @@ def test_a_message_beyond_the_bound_is_refused_unparsed(url: str, tokens: dict[s
 def holder(site: McpSite) -> str | None:
     """Return who holds the first robot of the world."""
     return leases_of(site.world, hardware=False).of("left").facts().get("holder")
+
+
+async def test_half_done_handshakes_of_tls_delay_no_stop(site: McpSite, tokens: dict[str, str], tmp_path: Path) -> None:
+    init(tmp_path)
+    files = issue(tmp_path, "server", ["127.0.0.1"])
+    with site.http("--http-cert", str(files.cert), "--http-key", str(files.key), scheme="https") as url:
+        resource.prlimit(site.server.pid, resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
+        trust = ssl.create_default_context(cafile=str(tmp_path / CA_CERT))
+        async with site.http_client(url, tokens["desk"], verify=trust) as client:
+            for begun in (b"", b"\x16\x03\x01\x02\x00"):
+                with half_sent(url, HALF_SENT, begun):
+                    began = time.monotonic()
+                    assert not (await client.call_tool("stop", {"robot": "arm-1"})).is_error
+                    async with site.http_client(url, tokens["desk"], verify=trust) as another:
+                        assert not (await another.call_tool("stop", {"robot": "arm-1"})).is_error
+                    assert time.monotonic() - began < STOP_S
