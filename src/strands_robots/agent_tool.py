@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 from strands_robots.utils import missing_extra
 
 try:
@@ -11,4 +14,18 @@ except ModuleNotFoundError as exc:
         raise
     raise missing_extra("An agent's tool", "agent") from exc
 
-__all__ = ["ToolContext", "tool"]
+__all__ = ["ToolContext", "fitted", "tool"]
+
+T = TypeVar("T", bound=Any)
+
+
+def fitted(agent_tool: T, fit: Callable[[dict[str, Any]], dict[str, Any]]) -> T:
+    """Return an agent tool whose input goes through ``fit`` before it is checked."""
+    stream = agent_tool.stream
+
+    def stream_fitted(tool_use: Any, *values: Any, **options: Any) -> Any:
+        given = tool_use.get("input")
+        return stream({**tool_use, "input": fit(given) if isinstance(given, dict) else given}, *values, **options)
+
+    vars(agent_tool)["stream"] = stream_fitted
+    return agent_tool

@@ -85,11 +85,33 @@ def test_estop_names_each_robot_and_exits_with_the_worst(
     assert (facts["status"] == "success") is (code == 0)
 
 
-@pytest.mark.parametrize(
-    "arguments", [("a", "--all"), ("a.b",), ("--deadline", "0"), ("--as", ""), ("--key", "nowhere")]
-)
+@pytest.mark.parametrize("arguments", [("--as", ""), ("--key", "nowhere")])
 def test_estop_with_wrong_arguments_is_exit_2(run: Run, arguments: tuple[str, ...]) -> None:
     assert run("estop", *arguments).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected", "said"),
+    [
+        (("a", "--all"), [], ""),
+        (("a.b", "x" * 1000), ["a.b", "x" * 1000], ""),
+        (("a", "--deadline", "0"), ["a"], "--deadline"),
+        (("a", "--deadline", "nan"), ["a"], "--deadline"),
+        (("a", "--reason", ""), ["a"], ""),
+        (("a", "--reason", "y" * 100_000), ["a"], "cut to 200 of 100000"),
+        (("a", "--reason", "\ud83e\x00"), ["a"], "cannot be printed"),
+    ],
+)
+def test_no_argument_refuses_an_emergency_stop(
+    run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], expected: list[str], said: str
+) -> None:
+    fake = FakeController(report(answer("a")))
+    monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: fake)
+    result = run("estop", *arguments)
+    ((names, reason),) = fake.calls
+    assert names == expected
+    assert len(reason) <= 200
+    assert said in result.stdout
 
 
 def test_slow_and_silent_robots_are_red() -> None:
@@ -135,9 +157,31 @@ def test_stop_of_one_robot_of_a_world_names_it(run: Run, fleet: FakeFleet) -> No
     assert "world-1/left" in result.stdout, "the other robots of the world may move on"
 
 
-@pytest.mark.parametrize("arguments", [("stop",), ("stop", "a", "--all"), ("stop", "--all", "--robot", "left")])
-def test_stop_takes_a_device_or_all(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
-    assert run(*arguments).exit_code == 2
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("a", "--all"),
+        ("--all", "--robot", "left"),
+        ("--robot", "left"),
+        ("a/b",),
+        ("--timeout", "0"),
+        ("x" * 1000,),
+    ],
+)
+def test_no_argument_refuses_a_stop(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
+    fleet.stops = {"a": success("Stopped.", stopped=True)}
+    result = run("stop", *arguments)
+    assert result.exit_code == 0
+    assert "Stopped." in result.stdout
+
+
+@pytest.mark.parametrize("name", ["x" * 1000, "\x00"])
+def test_a_stop_of_a_name_that_cannot_be_read_stops_all_of_the_device(run: Run, fleet: FakeFleet, name: str) -> None:
+    fleet.stops = {"world-1": success("Stopped.", stopped=True)}
+    result = run("stop", "world-1", "--robot", name)
+    assert result.exit_code == 0
+    assert "Ignored" in result.stdout
 
 
 @pytest.mark.parametrize(

@@ -100,14 +100,24 @@ async def test_stop_of_one_robot_leaves_the_others_moving(world: ToyWorld) -> No
         assert (await bench.call("stop", robot_name=""))["stopped"] == ["right"]
 
 
-@pytest.mark.parametrize("name", ["middle", 5, True, None, "x" * 129])
-async def test_stop_of_a_robot_that_is_not_there_stops_nothing_and_is_no_success(world: ToyWorld, name: Any) -> None:
+async def test_stop_of_a_robot_that_is_not_there_stops_nothing_and_is_no_success(world: ToyWorld) -> None:
     async with DriverBench(SimulationDeviceDriver(world)) as bench:
         await bench.call("execute", instruction="wave", robot_name="left")
-        answer = await bench.call("stop", robot_name=name)
+        answer = await bench.call("stop", robot_name="middle")
         assert answer["status"] == "error"
-        assert answer.get("not_stopped") == ["middle"] if name == "middle" else "robot_name" in answer["reason"]
+        assert answer["not_stopped"] == ["middle"]
         assert [row["robot"] for row in world.list_policies_running()] == ["left"]
+
+
+@pytest.mark.parametrize("name", [5, True, None, "x" * 100_000, "\x00", ["left"], {"left": [[]]}])
+async def test_stop_of_a_name_that_cannot_be_read_stops_the_whole_world(world: ToyWorld, name: Any) -> None:
+    async with DriverBench(SimulationDeviceDriver(world)) as bench:
+        await bench.call("execute", instruction="wave", robot_name="left")
+        answer = await bench.call("stop", robot_name=name, reason="x" * 10_000, other=[[]])
+        assert answer["status"] == "success"
+        assert "2 unknown arguments" in answer["ignored"]
+        assert ("robot_name is not readable" in answer["ignored"]) is (name is not None)
+        assert world.list_policies_running() == []
 
 
 async def test_stop_of_one_robot_voids_its_pending_command_alone(world: ToyWorld) -> None:

@@ -335,8 +335,16 @@ def test_what_takes_energy_away_is_refused_for_no_field_that_it_does_not_use(
     peers.join(Arm(), "arm-1")
     reply = ask(peers, peers.stranger(), "arm-1", {"command": command})[0]
     assert reply["type"] == "response"
-    named = ask(peers, peers.stranger(), "arm-1", {"command": {"action": "stop", "robot_name": "a/b"}})[0]
-    assert named["error"].startswith("validation: robot_name")
+
+
+@pytest.mark.parametrize("name", ["a/b", "x" * 10_000, 5, True, ["left"], {"left": [[]]}, None])
+def test_a_stop_whose_name_cannot_be_read_stops_the_whole_world(peers: Fleet, name: object) -> None:
+    peers.join(World("left"), "sim-1", "sim")
+    console = peers.join(None, "console")
+    command = {"action": "stop", "robot_name": name, "reason": "x" * 1000, "other": [[]]}
+    for reply in (ask(peers, peers.stranger(), "sim-1", {"command": command})[0], console.send("sim-1", command, 20)):
+        assert reply["type"] == "response", reply
+        assert reply["result"]["ok"] is True
 
 
 @pytest.mark.parametrize("action", ["stop", "teleop_stop"])

@@ -79,10 +79,6 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
         ({"action": "call", "target": "arm-1", "verb": "a/b"}, "verb"),
         ({"action": "move", "target": "arm-1", "arguments": [1]}, "arguments"),
         ({"action": "release_torque"}, "target"),
-        ({"action": "stop", "target": "arm 1"}, "target"),
-        ({"action": "stop", "arguments": {"robot_name": "left"}}, "target"),
-        ({"action": "stop", "target": "world-1", "arguments": {"robot": "left"}}, "robot_name"),
-        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": ""}}, "robot_name"),
     ],
 )
 def test_argument_out_of_its_domain_is_refused_by_name(
@@ -92,6 +88,29 @@ def test_argument_out_of_its_domain_is_refused_by_name(
     assert answer["status"] == "error"
     assert named in answer["reason"]
     assert fake.calls == []
+
+
+@pytest.mark.parametrize(
+    ("given", "called"),
+    [
+        ({"action": "emergency_stop"}, ("emergency_stop", "")),
+        ({"action": "emergency_stop", "instruction": "x" * 100_000}, ("emergency_stop", "x" * 200)),
+        ({"action": "emergency_stop", "instruction": "a\nb", "duration": "?"}, ("emergency_stop", "a b")),
+        ({"action": "emergency_stop", "instruction": 5, "target": "a b"}, ("emergency_stop", "5")),
+        ({"action": "stop", "target": "arm 1"}, ("stop", "")),
+        ({"action": "stop", "target": ["arm-1"], "reason": "x"}, ("stop", "")),
+        ({"action": "stop", "arguments": {"robot_name": "left"}}, ("stop", "")),
+        ({"action": "stop", "target": "world-1", "arguments": {"robot": "left"}}, ("stop", "world-1")),
+        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": ""}}, ("stop", "world-1")),
+        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": [1]}}, ("stop", "world-1")),
+        ({"action": "stop", "target": "world-1", "arguments": "left"}, ("stop", "world-1")),
+        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": "left"}}, ("stop", "world-1", "left")),
+    ],
+)
+async def test_no_argument_refuses_a_stop(fake: FakeNetwork, given: dict[str, Any], called: tuple[Any, ...]) -> None:
+    use = {"toolUseId": "1", "name": "robot_mesh", "input": given}
+    events = [event async for event in robot_mesh.stream(use, {})]
+    assert fake.calls == [called], events
 
 
 def test_verbs_are_called_with_their_arguments(fake: FakeNetwork) -> None:

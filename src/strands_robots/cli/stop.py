@@ -21,8 +21,10 @@ from strands_robots.envelope import Envelope, text_of
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import DEADLINE_S, Progress, SafetyController, StopReport
 from strands_robots.safety.orders import new_epoch
+from strands_robots.serving.robot_verbs import WORLD_VERBS
+from strands_robots.serving.stop_arguments import stop_reason, stop_robot
 from strands_robots.tools.networks import NativeMesh, stop_outcome
-from strands_robots.utils import device_id, number, text
+from strands_robots.utils import ValidationError, device_id, number
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
@@ -62,16 +64,17 @@ def stop(
     on_mesh: OnMesh = False,
 ) -> None:
     """Stop one robot, or all. Exits with 1 when one did not stop, with 3 when one is silent."""
-    if (device is None) != everything:
-        raise CliError("stop takes a DEVICE or --all.", Exit.USAGE)
-    if one and device is None:
-        raise CliError("stop takes --robot with a DEVICE, whose world has that robot.", Exit.USAGE)
-    name = text("--robot", one, longest=128, empty=True)
+    device, unread = stop_robot("DEVICE", None if everything else device)
+    everything, device = not device, device or None
+    name = WORLD_VERBS["stop"].readable({"robot_name": one})[0]["robot_name"] if device else ""
+    if one and not name:
+        unread = unread or "--robot names no robot of a DEVICE's world, so all of it is stopped"
+    _say_ignored(screen, unread)
     if on_mesh:
         network.use_mesh()
         _report_mesh_stop(screen, NativeMesh().stop(device or "", name))
         return
-    seconds = number("--timeout", timeout, above=0, high=60)
+    seconds = _seconds(screen, "--timeout", timeout, 60, 5.0)
     with network.fleet() as fleet:
         answers = fleet.stop_all(seconds) if device is None else {device: fleet.stop(device, seconds, name)}
         unknown = device is not None and stop_outcome(answers[device])[0] is None
@@ -120,18 +123,19 @@ def estop(
     The tenant is the fleet that --tenant names, default without it. The id of the stop is the epoch of the lockout that
     it leaves; a resume names it.
     """
-    if devices and everything:
-        raise CliError("estop takes DEVICE... or --all.", Exit.USAGE)
+    reason, cut = stop_reason(reason)
+    _say_ignored(screen, cut)
     if on_mesh:
         if devices:
-            raise CliError("estop --mesh stops every robot, and takes no DEVICE.", Exit.USAGE)
+            _say_ignored(screen, "estop --mesh stops every robot, and no DEVICE is waited for")
         network.use_mesh()
         on_key = None if key is None else signing_key(key, passphrase_file)
         _report_mesh_stop(screen, NativeMesh().emergency_stop(reason, on_key))
         show_resume(screen, key, f" --mesh{network.flags}")
         return
-    expected = [device_id("DEVICE", each) for each in devices or []]
-    seconds = number("--deadline", deadline, above=0, high=600)
+    # What is no device's id answers to nothing, so the report has it as silent.
+    expected = [] if everything else list(devices or [])
+    seconds = _seconds(screen, "--deadline", deadline, 600, DEADLINE_S)
     source = device_id("--as", source)
     link = network.link()
     signer = None if key is None else signing_key(key, passphrase_file)
@@ -173,6 +177,20 @@ def estop(
         screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
     else:
         show_resume(screen, key, network.flags)
+
+
+def _say_ignored(screen: Screen, note: str) -> None:
+    """Say what of a stop's arguments is left out; none of them refuses it."""
+    if note:
+        screen.say(f"Ignored: {plain(note, 300)}.", "yellow")
+
+
+def _seconds(screen: Screen, name: str, value: float, most: float, usual: float) -> float:
+    try:
+        return number(name, value, above=0, high=most)
+    except ValidationError as unfit:
+        _say_ignored(screen, f"{str(unfit).rstrip('.')}; it is {usual:g}")
+        return usual
 
 
 def show_resume(screen: Screen, key: Path | None, flags: str) -> None:

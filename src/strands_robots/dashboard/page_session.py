@@ -28,6 +28,8 @@ from strands_robots.utils import ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
 
+STOPS = ("stop", "stopMotion")
+
 TICK_S, SLOW_TICKS = 0.05, 10
 """Seconds between two looks for changes, and looks between two updates of ages and steps."""
 
@@ -303,6 +305,10 @@ class PageSession:
 
     async def _call(self, key: str, message: Message) -> Envelope:
         verb, params = text("verb", message.get("verb"), longest=100), message.get("params")
+        if verb in STOPS:
+            # Before anything else of the message is looked at.
+            stopped, name = self._feed(key)
+            return await stopped.stop(name)
         if not isinstance(params, dict):
             raise ValidationError(f"params must be an object, not {shown(params)}.")
         feed, robot = self._feed(key)
@@ -310,8 +316,6 @@ class PageSession:
         form = next((each for each in row.forms if each["name"] == verb), None) if row is not None else None
         if form is None or verb in LEFT_OUT:
             raise ValidationError(f"verb must be one of this robot's, not {shown(verb)}.")
-        if verb in ("stop", "stopMotion"):
-            return await feed.stop(robot)
         if form["kind"] != "read":
             self._may_drive()
             params = {**params, **self._control.lease(key)}

@@ -171,8 +171,10 @@ class Dashboard:
                 pressed = json.loads(await socket.receive_text())
                 if isinstance(pressed, dict) and pressed.get("type") == "stop":
                     # Before anything else is done with it.
-                    self.stop.press(str(pressed.get("robot", ""))[:128])
-                    self.model.note("", "", "STOP pressed", {"button": str(pressed.get("robot", "")) or "all robots"})
+                    named = pressed.get("robot")
+                    who = named[:128] if isinstance(named, str) else ""
+                    self.stop.press(who)
+                    self.model.note("", "", "STOP pressed", {"button": who or "all robots"})
                     await socket.send_text(json.dumps({"type": "pressed", "id": pressed.get("id")}, default=str))
         except (ValueError, RecursionError, KeyError, RuntimeError, WebSocketDisconnect) as gone:
             logger.debug("A page is gone, or sent no message of this page: %s", type(gone).__name__)

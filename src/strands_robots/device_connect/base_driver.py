@@ -45,6 +45,7 @@ from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
+from strands_robots.serving.stop_arguments import noted
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.serving.world_stops import stop_within
@@ -194,12 +195,13 @@ class RobotDriver(CollectedOnce):
             params: arguments, and ``source_device``, the caller's declared name.
         """
         verb = self.verbs.get(function_name)
+        if verb is not None and verb.kind is Kind.STOP and function_name in self.made:
+            params.pop("source_device", None)
+            return await self._stop(verb, params)
         if verb is None or function_name not in self.made or (observable and observed(self)):
             problem = verb and verb.unfit(params.keys() - {"source_device"})
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
-        if verb.kind is Kind.STOP:
-            return await self._stop(verb, params)
         moves, named = verb.kind is Kind.MOTION, params.get("robot_name")
         asked = self.pipeline.pending.arrive(named if isinstance(named, str) else "") if moves else None
         command = Command(verb, params, caller, asked)
@@ -267,16 +269,14 @@ class RobotDriver(CollectedOnce):
         return verdict.envelope()
 
     async def _stop(self, verb: Verb, given: Mapping[str, Any]) -> Envelope:
-        try:
-            name = verb.checked(given).get("robot_name", "")
-        except ValidationError as refused:
-            return error(str(refused), stopped=None)
+        arguments, ignored = verb.readable(given)
+        name = arguments.get("robot_name", "")
         self.pipeline.pending.void(name)
         try:
             target = self.stop_target(name)
         except ValidationError as unknown:
             return enveloped("stop", self.stop_envelope(StopVerdict(not_stopped={name: str(unknown)})))
-        return await self.stop_answer(verb.name, target, name)
+        return noted(await self.stop_answer(verb.name, target, name), ignored)
 
     async def stop_answer(self, reason: str, target: Haltable | None = None, name: str = "") -> Envelope:
         """Halt and answer within the halt deadline, for any caller."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
@@ -10,9 +11,14 @@ from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots.device_connect._compat import emit, rpc
 from strands_robots.device_connect.safety_controller import envelope
-from strands_robots.envelope import error, success
+from strands_robots.envelope import success
 from strands_robots.safety.controller import DEADLINE_S, SafetyController
-from strands_robots.utils import ValidationError, device_id, number, text
+from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot
+from strands_robots.serving.verbs import unknown_arguments
+from strands_robots.utils import ValidationError, number
+
+EXPECTED_MAX = 1024
+"""Names of robots that one stop expects to answer; it stops every robot all the same."""
 
 
 class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framework has no type information
@@ -50,15 +56,29 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
             expected: Ids of the robots that must answer
             deadline_s: Seconds until a robot that gave no answer is reported as silent
         """
+        return await self._stop_all({"reason": reason, "expected": expected, "deadline_s": deadline_s})
+
+    async def invoke(self, function_name: str, **params: Any) -> Any:
+        """Serve one call; a stop is refused for none of its arguments."""
+        if function_name == "stopAll":
+            params.pop("source_device", None)
+            return await self._stop_all(params)
+        return await super().invoke(function_name, **params)
+
+    async def _stop_all(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        why, cut = stop_reason(given.get("reason"))
+        asked, within, notes = given.get("expected"), DEADLINE_S, [cut]
+        rows = asked[:EXPECTED_MAX] if isinstance(asked, list) else []
+        names = [stop_robot("expected", each)[0] for each in rows]
+        if asked and (not rows or len(rows) < len(asked) or not all(names)):
+            notes.append("expected names what is no robot's id, or too many")
         try:
-            names = [device_id("expected", each) for each in expected or []]
-            why, within = (
-                text("reason", reason, longest=200, empty=True),
-                number("deadline_s", deadline_s, above=0, high=60),
-            )
-        except ValidationError as exc:
-            return error(str(exc))
-        return envelope(await asyncio.to_thread(self.controller.stop, names, why, deadline_s=within))
+            within = number("deadline_s", given.get("deadline_s", DEADLINE_S), above=0, high=60)
+        except ValidationError:
+            notes.append(f"deadline_s is not above 0 and at most 60, so it is {DEADLINE_S:g}")
+        notes.append(unknown_arguments(len(given.keys() - {"reason", "expected", "deadline_s"})))
+        report = await asyncio.to_thread(self.controller.stop, list(filter(None, names)), why, deadline_s=within)
+        return noted(envelope(report), *notes)
 
     @rpc(labels={"direction": "read"})
     async def getStatus(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import base64
 import json
+import logging
 import math
 import secrets
 import time
@@ -35,6 +36,8 @@ from strands_robots.mcp.results import jpeg_of, result
 from strands_robots.safety.approval import Approval, Grants, digest, state_dir
 from strands_robots.safety.state_files import StateFileError
 from strands_robots.utils import ValidationError
+
+logger = logging.getLogger(__name__)
 
 GRANT_S = 15.0
 """Seconds for which the grant of a yes is good: the motion is begun at once."""
@@ -71,7 +74,8 @@ class Wish:
 class Approve(BaseModel):
     """The form that a user fills in."""
 
-    approve: bool = Field(description="True lets the robot make this motion, once")
+    # Strict: the texts and numbers that stand for true elsewhere are no yes.
+    approve: bool = Field(strict=True, description="True lets the robot make this motion, once")
 
 
 class Approvals:
@@ -100,8 +104,7 @@ class Approvals:
         message = f"{question}\nPicture: {shown or 'this robot gives none'}"
         if str(context.protocol_version or "") >= WITHOUT_PARTS:
             return self._ask(message, motion)
-        reply = await context.elicit(message, Approve)
-        yes = reply.action == "accept" and reply.data.approve
+        yes = await _approved(context, message)
         return result(await self._granted(wish, source) if yes else _declined(robot, verb))
 
     def _ask(self, message: str, motion: str) -> InputRequiredResult:
@@ -143,6 +146,16 @@ class Approvals:
         if is_error(answer) and unused and answer.get("reason") == Approval.refusal(verb, robot):
             return {**answer, "approved_here": "the robot is served by another machine or user, which has to approve"}
         return answer
+
+
+async def _approved(context: Context[Any, Any], message: str) -> bool:
+    """Ask the user in the midst of a call; True only where the form holds true."""
+    try:
+        reply = await context.elicit(message, Approve)
+    except ValueError as unfit:
+        logger.warning("The answer to a question is not its form, so it is no yes: %s", unfit)
+        return False
+    return reply.action == "accept" and reply.data.approve is True
 
 
 def _can_ask(context: Context[Any, Any]) -> bool:

@@ -21,7 +21,7 @@ from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
-from strands_robots.tools.networks import stop_and_lock
+from strands_robots.tools.networks import combined_verdict, stop_and_lock
 from strands_robots.utils import ValidationError, number
 
 ANSWER_S = 10.0
@@ -41,6 +41,9 @@ RENEWALS = 4
 
 RENEWED_S = 2.0
 """Longest wait for the answer to a renewal: the next one is in time even so."""
+
+URGENT_MAX = 8
+"""Stops of all robots that one client has running at once."""
 
 OVER = frozenset({"displaced", "lease_over", "not_holder"})
 """Answers to a renewal after which the lease is another's, or nobody's."""
@@ -78,8 +81,8 @@ class Caller:
         self._secrets: dict[str, str] = {}
         self._binding: set[tuple[str, str]] = set()
         self._used_at = time.monotonic()
-        # An emergency stop is never behind another call.
-        self._urgent = ThreadPoolExecutor(1, "mcp-estop")
+        # An emergency stop is never behind another call, nor behind the one before it.
+        self._urgent = ThreadPoolExecutor(URGENT_MAX, "mcp-estop")
 
     def used(self) -> None:
         """Note a call of the client; it is there, so its leases are renewed."""
@@ -171,7 +174,11 @@ class Caller:
         return answer
 
     async def stop(self, robot: str, robot_name: str = "") -> Envelope:
-        """Stop a robot, or one of a world, without a lease or a wait."""
+        """Stop a robot, one of a world, or all robots, without a lease or a wait."""
+        if not robot:
+            loop = asyncio.get_running_loop()
+            answers = await loop.run_in_executor(self._urgent, self.fleet.stop_all)
+            return combined_verdict(answers, self.fleet.stale)
         try:
             return await self.fleet.stop_async(robot, robot_name=robot_name)
         except ValidationError as refused:

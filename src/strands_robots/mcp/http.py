@@ -5,20 +5,22 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import secrets
 import signal
-import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import anyio
 import uvicorn
 from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
 from mcp.server.auth.provider import AccessToken
-from mcp.server.transport_security import TransportSecuritySettings
+from mcp.server.transport_security import TransportSecurityMiddleware, TransportSecuritySettings
+from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import Message, Receive, Scope, Send
 
@@ -27,24 +29,28 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
+from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Connections, Room, listener
 from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.server import GONE, build
+from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, build
+from strands_robots.mcp.sessions import Sessions
 from strands_robots.mcp.tokens import Token, TokenFile
 from strands_robots.utils import is_loopback_host
 
 PATH = "/mcp"
 PICTURES = "/pictures/"
 PICTURES_MAX = 16
-MESSAGES_MAX = 8
 
 LEFT_S = 1.0
 """Seconds without a request after a client closed its standing stream; then it has gone away."""
 
-KEEPALIVE = {"TCP_KEEPIDLE": 2, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3, "TCP_USER_TIMEOUT": 5000}
-"""Options of a connection: its client's machine is gone after 5 s without a sign."""
+CLOSE = {"connection": "close"}
+BEFORE_A_STOP = ("initialize", "notifications/initialized", "server/discover", "ping", "tools/list")
+"""Methods that a client calls before its first stop."""
 
 SHUTDOWN_S = 1
 CONNECTING_MAX = 4
+LOOK_S = 30.0
+"""Seconds between two looks for idle sessions."""
 
 _ACCESS = "strands_robots.access"
 
@@ -99,6 +105,29 @@ class _Client:
         self.open = 0
 
 
+class _Sent:
+    """Answer to a request, sent on as it comes.
+
+    Attributes:
+        accepted: it began, and is no refusal.
+        complete: it has ended.
+        session_id: of the session that it names.
+    """
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self.accepted = self.complete = False
+        self.session_id = ""
+
+    async def __call__(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self.accepted = message["status"] < 400
+            self.session_id = _header(message, b"mcp-session-id")
+        await self._send(message)
+        ended = message["type"] == "http.response.body" and not message.get("more_body", False)
+        self.complete = self.complete or ended
+
+
 class HttpServer:
     """ASGI application that checks tokens, over a server for each permission.
 
@@ -117,7 +146,9 @@ class HttpServer:
         self._connecting = ThreadPoolExecutor(CONNECTING_MAX, "mcp-connect")
         self._leaving: set[asyncio.Task[None]] = set()
         self._running = AsyncExitStack()
-        self._servers: dict[bool, Any] = {}
+        self._sessions: dict[bool, Sessions] = {}
+        self._security = TransportSecurityMiddleware(address.security())
+        self.connections = Connections()
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -131,12 +162,14 @@ class HttpServer:
                 server.streamable_http_app(
                     streamable_http_path=PATH, transport_security=self._address.security(), host=self._address.host
                 )
-                self._servers[read_only] = server.session_manager
+                self._sessions[read_only] = Sessions(server.session_manager)
                 await stack.enter_async_context(server.session_manager.run())
             await stack.enter_async_context(resources.published())
+            looking = asyncio.ensure_future(self._close_idle())
             try:
                 yield
             finally:
+                looking.cancel()
                 # Before the stack closes the connections of the clients.
                 await self.leave_all()
 
@@ -151,54 +184,76 @@ class HttpServer:
         if scope["path"] != PATH:
             await Response(status_code=404)(scope, receive, send)
             return
+        # Nothing below this line happens for a page of another origin, whatever its method and its session.
+        refusal = await self._security.validate_request(Request(scope), is_post=scope["method"] == "POST")
         # Read here and not in a thread: a stop waits for no thread of the pool. It is one small file.
         token = self._token(headers.get(b"authorization", ""))
-        if token is None:
+        if refusal is None and token is None:
             refusal = JSONResponse(
                 {"error": "invalid_token", "error_description": "strands-robots keys mcp NAME makes a token"},
                 status_code=401,
-                headers={"www-authenticate": 'Bearer error="invalid_token"'},
+                headers={"www-authenticate": 'Bearer error="invalid_token"', **CLOSE},
             )
-            await refusal(scope, receive, send)
+        if refusal is not None or token is None:
+            await (refusal or Response(status_code=401))(scope, receive, send)
             return
-        await self._serve(await self._client(token), scope, receive, send)
+        room = self.connections.admit(scope["state"][CONNECTION], token.name)
+        body = b"" if room is Room.NONE else await _body(headers, receive)
+        if body is None:
+            return
+        if len(body) > MESSAGE_MAX:
+            await _refused(413, f"A message has at most {MESSAGE_MAX} bytes.")(scope, receive, send)
+        elif room is Room.ANY or (room is Room.STOPS and stops(body)):
+            await self._serve(await self._client(token), body, scope, receive, send)
+        else:
+            await _refused(503, "This token has too many connections; stops alone are served.")(scope, receive, send)
 
-    async def _serve(self, client: _Client, scope: Scope, receive: Receive, send: Send) -> None:
-        gone = asyncio.Event()
+    async def _serve(self, client: _Client, body: bytes, scope: Scope, receive: Receive, send: Send) -> None:
+        gone, sent_body = asyncio.Event(), False
         # A session of the SDK belongs to the user that began it.
         user = AuthenticatedUser(AccessToken(token="", client_id=client.token.name, scopes=[]))
         inner = {**scope, "user": user, _ACCESS: client.access, GONE: gone}
-        messages: asyncio.Queue[Message] = asyncio.Queue(MESSAGES_MAX)
-        answered = False
+        answer = _Sent(send)
 
-        async def pump() -> None:
-            while True:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    gone.set()
-                await messages.put(message)
-                if gone.is_set():
-                    return
+        async def watch() -> None:
+            while (await receive())["type"] != "http.disconnect":
+                pass
+            gone.set()
 
-        async def sent(message: Message) -> None:
-            nonlocal answered
-            await send(message)
-            answered = answered or (message["type"] == "http.response.body" and not message.get("more_body", False))
+        async def received() -> Message:
+            nonlocal sent_body
+            if not sent_body:
+                sent_body = True
+                return {"type": "http.request", "body": body, "more_body": False}
+            await gone.wait()
+            return {"type": "http.disconnect"}
 
+        sessions, session_id = self._sessions[client.token.read_only], _header(scope, b"mcp-session-id")
+        name = client.token.name
         client.open += 1
-        client.access.caller.used()
-        pumping = asyncio.ensure_future(pump())
+        sessions.begin(session_id, name)
+        watching = asyncio.ensure_future(watch())
         try:
-            await self._servers[client.token.read_only].handle_request(inner, messages.get, sent)
+            await sessions.manager.handle_request(inner, received, answer)
         finally:
-            pumping.cancel()
+            watching.cancel()
             client.open -= 1
-            client.access.caller.used()
+            sessions.end(session_id, name)
+            if answer.accepted:
+                client.access.caller.used()
             standing = scope["method"] == "GET" or _header(scope, b"mcp-method") == "subscriptions/listen"
-            if scope["method"] == "DELETE" or (standing and not answered):
+            if answer.accepted and (scope["method"] == "DELETE" or (standing and not answer.complete)):
                 leaving = asyncio.ensure_future(self._left(client))
                 self._leaving.add(leaving)
                 leaving.add_done_callback(self._leaving.discard)
+            with anyio.CancelScope(shield=True):
+                await _keep(sessions, answer, session_id, name, ended=scope["method"] == "DELETE")
+
+    async def _close_idle(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK_S)
+            for sessions in self._sessions.values():
+                await sessions.close_idle()
 
     async def _left(self, client: _Client) -> None:
         """Halt and release what a client has, unless it comes again at once."""
@@ -252,16 +307,6 @@ class HttpServer:
         return Response(status_code=404) if jpeg is None else Response(jpeg, media_type="image/jpeg")
 
 
-class _Server(uvicorn.Server):
-    """uvicorn's server, which reports at once that it was told to end."""
-
-    on_exit: Callable[[], object] = staticmethod(lambda: None)
-
-    def handle_exit(self, sig: int, frame: Any) -> None:
-        self.on_exit()
-        super().handle_exit(sig, frame)
-
-
 def require_secure(address: Address, tokens: TokenFile) -> None:
     """Refuse to leave this machine without TLS and a token.
 
@@ -299,12 +344,17 @@ async def serve_http(
         ssl_certfile=address.cert,
         ssl_keyfile=address.key,
         timeout_graceful_shutdown=SHUTDOWN_S,
-        timeout_keep_alive=60,
+        timeout_keep_alive=IDLE_S,
+        # A connection that became another protocol's would be within no bound.
+        ws="none",
     )
     loop = asyncio.get_running_loop()
     leaving: list[asyncio.Future[None]] = []
-    server = _Server(config)
-    server.on_exit = lambda: loop.call_soon_threadsafe(lambda: leaving.append(asyncio.ensure_future(app.leave_all())))
+
+    def leave() -> None:
+        leaving.append(asyncio.ensure_future(app.leave_all()))
+
+    server = BoundedServer(config, app.connections, lambda: loop.call_soon_threadsafe(leave))
     for each in (signal.SIGTERM, signal.SIGINT):
         # uvicorn raises a signal again at its end; the robots are halted first, and then the process ends by itself.
         signal.signal(each, lambda *_: None)
@@ -314,20 +364,42 @@ async def serve_http(
             await server.serve(sockets=[listening])
 
 
-def listener(host: str, port: int) -> socket.socket:
-    """Return a listening socket that notices when a client's machine is gone.
+def stops(body: bytes) -> bool:
+    """Return whether a message is a stop, or what a client says before its first one."""
+    try:
+        message = json.loads(body)
+        method, params = message["method"], message.get("params")
+        return method in BEFORE_A_STOP or (method == "tools/call" and params["name"] in STOPS)
+    except (ValueError, RecursionError, TypeError, KeyError, AttributeError):
+        return False
 
-    Its client counts as present until then, so its leases are renewed.
-    """
-    listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-    # asyncio sets this on sockets of a stated protocol only; without it an answer waits 40 ms for the client's kernel.
-    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in KEEPALIVE.items():
-        option = getattr(socket, name, None)  # the names differ among systems
-        if option is not None:
-            listening.setsockopt(socket.IPPROTO_TCP, option, value)
-    return listening
+
+async def _body(headers: Mapping[bytes, str], receive: Receive) -> bytes | None:
+    """Return a request's body, cut behind its bound; None where its client left."""
+    length = headers.get(b"content-length", "")
+    if length.isdecimal() and (len(length) > 9 or int(length) > MESSAGE_MAX):
+        return bytes(MESSAGE_MAX + 1)
+    body = bytearray()
+    while len(body) <= MESSAGE_MAX:
+        message = await receive()
+        if message["type"] != "http.request":
+            return None
+        body += message.get("body", b"")
+        if not message.get("more_body", False):
+            break
+    return bytes(body)
+
+
+async def _keep(sessions: Sessions, answer: _Sent, asked: str, owner: str, *, ended: bool) -> None:
+    """Keep the session that a request began; end that of a refusal, or a DELETE."""
+    if ended and answer.accepted:
+        await sessions.close(asked)
+    elif answer.session_id and not asked:
+        await (sessions.opened(answer.session_id, owner) if answer.accepted else sessions.close(answer.session_id))
+
+
+def _refused(status: int, why: str) -> Response:
+    return JSONResponse({"error": why}, status_code=status, headers=CLOSE)
 
 
 def _access_of(context: Any) -> ClientAccess:
@@ -335,8 +407,9 @@ def _access_of(context: Any) -> ClientAccess:
     return access
 
 
-def _header(scope: Scope, name: bytes) -> str:
-    return next((value.decode("latin-1") for each, value in scope["headers"] if each.lower() == name), "")
+def _header(message: Mapping[str, Any], name: bytes) -> str:
+    """Return a header of a scope or of an answer's start, empty where there is none."""
+    return next((value.decode("latin-1") for each, value in message["headers"] if each.lower() == name), "")
 
 
 def _bracketed(host: str) -> str:

@@ -24,7 +24,6 @@ from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import acquire_arguments, move_arguments
 from strands_robots.mcp.results import Result, facts, picture, quoted, result, row
-from strands_robots.utils import ValidationError, text
 
 PAGE_BYTES = 2600
 """Size of a page of robots; it is in an answer twice, as text and as structured content."""
@@ -41,6 +40,7 @@ Count = Annotated[int, Field(strict=True, ge=0, le=100_000)]
 Flag = Annotated[bool, Field(strict=True)]
 Robot = Annotated[str, Field(description="The robot's id, as list_robots has it", max_length=128)]
 InWorld = Annotated[str, Field(description="Which robot of a simulated world; empty for its first", max_length=128)]
+StopRobot = Annotated[str, Field(description="The robot's id, as list_robots has it; empty for all robots")]
 StopInWorld = Annotated[
     str, Field(description="Which robot of a simulated world; empty for all of them", max_length=128)
 ]
@@ -141,8 +141,8 @@ def add_stops(server: MCPServer[Any], access: AccessOf) -> None:
     """Add the tools that stop."""
 
     @server.tool(annotations=STOP)
-    async def stop(context: Context[Any, Any], robot: Robot, robot_name: StopInWorld = "") -> Result:
-        """Stop a robot now.
+    async def stop(context: Context[Any, Any], robot: StopRobot = "", robot_name: StopInWorld = "") -> Result:
+        """Stop a robot now, or all of them.
 
         Only a success confirms it: a refused or missing answer means that it may still move.
         """
@@ -150,14 +150,10 @@ def add_stops(server: MCPServer[Any], access: AccessOf) -> None:
 
     @server.tool(annotations=STOP)
     async def emergency_stop(
-        context: Context[Any, Any], reason: Annotated[str, Field(description="Why, 1 to 200 characters")]
+        context: Context[Any, Any], reason: Annotated[str, Field(description="Why, in up to 200 characters")] = ""
     ) -> Result:
         """Stop and lock every robot; only a human operator can resume them."""
-        try:
-            why = text("reason", reason, longest=200)
-        except ValidationError as refused:
-            return result(error(str(refused)))
-        return result(await access(context).caller.emergency_stop(why))
+        return result(await access(context).caller.emergency_stop(reason))
 
 
 def add_motions(server: MCPServer[Any], access: AccessOf, approvals: Approvals) -> None:

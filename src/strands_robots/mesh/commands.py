@@ -249,14 +249,9 @@ class CommandReceiver:
             audit(event, request.sender_id, action=verb.name, turn_id=request.turn_id)
 
     def _stop(self, request: wire.Request, verb: Verb) -> None:
-        named = request.command.get("robot_name")
-        self._pipeline.pending.void(named if isinstance(named, str) else "")
+        name = verb.readable(request.command)[0]["robot_name"] or ""
+        self._pipeline.pending.void(name)
         self._before_stop()
-        try:
-            name = verb.checked(request.command).get("robot_name", "")
-        except ValidationError as exc:
-            self._refuse(request, verb.name, f"validation: {exc}")
-            return
         try:
             target = self._target_of(name)
         except ValidationError as exc:

@@ -10,6 +10,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.serving.peer_verbs import PEER_VERBS
+from strands_robots.serving.verbs import Kind
 from strands_robots.utils import ValidationError, identifier, mapping, number, peer_id, shown
 
 __all__ = [
@@ -47,7 +48,8 @@ def validate_command(command: object) -> dict[str, Any]:
     Args:
         command: an object with ``action`` and that action's fields.
 
-    A resume's assertion is passed on unchanged: the check of its signature counts refusals.
+    A stop is refused for none of its fields: what cannot be read is dropped, which stops more. A resume's assertion
+    is passed on unchanged: the check of its signature counts refusals.
 
     Raises:
         ValidationError: naming the field, the value and its domain.
@@ -57,6 +59,9 @@ def validate_command(command: object) -> dict[str, Any]:
     verb = PEER_VERBS.get(action) if isinstance(action, str) else None
     if verb is None:
         raise ValidationError(f"action must be one of {', '.join(PEER_VERBS)}, not {shown(action)}.")
+    if verb.kind is Kind.STOP:
+        readable, _ = verb.readable(given)
+        return {"action": verb.name, **{name: value for name, value in readable.items() if value is not None}}
     return {"action": verb.name, **verb.checked(given)}
 
 

@@ -182,6 +182,30 @@ class Verb:
         }
         return {name: value for name, value in arguments.items() if value is not None or not self.drops_unknown}
 
+    def readable(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+        """Return the arguments of a stop that can be read, and a note on the others.
+
+        A stop is refused for none of them: without one it stops more. A value that is no scalar is not looked at.
+        """
+        arguments = {each.name: each.default for each in self.parameters}
+        unread = []
+        for each in self.parameters:
+            value = given.get(each.name)
+            if value is None:
+                continue
+            try:
+                arguments[each.name] = each.check(each.name, value if isinstance(value, str | int | float) else "\0")
+            except ValidationError:
+                unread.append(f"{each.name} is not readable, so everything is stopped")
+        if not self.drops_unknown:
+            unread.append(unknown_arguments(len(given) - sum(name in given for name in self.by_name)))
+        return arguments, "; ".join(filter(None, unread))
+
+
+def unknown_arguments(count: int) -> str:
+    """Return a note on arguments that a stop does not have, or nothing."""
+    return f"{count} unknown argument{'s' if count > 1 else ''}" if count else ""
+
 
 def table(verbs: Sequence[Verb]) -> dict[str, Verb]:
     """The verbs by name."""

@@ -11,24 +11,41 @@
 from __future__ import annotations
 
 import base64
+from functools import partial
 from typing import Any
 
-from strands_robots.agent_tool import tool
+from strands_robots.agent_tool import fitted, tool
 from strands_robots.envelope import error
-from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot
 from strands_robots.tools import networks
-from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, shown, text
+from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, shown
 
 CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
 """Verb of each action that calls one where none is named."""
 
-ACTIONS = ("peers", "tell", "status", "stop", "emergency_stop", "release_torque", "call", *CALLED)
+STOPS = ("stop", "emergency_stop")
+ACTIONS = ("peers", "tell", "status", *STOPS, "release_torque", "call", *CALLED)
 NEEDS_TARGET = ("tell", "status", "release_torque", "call", *CALLED)
 
 CALL_S = networks.ANSWER_S + WAIT_S
 """Longest wait for the answer to a verb, which may wait for the end of a motion."""
 
 
+def _readable_stop(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the input of a stop as the tool's schema has it."""
+    if given.get("action") not in STOPS:
+        return given
+    texts = {name: given[name] for name in ("target", "instruction") if given.get(name) is not None}
+    arguments = given.get("arguments")
+    return {
+        "action": given["action"],
+        **{name: value if isinstance(value, str) else shown(value) for name, value in texts.items()},
+        **({"arguments": arguments if isinstance(arguments, dict) else {shown(arguments): None}} if arguments else {}),
+    }
+
+
+@partial(fitted, fit=_readable_stop)
 @tool
 def robot_mesh(
     action: str,
@@ -62,6 +79,11 @@ def robot_mesh(
             takes picture, the camera whose picture its answer brings.
         arguments: The verb's arguments by name, such as {"x": 0.25, "y": 0.0, "z": 0.1} or {"camera": "table"}.
     """
+    if action == "emergency_stop":
+        why, cut = stop_reason(instruction)
+        return noted(networks.network().emergency_stop(why), cut)
+    if action == "stop":
+        return _stop(target, arguments)
     try:
         asked = choice("action", action, ACTIONS)
         robot = device_id("target", target) if target or asked in NEEDS_TARGET else ""
@@ -73,10 +95,6 @@ def robot_mesh(
             given = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
             task = ARM_VERBS["execute"].checked(given)
             return networks.network().tell(robot, task["instruction"], task["policy_provider"], task["duration"])
-        if asked == "emergency_stop":
-            return networks.network().emergency_stop(text("instruction", instruction, empty=True))
-        if asked == "stop":
-            return networks.network().stop(robot, *_one_of_world(robot, arguments))
     except ValidationError as refused:
         return error(str(refused))
     if asked == "release_torque":
@@ -84,14 +102,15 @@ def robot_mesh(
     return networks.network().status(robot) if asked == "status" else networks.network().peers()
 
 
-def _one_of_world(target: str, arguments: object) -> tuple[str, ...]:
-    """Return the name of the one robot of a world that is to stop; empty for all."""
-    if arguments is None:
-        return ()
-    given = mapping("arguments", arguments)
-    if set(given) != {"robot_name"} or not target:
-        raise ValidationError(f"arguments of stop must be robot_name alone, with a target, not {shown(given)}.")
-    return (text("robot_name", given["robot_name"], longest=128),)
+def _stop(target: object, arguments: object) -> dict[str, Any]:
+    """Stop a robot, one of a world, or all; no argument refuses it."""
+    robot, unknown = stop_robot("target", target)
+    given = arguments if isinstance(arguments, dict) else {}
+    of_world, unread = WORLD_VERBS["stop"].readable(given) if robot else ({}, "")
+    if arguments and not given:
+        unread = "arguments is no object"
+    one = of_world.get("robot_name", "")
+    return noted(networks.network().stop(robot, *([one] if one else [])), unknown, unread)
 
 
 def _with_image(answer: dict[str, Any]) -> dict[str, Any]:

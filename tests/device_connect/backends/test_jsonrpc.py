@@ -120,3 +120,29 @@ def test_valid_json_finds_nan_and_infinity(value):
 
 def test_valid_json_accepts_nan_in_a_text():
     assert jsonrpc.valid_json(b'{"text": "NaN and Infinity"}')
+
+
+@pytest.mark.parametrize("method", jsonrpc.STOPS)
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"params": None},
+        {"params": ["left"]},
+        {"params": {"self": 1}},
+        {"params": {"_dc_meta": []}},
+        {"params": {"source_device": 5}},
+        {"id": True},
+        {"id": [1]},
+        {"jsonrpc": "1.0"},
+    ],
+)
+def test_stop_is_refused_for_no_other_part_of_its_message(method, odd):
+    checked = jsonrpc.check(json.dumps({**GOOD, "method": method, **odd}).encode())
+    assert isinstance(checked, jsonrpc.RpcRequest)
+    assert checked.method == method
+    assert checked.params == {}
+
+
+def test_stop_without_an_id_is_one():
+    checked = jsonrpc.check(b'{"method": "stop", "params": {"robot_name": "left"}}')
+    assert (checked.method, checked.id) == ("stop", None)

@@ -16,15 +16,25 @@ from mcp import MCPError
 from mcp.types import ElicitResult
 
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
+YES = {"approve": True}
+NO_YES: list[dict[str, Any]] = [
+    *({"approve": each} for each in ("yes", "true", "True", "on", "1", "", 1, 1.0, 0, False, ["true"])),
+    {},
+    {"Approve": True},
+]
 SHORT = {"robot": "metal-1", "instruction": "wave", "duration": 0.3}
 
 
 class User:
     """A user who answers every question alike, and keeps what was asked."""
 
-    def __init__(self, action: str, approve: bool = True) -> None:
+    def __init__(self, action: str, content: dict[str, Any] | None = None) -> None:
         self.asked: list[str] = []
-        self._answer: dict[str, Any] = {"action": action, **({"content": {"approve": approve}} if approve else {})}
+        self._answer: dict[str, Any] = {"action": action, **({} if content is None else {"content": content})}
+
+    def answer_with(self, content: dict[str, Any]) -> None:
+        """Give this form from now on."""
+        self._answer["content"] = content
 
     async def __call__(self, context: object, params: Any) -> ElicitResult:
         self.asked.append(params.message)
@@ -40,7 +50,7 @@ def still(site: McpSite) -> Iterator[None]:
 
 @BOTH
 async def test_a_yes_lets_the_robot_move_once(site: McpSite, mode: str) -> None:
-    user = User("accept")
+    user = User("accept", YES)
     async with site.client(mode=mode, elicitation_callback=user) as client:
         done = await client.call_tool("run_policy", SHORT)
         assert not done.is_error, done
@@ -62,12 +72,34 @@ async def test_the_question_says_what_will_move_how_far_and_how_fast(site: McpSi
 
 
 @BOTH
-@pytest.mark.parametrize("user", [User("decline"), User("cancel"), User("accept", approve=False)])
+@pytest.mark.parametrize("user", [User("decline", YES), User("cancel", YES), User("accept")])
 async def test_anything_but_a_yes_leaves_the_robot_still(site: McpSite, mode: str, user: User) -> None:
     async with site.client(mode=mode, elicitation_callback=user) as client:
         refused = await client.call_tool("run_policy", SHORT)
     assert refused.is_error
     assert site.metal.answers == []
+
+
+@BOTH
+@pytest.mark.parametrize("over_http", [False, True], ids=["stdio", "http"])
+async def test_only_true_is_a_yes(site: McpSite, mode: str, over_http: bool) -> None:
+    async def refused_all(connected: Any, user: User) -> None:
+        async with connected as client:
+            for content in NO_YES:
+                user.answer_with(content)
+                assert (await client.call_tool("run_policy", SHORT)).is_error, content
+            assert len(user.asked) == len(NO_YES)
+            assert site.metal.answers == []
+            user.answer_with(YES)
+            assert not (await client.call_tool("run_policy", SHORT)).is_error
+
+    user = User("accept")
+    if not over_http:
+        await refused_all(site.client(mode=mode, elicitation_callback=user), user)
+        return
+    token = site.token("second", "--approves")
+    with site.http() as url:
+        await refused_all(site.http_client(url, token, mode=mode, elicitation_callback=user), user)
 
 
 @BOTH
@@ -84,7 +116,7 @@ async def test_a_client_that_cannot_ask_gets_the_refusal_and_the_grant_line(site
 async def test_the_yes_of_a_token_counts_only_where_its_maker_said_so(site: McpSite, mode: str) -> None:
     plain, approving = site.token("desk"), site.token("second", "--approves")
     with site.http() as url:
-        user = User("accept")
+        user = User("accept", YES)
         async with site.http_client(url, plain, mode=mode, elicitation_callback=user) as client:
             refused = await client.call_tool("run_policy", SHORT)
             assert refused.is_error
@@ -96,7 +128,7 @@ async def test_the_yes_of_a_token_counts_only_where_its_maker_said_so(site: McpS
 
 
 async def test_a_yes_that_was_used_is_good_for_nothing_else(site: McpSite) -> None:
-    async with site.client(mode="2026-07-28", elicitation_callback=User("accept")) as client:
+    async with site.client(mode="2026-07-28", elicitation_callback=User("accept", YES)) as client:
         asked = await client.session.call_tool("run_policy", SHORT, allow_input_required=True)
         yes = {"approval": ElicitResult(action="accept", content={"approve": True})}
         answer: dict[str, Any] = {

@@ -154,3 +154,15 @@ async def test_server_over_http_answers_after_malformed_frames(site: McpSite) ->
             await good("after")
             assert memory_mb(site.server.pid) - before < GROWTH_MB
     assert not site.moving
+
+
+def test_a_line_beyond_the_bound_is_read_past_and_the_next_one_is_served(site: McpSite) -> None:
+    begun = b'{"jsonrpc":"2.0","id":1,"method":"tools/call","params":{"name":"stop","arguments":{"robot":['
+    with RawServer(site) as server:
+        server.ask(server.call("first", "get_state", {"robot": "arm-1"}))
+        before = server.memory_mb
+        for _ in range(2):
+            server.send_raw(begun + b"[]," * 8_000_000 + b"[]]}}}")
+            stopped = server.ask(server.call("stop", "stop", {"robot": "arm-1"}))
+            assert stopped["result"]["structuredContent"]["status"] == "success"
+        assert server.memory_mb - before < 20

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 
-from strands_robots.mcp.http import KEEPALIVE, listener
+from strands_robots.mcp.connections import KEEPALIVE, listener
 
 GONE_S = 5
 

@@ -222,7 +222,11 @@ async def test_the_controller_as_a_device_answers_by_name(
     driver = SafetyControllerDriver(controller)
     answer = await driver.stopAll("smoke", ["arm-1"])
     assert list(answer["stopped"]) == ["arm-1"]
-    assert is_error(await driver.stopAll("smoke", ["arm/1"]))
+    odd = {"reason": ["x"] * 9, "expected": ["arm-1", "arm/1", 5], "deadline_s": "nan", "other": [[]]}
+    stopped = await driver.invoke("stopAll", **odd)
+    assert stopped["status"] == "success"
+    for said in ("reason is a list", "expected names", "deadline_s", "1 unknown argument"):
+        assert said in stopped["ignored"]
     assert (await driver.getStatus())["link_up"] is True
 
 

@@ -25,6 +25,9 @@ BUSY = -32001
 MAX_COMMAND_BYTES = MESSAGE_MAX
 """Largest command that is read, in bytes."""
 
+STOPS = ("stop", "stopMotion", "stopAll")
+"""Methods that no other part of their message refuses."""
+
 # The framework hands params to ``invoke(function_name, **params)``; these would collide with its own arguments.
 _TAKEN = ("self", "function_name")
 
@@ -128,7 +131,20 @@ def _id_of(data: bytes) -> RpcId:
     return rpc_id if isinstance(rpc_id, _SCALARS) else None
 
 
+def _stop_request(request: dict[str, Any], data: bytes) -> RpcRequest:
+    """Return a stop, whatever else its message holds."""
+    rpc_id, params = request.get("id"), request.get("params", {})
+    finite = not isinstance(rpc_id, float) or math.isfinite(rpc_id)
+    rpc_id = rpc_id if isinstance(rpc_id, _SCALARS) and not isinstance(rpc_id, bool) and finite else None
+    if "id" not in request or _params_problem(params):
+        params = {}
+        data = json.dumps({"jsonrpc": "2.0", "id": rpc_id, "method": request["method"], "params": params}).encode()
+    return RpcRequest(request["method"], rpc_id, params, data)
+
+
 def _check_request(request: dict[str, Any], data: bytes) -> RpcRequest | Refusal:
+    if request.get("method") in STOPS:
+        return _stop_request(request, data)
     if "id" not in request:
         return Refusal(INVALID_REQUEST, "id is missing")
     rpc_id = request["id"]
