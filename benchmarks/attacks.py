@@ -1,4 +1,4 @@
-"""Attacks: floods, robots that lie, many lockouts, strangers on the mesh."""
+"""Attacks: floods, robots that lie, many lockouts, strangers on the mesh, and the attacks of the files beside this."""
 
 from __future__ import annotations
 
@@ -15,6 +15,17 @@ from fixtures.plane_process import planned
 from fixtures.stop_controller import controller
 from fixtures.waiting import eventually, free_port
 
+from benchmarks import (
+    attacks_approval,
+    attacks_audit,
+    attacks_doors,
+    attacks_doubt,
+    attacks_leases,
+    attacks_mcp,
+    attacks_policies,
+    attacks_reachy,
+    attacks_sizes,
+)
 from benchmarks.attacks_robots import attacked_link, files_row, foreign_row, state_folder
 from benchmarks.safety import Figures, Fleet, Hiccups, row
 from benchmarks.table import Row
@@ -29,6 +40,18 @@ EVERY_S = 0.5
 OTHERS = [f"safety-{number}" for number in range(2, 2002)]
 ARMS = ["arm-1", "arm-2"]
 
+PARTS = (
+    attacks_doubt,
+    attacks_leases,
+    attacks_sizes,
+    attacks_policies,
+    attacks_reachy,
+    attacks_approval,
+    attacks_mcp,
+    attacks_audit,
+    attacks_doors,
+)
+
 
 def run(quick: bool = False) -> list[Row]:
     """Measure and give the rows of the table."""
@@ -41,7 +64,10 @@ def run(quick: bool = False) -> list[Row]:
             rows.append(_flooded(transport, url, name, seconds))
             rows.append(foreign_row(transport, url, name, stops))
         rows.append(files_row(stops))
-    return [*rows, *_strangers(TRIES_QUICK if quick else TRIES), machine.row()]
+        rows += _strangers(TRIES_QUICK if quick else TRIES)
+        for part in PARTS:
+            rows += part.rows(quick)
+    return [*rows, machine.row()]
 
 
 def _strangers(tries: int) -> list[Row]:
