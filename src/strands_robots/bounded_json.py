@@ -77,15 +77,16 @@ def parsed(data: bytes | str, longest: int = MESSAGE_MAX, parse: Callable[[Any],
         OutOfBoundsError: it is out of its bounds, or nests deeper than :data:`DEPTH_MAX`.
         ValueError: it is no JSON, or deeper than the parser goes.
     """
-    why = refusal(data, longest)
+    # A short text, as every stop is, is not measured: it may hold anything.
+    why = refusal(data, longest) if len(data) > min(longest, FREE_BYTES) else ""
     if why:
         raise OutOfBoundsError(why)
     try:
         value = parse(data)
     except RecursionError:
         raise ValueError("nested too deep") from None
-    nests = len(data) > MESSAGE_MAX or _count(data, "[") + _count(data, "{") > DEPTH_MAX
-    if nests and _deeper_than(value, DEPTH_MAX):
+    marks = data.count("[") + data.count("{") if isinstance(data, str) else data.count(b"[") + data.count(b"{")
+    if marks > DEPTH_MAX and _deeper_than(value, DEPTH_MAX):
         raise OutOfBoundsError(f"it is nested deeper than {DEPTH_MAX}")
     return value
 

@@ -146,7 +146,11 @@ class StopLine:
                     if not _overdue(running):
                         return None
                     self.stuck += 1
-            self.running = self._taken() or None
+            taken = []
+            while self.waiting:
+                taken.append(self.waiting.popleft())
+                taken[-1].begun = time.monotonic()
+            self.running = taken or None
             return self.running
 
     def more(self, running: list[SubmittedStop]) -> list[SubmittedStop] | None:
@@ -154,7 +158,10 @@ class StopLine:
         with self._changing:
             if self.running is not running:
                 return None
-            taken = self._taken()
+            taken = []
+            while self.waiting:
+                taken.append(self.waiting.popleft())
+                taken[-1].begun = time.monotonic()
             running.extend(taken)
             return taken
 
@@ -166,13 +173,6 @@ class StopLine:
             self.running = None
             self.stuck += 1
             return True
-
-    def _taken(self) -> list[SubmittedStop]:
-        taken = []
-        while self.waiting:
-            taken.append(self.waiting.popleft())
-            taken[-1].begun = time.monotonic()
-        return taken
 
 
 class TargetSlot:
