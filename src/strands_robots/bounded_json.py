@@ -65,17 +65,20 @@ def refusal(data: bytes | str, longest: int = MESSAGE_MAX) -> str:
     return "it has a number of hundreds of digits" if _long_number(data) else ""
 
 
-def parsed(data: bytes | str, longest: int = MESSAGE_MAX, parse: Callable[[Any], Any] = json.loads) -> Any:
+def parsed(
+    data: bytes | str, longest: int = MESSAGE_MAX, parse: Callable[[Any], Any] = json.loads, *, depth: int = DEPTH_MAX
+) -> Any:
     """Return the value of a JSON text.
 
     Args:
         data: the text.
         longest: its bound, as in :func:`refusal`.
         parse: the parser of ``data``.
+        depth: deepest nesting.
 
     Raises:
-        OutOfBoundsError: it is out of its bounds, or nests deeper than :data:`DEPTH_MAX`.
-        ValueError: it is no JSON, or deeper than the parser goes.
+        OutOfBoundsError: it is out of its bounds, or nests deeper than ``depth``.
+        ValueError: it is no JSON.
     """
     # A short text, as every stop is, is not measured: it may hold anything.
     why = refusal(data, longest) if len(data) > min(longest, FREE_BYTES) else ""
@@ -84,10 +87,10 @@ def parsed(data: bytes | str, longest: int = MESSAGE_MAX, parse: Callable[[Any],
     try:
         value = parse(data)
     except RecursionError:
-        raise ValueError("nested too deep") from None
+        raise OutOfBoundsError(f"it is nested deeper than {depth}") from None
     marks = data.count("[") + data.count("{") if isinstance(data, str) else data.count(b"[") + data.count(b"{")
-    if marks > DEPTH_MAX and _deeper_than(value, DEPTH_MAX):
-        raise OutOfBoundsError(f"it is nested deeper than {DEPTH_MAX}")
+    if marks > depth and _deeper_than(value, depth):
+        raise OutOfBoundsError(f"it is nested deeper than {depth}")
     return value
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from strands_robots.policies.decoding import ForeignDataError, decode_json, read_json
+from strands_robots.policies.decoding import ForeignDataError, decode_file, read_json
 from strands_robots.utils import ValidationError, shown
 
 STATE, ACTION, ENVIRONMENT = "observation.state", "action", "observation.environment_state"
@@ -158,7 +158,7 @@ def _header(path: Path) -> dict[str, Any]:
             (length,) = struct.unpack("<Q", file.read(8))
             if length > HEADER_MAX:
                 raise ValidationError(f"{path.name} has a header of {length} bytes")
-            header = decode_json(file.read(length), bytes_max=HEADER_MAX, elements_max=HEADER_ELEMENTS_MAX)
+            header = decode_file(file.read(length), bytes_max=HEADER_MAX, elements_max=HEADER_ELEMENTS_MAX)
     except (OSError, struct.error, ForeignDataError) as exc:
         raise ValidationError(f"{path.name} cannot be read: {exc}") from None
     if not isinstance(header, dict):

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from strands_robots.bounded_json import OutOfBoundsError, parsed
 from strands_robots.utils import ValidationError
 
 MESSAGE_MAX = 2**20
@@ -43,17 +44,32 @@ def decode_msgpack(data: bytes) -> Any:
         raise ForeignDataError(f"it is malformed: {type(exc).__name__}: {exc!s:.200}") from None
 
 
-def decode_json(data: str | bytes, *, bytes_max: int = MESSAGE_MAX, elements_max: int = ELEMENTS_MAX) -> Any:
-    """Return what a JSON text holds.
+def decode_json(data: str | bytes) -> Any:
+    """Return what a JSON message holds.
 
     Separators are counted in place of elements, also those inside of texts.
 
     Raises:
         ForeignDataError: it is beyond a bound, or no JSON.
     """
+    _within("bytes", len(data), MESSAGE_MAX)
+    _within("elements", _marks(data), ELEMENTS_MAX)
+    try:
+        return parsed(data, MESSAGE_MAX, depth=DEPTH_MAX)
+    except OutOfBoundsError as exc:
+        raise ForeignDataError(str(exc)) from None
+    except ValueError as exc:
+        raise ForeignDataError(f"it is malformed: {type(exc).__name__}: {exc!s:.200}") from None
+
+
+def decode_file(data: bytes, *, bytes_max: int = MESSAGE_MAX, elements_max: int = ELEMENTS_MAX) -> Any:
+    """Return what the JSON text of a file holds, which may have more than a message.
+
+    Raises:
+        ForeignDataError: it is beyond a bound, or no JSON.
+    """
     _within("bytes", len(data), bytes_max)
-    marks = map(data.count, ",[{:") if isinstance(data, str) else map(data.count, b",[{:")
-    _within("elements", sum(marks), elements_max)
+    _within("elements", _marks(data), elements_max)
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as exc:
@@ -68,7 +84,11 @@ def read_json(path: Path, *, bytes_max: int = MESSAGE_MAX, elements_max: int = E
         OSError: it cannot be read.
     """
     with path.open("rb") as file:
-        return decode_json(file.read(bytes_max + 1), bytes_max=bytes_max, elements_max=elements_max)
+        return decode_file(file.read(bytes_max + 1), bytes_max=bytes_max, elements_max=elements_max)
+
+
+def _marks(data: str | bytes) -> int:
+    return sum(map(data.count, ",[{:") if isinstance(data, str) else map(data.count, b",[{:"))
 
 
 def _within(what: str, count: int, most: int) -> None:

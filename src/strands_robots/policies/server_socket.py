@@ -39,7 +39,8 @@ class ServerSocket:
         self._errors = _module("websockets.exceptions")
         self._socket: Any = None
         self._open_socket = contextlib.ExitStack()
-        self.lost: tuple[type[Exception], ...] = (self._errors.WebSocketException, OSError)
+        # Where garbage arrives during the handshake, an assertion of websockets may fail.
+        self.lost: tuple[type[Exception], ...] = (self._errors.WebSocketException, OSError, AssertionError)
         """Raised where the connection, or its opening, failed."""
 
     @property

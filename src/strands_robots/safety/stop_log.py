@@ -16,6 +16,8 @@ from collections import deque
 RECORDS_MAX = 1000
 """Records that wait for their handlers; beyond it the newest are dropped and counted."""
 
+DROPPED = "%d log records were dropped while a handler was blocked."
+
 ENDING_S = 1.0
 """Seconds that the end of the process waits for the last records."""
 
@@ -71,15 +73,17 @@ class LogWriter(logging.Filter):
             self._waiting.clear()
             while self._records:
                 logger, record = self._records.popleft()
+                dropped, self.dropped = self.dropped, 0
                 try:
+                    if dropped:
+                        text = "%d log records were dropped while a handler was blocked."
+                        logger.callHandlers(
+                            logger.makeRecord(logger.name, logging.WARNING, "", 0, text, (dropped,), None)
+                        )
                     logger.callHandlers(record)
                 except Exception:  # noqa: BLE001 - a handler of somebody else's must not end the log of the others
                     if logging.lastResort is not None:
                         logging.lastResort.handleError(record)
-                dropped, self.dropped = self.dropped, 0
-                if dropped:
-                    text = "%d log records were dropped while a handler was blocked."
-                    logger.callHandlers(logger.makeRecord(logger.name, logging.WARNING, "", 0, text, (dropped,), None))
             self._busy = False
 
 

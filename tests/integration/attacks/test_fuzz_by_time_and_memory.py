@@ -55,7 +55,7 @@ PARSERS = {
     "mesh/safety.py": BOUNDED,
     "mesh/subscriptions.py": BOUNDED,
     "mesh/transport/bridge.py": BOUNDED,
-    "mesh/transport/zenoh_config.py": OWN_FILE,
+    "mesh/transport/access.py": OWN_FILE,
     "mesh/wire.py": BOUNDED,
     "ros/rosbridge_session.py": BOUNDED,
     "safety/approval.py": OWN_FILE,
@@ -63,7 +63,6 @@ PARSERS = {
     "safety/identity.py": OWN_FILE,
     "safety/orders.py": BOUNDED,
     "safety/persistence.py": OWN_FILE,
-    "teleoperators/recorded.py": OWN_FILE,
 }
 """Each module that parses JSON, and whose text it is. The decoders of foreign text are in fixtures/decoders.py."""
 
@@ -81,9 +80,9 @@ RECEIVERS = {
     "device_connect/runtime_stops.py": "64 KiB by the back end",
     "device_connect/stop_link.py": "64 KiB, looked at before it is copied",
     "drivers/reachy/driver.py": "an event stream of this process",
-    "drivers/reachy/links.py": "1 MiB by the WebSocket, 64 KiB are parsed",
-    "drivers/reachy/motion.py": "1 MiB by the WebSocket, 64 KiB are parsed",
-    "drivers/reachy/rest.py": "1 MiB, read in parts",
+    "drivers/reachy/links.py": "64 KiB, by the WebSocket and before it is copied",
+    "drivers/reachy/motion.py": "64 KiB by the WebSocket",
+    "drivers/reachy/rest.py": "512 KiB, of a stop 64 KiB, read in parts",
     "mesh/children.py": "by the transport: the topic's own bound",
     "mesh/core.py": "by the transport: the topic's own bound",
     "mesh/input_receiver.py": "by the transport: the topic's own bound",

@@ -17,7 +17,7 @@ from fixtures.waiting import eventually, free_port
 from tests.mesh.peers import Fleet, RealClock
 
 from strands_robots.mesh import keys
-from strands_robots.mesh.transport import Transport
+from strands_robots.mesh.transport import Transport, access
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport
 from strands_robots.mesh.transport.zenoh import ZenohTransport
 from strands_robots.mesh.transport.zenoh_config import Posture
@@ -151,7 +151,11 @@ class OverTls(OverZenoh):
 
     def _stranger(self, name: str) -> Transport:
         own = keys.issue(self.folder / "keys", name)
-        return ZenohTransport(Posture("strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, None, False, 16))
+        return ZenohTransport(
+            Posture(
+                "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, access.certified_peers("strands/"), False, 16
+            )
+        )
 
 
 class OverMqtt(Network):
@@ -202,7 +206,11 @@ class OverBoth(OverMqtt):
 
     def _stranger(self, name: str) -> Transport:
         own = keys.issue(self._keys, name)
-        return ZenohTransport(Posture("strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, None, False, 16))
+        return ZenohTransport(
+            Posture(
+                "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, access.certified_peers("strands/"), False, 16
+            )
+        )
 
 
 KINDS: dict[str, type[Network]] = {each.kind: each for each in (InMemory, OverZenoh, OverTls, OverMqtt, OverBoth)}
