@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from fixtures.bodies import ScriptedPolicy
 from fixtures.devices import RANGES, RecordingDevice, TorqueDevice
 from fixtures.planes import own_plane
 from fixtures.waiting import eventually
@@ -16,8 +18,11 @@ from fixtures.waiting import eventually
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.contract import RolloutEvent
 from strands_robots.hardware import HardwareRobot
+from strands_robots.hardware import robot as hardware_robot
 from strands_robots.policies.settling import RANGES_PER_S, SETTLE_HZ
 from strands_robots.safety.orders import StopOrder, new_epoch
+from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError
 
 pytestmark = pytest.mark.usefixtures("patient_settling")
@@ -222,3 +227,73 @@ def test_limp_and_its_older_name_take_the_torque_off(level: Any) -> None:
     assert robot.halt("test").stopped is True
     assert robot.device.limp == ["pan", "lift", "grip"]
     robot.cleanup()
+
+
+class SlowToInterrupt(ScriptedPolicy):
+    """Waits in its second call for ``act_returns``, and in its interruption for ``interruption_returns``."""
+
+    def __init__(self) -> None:
+        super().__init__([{"pan.pos": 20.0}], always=self._wait)
+        self.acts, self.act_returns = threading.Event(), threading.Event()
+        self.interruption_returns = threading.Event()
+
+    def _wait(self) -> None:
+        self.acts.set()
+        self.act_returns.wait(120)
+
+    def interrupt(self) -> None:
+        super().interrupt()
+        self.interruption_returns.wait(120)
+
+
+@pytest.fixture
+def slow(robot: HardwareRobot, monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowToInterrupt]:
+    """The policy of a task of ``robot`` that runs."""
+    policy = SlowToInterrupt()
+    with monkeypatch.context() as patched:
+        patched.setattr(hardware_robot, "create_policy", lambda name, **options: policy)
+        assert robot.start_task("wave")["status"] == "success"
+    assert policy.acts.wait(20)
+    yield policy
+    policy.act_returns.set()
+    policy.interruption_returns.set()
+
+
+def test_an_arm_that_moves_again_before_its_stop_is_judged_does_not_settle(
+    robot: HardwareRobot, slow: SlowToInterrupt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = stop_executor().submit(robot, "settler", "test", within=600)
+    assert slow.interrupted.wait(20)
+    slow.act_returns.set()
+    eventually(lambda: not robot.occupied("settler"))
+    monkeypatch.setattr(hardware_robot, "create_policy", lambda name, **options: ScriptedPolicy([], {"pan.pos": 9.0}))
+    assert robot.start_task("again")["status"] == "success"
+    slow.interruption_returns.set()
+    assert (stop.result(20).stopped, stop.result(20).settling) == (True, False)
+    assert robot.get_task_status()["task_status"] == "running"
+    assert robot.get_task_status()["settling"] != "settling"
+
+
+def test_an_arm_whose_stop_was_answered_by_its_deadline_does_not_settle_later(
+    robot: HardwareRobot, slow: SlowToInterrupt
+) -> None:
+    late: list[StopVerdict] = []
+    stop = stop_executor().submit(robot, "settler", "test", within=0.5, answered=late.append)
+    assert stop.result(20).settling is False
+    slow.act_returns.set()
+    slow.interruption_returns.set()
+    eventually(lambda: len(late) == 2, what="the late verdict")
+    assert (late[1].stopped, late[1].settling) == (True, False)
+    assert robot.get_task_status()["settling"] != "settling"
+
+
+def test_of_two_stops_the_later_one_says_that_the_arm_settles(robot: HardwareRobot, slow: SlowToInterrupt) -> None:
+    stops = []
+    for _ in range(2):
+        written = len(robot.device.writes)
+        stops.append(stop_executor().submit(robot, "settler", "test", within=600))
+        eventually(lambda written=written: len(robot.device.writes) > written)  # type: ignore[misc]
+    slow.act_returns.set()
+    slow.interruption_returns.set()
+    assert [each.result(20).stopped for each in stops] == [True, True]
+    assert stops[1].result(20).settling is True

@@ -221,3 +221,11 @@ def test_stop_that_is_too_long_to_be_read_is_refused_where_it_has_to_be_signed()
     public = ed25519.public_half(Ed25519PrivateKey.generate())
     for rules in (StopRules(allow=(), keys=[public]), StopRules(allow=["other"], keys=())):
         assert isinstance(rules.order("safety-1", {}, "lane", 8_000_000), StopRefused)
+
+
+def test_each_press_of_a_panel_that_always_sends_the_same_bytes_is_a_stop_of_its_own() -> None:
+    rules = StopRules(allow=(), keys=())
+    orders = [rules.order("panel", {"reason": "press"}, "listener", b"STOP", at) for at in (0.0, 0.1, 10.0, 20.0)]
+    first, repeated, second, third = (each.epoch for each in orders if isinstance(each, StopOrder))
+    assert first == repeated
+    assert len({first, second, third}) == 3

@@ -370,13 +370,16 @@ class HardwareRobot(ArmMixin, TeleopMixin):
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Halt on the stop executor's thread, unless the bus blocks; wait for no loop."""
         ordered = self.gate.generation
-        if ordered == self._frozen_at and not self._body.driven:
+        settles = self._settling is not None and self._settling.running
+        if ordered == self._frozen_at and (settles or not self._body.driven):
             # A halt that waited for the bus when this one was ordered has frozen the robot for both.
             return self._latest_halt
-        with self._halted(deadline, self._settled_after) as verdicts:
-            seen = self.gate.generation
+        # Counted before the wait for the bus: a motion that is allowed meanwhile goes on after the freeze.
+        given, at = self.gate.given, [ordered]
+        with self._halted(deadline, lambda verdict: self._settled_after(at[0], given, verdict)) as verdicts:
+            at[0] = self.gate.generation
             self._body.stop()
-            self._frozen_at = seen
+            self._frozen_at = at[0]
         self._latest_halt = verdicts[0]
         return self._latest_halt
 
@@ -441,9 +444,9 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         fields = {name: value for name, value in answer.items() if name not in ("status", "content")}
         return success(f"Torque is off: {', '.join(answer['released'])}.", **fields)
 
-    def _settled_after(self, verdict: StopVerdict) -> StopVerdict:
-        """Let a robot that was frozen settle, if it does so and no other stop came."""
-        settling, generation = self._settling, self._frozen_at
+    def _settled_after(self, generation: int, given: int, verdict: StopVerdict) -> StopVerdict:
+        """Let a robot settle that the halt of ``generation`` froze, unless another stop or a motion came since."""
+        settling = self._settling
         if settling is None:
             return verdict
         if generation != self.gate.generation:
@@ -451,7 +454,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             return replace(verdict, settling=settling.running)
         if not settling.take() or not verdict.stopped:
             return verdict
-        return replace(verdict, settling=settling.begin(generation))
+        return replace(verdict, settling=settling.begin(generation, given))
 
     def wait_settled(self) -> str:
         """Wait for the end of a settling, at most 6 s; return a sentence on it."""

@@ -479,17 +479,20 @@ class RolloutsEnd(PendingVerdict):
         super().__init__(until, pause_s=0.0)
         self._moved, self._loops, self._then = tuple(moved), loops, then
         self._final: StopVerdict | None = None
+        self._interrupted = self._answered_for = False
 
     def at_once(self) -> StopVerdict | PendingVerdict:
         """Return the verdict where no loop has to end, else this."""
         return self if self._loops else self._then(self._found())
 
     def known(self) -> StopVerdict | None:
-        for each in self._loops.values() if self._final is None else ():
-            each.interrupt()
         return self.judged(None, last=False)
 
     def read(self) -> None:
+        if not self._interrupted:
+            self._interrupted = True
+            for each in self._loops.values():
+                each.interrupt()
         for each in self._loops.values():
             if each.running:
                 each.join(READ_EVERY_S)
@@ -498,11 +501,12 @@ class RolloutsEnd(PendingVerdict):
     def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
         found = self._found()
         if self._final is None and (found.stopped or last):
-            # Once: it may have the robot settle.
-            self._final = self._then(found)
+            # Once, and in time: it may have the robot settle, of which the answer must say so.
+            self._final = found if self._answered_for else self._then(found)
         return self._final
 
     def unread(self, why: str) -> StopVerdict:
+        self._answered_for = True
         return self._found()
 
     def _found(self) -> StopVerdict:

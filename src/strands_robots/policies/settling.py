@@ -145,13 +145,26 @@ class Settling:
         due, self._due = self._due, False
         return due
 
-    def begin(self, generation: int) -> bool:
-        """Start, for the halt of this ``generation``; False if no thread starts."""
-        permit = self._permit = self._gate.settling(generation)
-        self.state, self.error = "settling", ""
+    def begin(self, generation: int, given: int) -> bool:
+        """Start, for the halt of this ``generation``.
+
+        Args:
+            given: the gate's count of permits at that halt.
+
+        Returns:
+            False where a motion was begun since, which a settling must not join, or no thread starts.
+        """
+        permit = self._gate.settling(generation)
+        before, self.state, self.error = self.state, "settling", ""
         self._ended.clear()
         # After the lockout, whose refusal says more.
         self._gate.attach(self)
+        if self._gate.given != given:
+            self.state = before
+            self._gate.detach(self)
+            self._ended.set()
+            return False
+        self._permit = permit
         try:
             threading.Thread(target=self._run, args=(permit,), name=f"settle-{self._body.name}", daemon=True).start()
         except RuntimeError as exc:

@@ -167,7 +167,7 @@ class MotionGate:
         self._generation = 0
         self._here = threading.local()
         self._watchers: tuple[Callable[[], None], ...] = ()
-        self._given = False
+        self._given = 0
 
     @property
     def generation(self) -> int:
@@ -238,13 +238,21 @@ class MotionGate:
         # The generation is read before the latches, so that a lock engaged in between voids this permit.
         asked = self._asked_here()
         permit = Permit(self, asked, verb)
-        refusal = self._refusal(verb, asked)
-        if refusal is not None:
-            raise MotionRefused(refusal)
-        self._given = True
+        for _ in range(2):
+            refusal = self._refusal(verb, asked)
+            if refusal is not None:
+                raise MotionRefused(refusal)
+            # Counted between two looks at the latches: a settling that begins beside this either is a latch that
+            # refuses it, or sees that it was given.
+            self._given += 1
         for begins in self._watchers:
             begins()
         return permit
+
+    @property
+    def given(self) -> int:
+        """Rises with every permit that is given; for a settling, which begins only where none was since its halt."""
+        return self._given
 
     def revoke(self) -> int:
         """Void every permit given so far; return the generation of this halt."""

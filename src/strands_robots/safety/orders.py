@@ -172,12 +172,17 @@ def epoch_of(source: str, params: Mapping[str, Any], raw: bytes) -> str:
 
     Without either it is derived from ``raw``, the bytes that arrived: a stop is never dropped for its shape.
     """
+    return stated_epoch(source, params) or derived_epoch(source, raw)
+
+
+def stated_epoch(source: str, params: Mapping[str, Any]) -> str:
+    """Return ``estop_id``, or the epoch derived from ``event_id``; empty without."""
     estop_id, event_id = params.get("estop_id"), params.get("event_id")
     if is_epoch(estop_id):
         return str(estop_id)
     if isinstance(event_id, str) and event_id:
         return derived_epoch(source, event_id.encode("utf-8", "replace"))
-    return derived_epoch(source, raw)
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,8 +285,8 @@ class StopRules:
     ) -> StopOrder | StopRefused:
         """Decide on the parameters of an ``emergencyStop``.
 
-        ``raw`` are the bytes that they were read from, or their number where there are too many to be read. The bytes
-        identify a message without parameters; one that is not read has a fresh epoch.
+        ``raw`` are the bytes that they were read from, or their number where there are too many to be read. A message
+        without an id, read or not, has a fresh epoch, and its repetitions within UNREAD_AGAIN_S have the same.
         """
         why = self.source_refusal(source) or self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
         if why is not None:
@@ -290,12 +295,11 @@ class StopRules:
         if isinstance(raw, int):
             epoch, why = self._unread_epoch(source, received), f"an emergency stop of {raw} bytes, which was not read"
             return StopOrder(epoch, source, why, path, remote=True, received=received)
-        distinct = raw if raw is not None and not params else _text(params)
         reason = params.get("reason")
         received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
         ahead = self._clocks.note(source, received_at - issued, received) if issued is not None else None
         return StopOrder(
-            epoch_of(source, params, distinct),
+            self._epoch(source, params, received),
             source,
             reason[:REASON_MAX] if isinstance(reason, str) and reason.isprintable() else "",
             path,
@@ -308,8 +312,15 @@ class StopRules:
             answered=_names(params.get(ANSWERED)),
         )
 
+    def _epoch(self, source: str, params: Mapping[str, Any], received: float) -> str:
+        """Return the epoch of a stop; without an id of its own that of its moment.
+
+        The bytes of such a stop may be those of every press.
+        """
+        return stated_epoch(source, params) or self._unread_epoch(source, received)
+
     def _unread_epoch(self, source: str, received: float) -> str:
-        """Return the epoch of a stop that is not read, the same for repetitions."""
+        """Return the epoch of a stop without an id, the same for repetitions."""
         since, epoch = self._unread.get(source, (float("-inf"), ""))
         if received - since >= UNREAD_AGAIN_S:
             since, epoch = received, new_epoch()
@@ -366,10 +377,3 @@ def answered_field(names: Iterable[str]) -> dict[str, list[str]]:
 
 def _names(value: object) -> frozenset[str]:
     return frozenset(each for each in value if isinstance(each, str)) if isinstance(value, list) else frozenset()
-
-
-def _text(params: Mapping[str, Any]) -> bytes:
-    try:
-        return json.dumps(params, sort_keys=True, separators=(",", ":"), default=repr).encode()
-    except (TypeError, ValueError, RecursionError):
-        return repr(sorted(map(str, params))).encode()

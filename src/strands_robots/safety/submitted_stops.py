@@ -67,7 +67,10 @@ class SubmittedStop:
         # Watched until the deadline, an answered stop must not keep its robot alive.
         self.slot = self.target = self.answered = self.pending = None
         if not self._set(verdict) and late is not None:
-            late(verdict)
+            try:
+                late(verdict)
+            except Exception:
+                logger.exception("A late verdict on %s was not taken.", self.name)
 
     def line(self) -> StopLine | None:
         """Return where it waits or is carried out; None once it is resolved."""

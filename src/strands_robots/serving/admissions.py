@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 START_WAIT_S = 1.0
 """Longest wait of a motion for the start of another caller's, which the robot may yet refuse."""
+
+
+LOOK_S = 0.02
+"""Seconds between two looks whether a motion has begun."""
 
 
 class Admission:
@@ -18,6 +23,8 @@ class Admission:
 
     def __init__(self, end: Callable[[Admission, bool], None] | None = None) -> None:
         self._end = end
+        self.begun: Callable[[], bool] = lambda: False
+        """Whether something moves by it already, while its call has not ended."""
 
     def close(self, begun: bool = True) -> None:
         """Report that the motion has begun, or with False that it was refused."""
@@ -39,6 +46,11 @@ class Admissions:
 
     def __bool__(self) -> bool:
         return bool(self._open)
+
+    @property
+    def undecided(self) -> bool:
+        """True while the robot may yet refuse one of them."""
+        return any(not each.begun() for each in self._open)
 
     def add(self, admission: Admission) -> None:
         """Note a motion that is about to begin."""
@@ -62,9 +74,9 @@ class Admissions:
             return
         turn = object()
         self._waiting.append(turn)
-        self._closed.wait_for(
-            lambda: self._waiting[0] is turn if free() else not undecided(),
-            START_WAIT_S,
-        )
+        deadline = time.monotonic() + START_WAIT_S
+        while not (self._waiting[0] is turn if free() else not undecided()) and time.monotonic() < deadline:
+            # A motion that begins tells nobody.
+            self._closed.wait(LOOK_S)
         self._waiting.remove(turn)
         self._closed.notify_all()

@@ -303,7 +303,7 @@ class ControlLease:
     def _undecided(self, holder: str, lease_id: str) -> bool:
         """True while the robot may yet refuse the motion of another that holds it."""
         lease = self._lease
-        if lease is None or lease.begun or not (lease.one_motion and self._starting):
+        if lease is None or lease.begun or not (lease.one_motion and self._starting.undecided):
             return False
         return not _owns(lease, holder, lease_id)
 

@@ -249,8 +249,11 @@ class Pipeline:
             refusal = Refused(RefusalReason.FAILED, f"{verb.name} failed inside the device; its log has the details.")
             result = refusal.envelope
         try:
-            # A motion that began and ended badly is answered with an error, too.
-            leave.close(begun or (command.asked is not None and command.asked.begun))
+            try:
+                # A motion that began and ended badly is answered with an error, too.
+                leave.close(begun or (command.asked is not None and command.asked.begun))
+            except OSError:
+                logger.exception("%s: the grant of %s is still in its folder.", self.peer_id(), verb.name)
             answered(Result(result, refusal))
         finally:
             with self._changed:
@@ -298,9 +301,11 @@ class Pipeline:
             if leases is None:
                 return Admission()
             try:
-                return leases.admit(verb.name, command.caller, lease_id, name, ttl_s, hold=hold)
+                admission = leases.admit(verb.name, command.caller, lease_id, name, ttl_s, hold=hold)
             except NotHolderError as exc:
                 raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
+            admission.begun = lambda: command.asked is not None and command.asked.begun
+            return admission
 
         return admit
 

@@ -70,12 +70,13 @@ class StopTorque:
         if self._level == "limp":
             body.let_go()
 
-    def after(self, verdict: StopVerdict, generation: int) -> StopVerdict:
+    def after(self, verdict: StopVerdict, generation: int, given: int) -> StopVerdict:
         """Let the arms settle that moved since the last stop, if everything stopped.
 
         Args:
             verdict: of the halt, which has frozen every robot.
             generation: of that halt.
+            given: the gate's count of permits at that halt.
         """
         if generation != self._gate.generation:
             # Another stop came meanwhile: the two are one, and the later one lets the arms settle.
@@ -83,7 +84,7 @@ class StopTorque:
         due = [each for each in self._settlings.values() if each.take()]
         if not due or not verdict.stopped:
             return verdict
-        begun = [each.begin(generation) for each in due]
+        begun = [each.begin(generation, given) for each in due]
         return replace(verdict, settling=any(begun))
 
     @property

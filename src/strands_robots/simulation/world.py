@@ -31,6 +31,7 @@ from strands_robots.policies.rollout import (
 )
 from strands_robots.safety.gate import MotionGate, Waiting, answered
 from strands_robots.safety.stop_log import stop_logger
+from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.simulation import projection
 from strands_robots.simulation.body import PICTURE, RobotBody
@@ -464,8 +465,8 @@ class Simulation(ArmMixin, TeleopMixin):
 
     def occupied(self, robot: str) -> str:
         """Name the rollout that drives this robot, for a refusal; empty without one."""
-        rollout = self._running().get(robot)
-        return "" if rollout is None else f"the policy {rollout.policy_name} ({rollout.instruction!r})"
+        one = self._running().get(robot)
+        return f"the policy {one.policy_name} ({one.instruction!r})" if one else ""
 
     @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
@@ -474,11 +475,10 @@ class Simulation(ArmMixin, TeleopMixin):
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Void every permit, freeze, and leave the ends of the loops to be read."""
-        try:
-            self.halt_ordered()
-        finally:
-            generation = self.gate.revoke()
-        return self._freeze(deadline, lambda verdict: self._torque.after(verdict, generation))
+        given = self.gate.given
+        note_motion(self)
+        halt = self.gate.revoke()
+        return self._freeze(deadline, lambda verdict: self._torque.after(verdict, halt, given))
 
     def halt_ordered(self) -> None:
         """Note what moves; a loop whose permit is void counts as halted."""

@@ -116,10 +116,10 @@ class StopRounds(Generic[T]):
         self._ordered(about, within)
 
     def claim(self, about: T, within: float) -> StopRound[T]:
-        """Return the round that was ordered last and goes on, else a new one."""
+        """Return the round that was ordered last, if it goes on and knows of ``about``, else a new one."""
         with self._changing:
             latest, self._unclaimed = self._unclaimed, None
-        if latest is not None and not latest.answer.done():
+        if latest is not None and not latest.answer.done() and (about is None or latest.about is about):
             return latest
         latest = self._ordered(about, within)
         with self._changing:
@@ -130,7 +130,8 @@ class StopRounds(Generic[T]):
         fresh = StopRound(about, within)
         with self._changing:
             latest = self._unclaimed
-            if latest is not None and not latest.answer.done() and fresh.ordered - latest.ordered < SAME_STOP_S:
+            same = latest is not None and not latest.answer.done() and about in (None, latest.about)
+            if latest is not None and same and fresh.ordered - latest.ordered < SAME_STOP_S:
                 return latest
             if self._running >= ROUNDS_MAX:
                 # It begins after all that share it, so its time is counted from the last of them.
