@@ -445,7 +445,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         return success(f"Torque is off: {', '.join(answer['released'])}.", **fields)
 
     def _settled_after(self, generation: int, given: int, verdict: StopVerdict) -> StopVerdict:
-        """Let a robot settle that the halt of ``generation`` froze, unless another stop or a motion came since."""
+        """Let a frozen robot settle, unless another stop or a motion came since."""
         settling = self._settling
         if settling is None:
             return verdict

@@ -116,7 +116,7 @@ class StopRounds(Generic[T]):
         self._ordered(about, within)
 
     def claim(self, about: T, within: float) -> StopRound[T]:
-        """Return the round that was ordered last, if it goes on and knows of ``about``, else a new one."""
+        """Return the last round, if it goes on and is about the same, else a new one."""
         with self._changing:
             latest, self._unclaimed = self._unclaimed, None
         if latest is not None and not latest.answer.done() and (about is None or latest.about is about):
