@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import pytest
 from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually
 
-from strands_robots.envelope import error
-from strands_robots.safety.approval import Approval, Grants, digest
+from strands_robots.envelope import error, success
+from strands_robots.safety.approval import Approval, Claim, Grants, digest
+from strands_robots.serving import admissions
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments
@@ -290,3 +292,40 @@ def test_a_grant_is_spent_by_what_began_or_may_have(
     line.own = {"execute": lambda arguments: answer(robot)}
     served(line, "agent-a")
     assert (grants.claim("execute", "arm-1") is None) is spent
+
+
+def test_another_callers_motion_is_refused_at_once_while_a_call_that_lasts_moves(
+    robot: ToyRobot, grants: Grants, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(admissions, "START_WAIT_S", 600.0)
+    moves, end = threading.Event(), threading.Event()
+
+    def last(toy: Any, arguments: Arguments) -> Any:
+        toy.gate.permit("execute").begin()
+        moves.set()
+        end.wait(120)
+        return success("done")
+
+    lasting = replace(ARM_VERBS["execute"], run=last)
+    line, results = pipeline(robot, grants, "execute"), list[Result]()
+    with ThreadPoolExecutor(2) as pool:
+        try:
+            pool.submit(line.serve, Command(lasting, GOOD, "agent-a", line.pending.arrive()), results.append)
+            assert moves.wait(20)
+            refusal = pool.submit(served, line, "agent-b").result(20).refusal
+            assert refusal is not None
+            assert refusal.why is RefusalReason.CONTROL
+        finally:
+            end.set()
+    assert ok(results[0])
+
+
+def test_a_caller_is_answered_though_the_grant_cannot_be_taken_away(
+    robot: ToyRobot, grants: Grants, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(claim: Claim) -> None:
+        raise OSError("read-only file system")
+
+    grants.grant("execute", "arm-1")
+    monkeypatch.setattr(Claim, "spend", fails)
+    assert ok(served(pipeline(robot, grants), "agent-a"))

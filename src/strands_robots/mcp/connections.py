@@ -84,7 +84,7 @@ GIVES_WAY = (Phase.BODY, Phase.HEADER, Phase.IDLE)
 """Phases in which a connection of a token is closed for a new one of it, in this order."""
 
 
-class Room(Enum):
+class Capacity(Enum):
     """Requests that a connection may serve."""
 
     ANY = "any"
@@ -205,7 +205,7 @@ class Connections:
             next(each for each in self._strangers if each.address == busiest).cut()
         self._strangers[connection] = None
 
-    def admit(self, connection: HttpConnection, owner: str) -> Room:
+    def admit(self, connection: HttpConnection, owner: str) -> Capacity:
         """Count a connection for the token that it has shown; return what it serves."""
         if connection.owner != owner:
             self.leave(connection)
@@ -217,8 +217,8 @@ class Connections:
         if self._total > TOTAL_MAX:
             _give_way(list(chain.from_iterable(self._owned.values())), connection)
         if len(own) > TOKEN_MAX + RESERVE or self._total > TOTAL_MAX + RESERVE:
-            return Room.NONE
-        return Room.ANY if connection in islice(own, TOKEN_MAX) and self._total <= TOTAL_MAX else Room.STOPS
+            return Capacity.NONE
+        return Capacity.ANY if connection in islice(own, TOKEN_MAX) and self._total <= TOTAL_MAX else Capacity.STOPS
 
     def leave(self, connection: HttpConnection) -> None:
         """Forget a connection."""

@@ -29,7 +29,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
-from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Connections, Room, listener
+from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Capacity, Connections, listener
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, build
 from strands_robots.mcp.sessions import Sessions
@@ -198,12 +198,12 @@ class HttpServer:
             await (refusal or Response(status_code=401))(scope, receive, send)
             return
         room = self.connections.admit(scope["state"][CONNECTION], token.name)
-        body = b"" if room is Room.NONE else await _body(headers, receive)
+        body = b"" if room is Capacity.NONE else await _body(headers, receive)
         if body is None:
             return
         if len(body) > MESSAGE_MAX:
             await _refused(413, f"A message has at most {MESSAGE_MAX} bytes.")(scope, receive, send)
-        elif room is Room.ANY or (room is Room.STOPS and stops(body)):
+        elif room is Capacity.ANY or (room is Capacity.STOPS and stops(body)):
             await self._serve(await self._client(token), body, scope, receive, send)
         else:
             await _refused(503, "This token has too many connections; stops alone are served.")(scope, receive, send)

@@ -36,7 +36,7 @@ from strands_robots.safety.stop_targets import (
     target_key,
 )
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
-from strands_robots.safety.submitted_stops import Answered, StopLine, SubmittedStop, TargetSlot
+from strands_robots.safety.submitted_stops import Answered, PendingStops, SubmittedStop, TargetSlot
 
 logger = stop_logger(__name__)
 
@@ -333,7 +333,7 @@ class StopExecutor:
 
     def _renew(self, stop: SubmittedStop) -> None:
         """Let a fresh thread take over what waits behind a halt that missed its deadline."""
-        slot, line = stop.slot, stop.line()
+        slot, line = stop.slot, stop.pending_stops()
         if slot is None or line is None:
             return
         halts = line is slot.halts
@@ -363,7 +363,7 @@ class StopExecutor:
             logger.critical("%s is stuck in its %s and no other thread can %s: %s.", stop.name, what, done, exc)
 
 
-def _judge(line: StopLine, stops: list[SubmittedStop]) -> None:
+def _judge(line: PendingStops, stops: list[SubmittedStop]) -> None:
     """Read the robot until ``stops``, and what comes meanwhile, have their verdicts."""
     unread: list[SubmittedStop] = []
     fresh: list[SubmittedStop] | None = list(stops)

@@ -72,7 +72,7 @@ class SubmittedStop:
             except Exception:
                 logger.exception("A late verdict on %s was not taken.", self.name)
 
-    def line(self) -> StopLine | None:
+    def pending_stops(self) -> PendingStops | None:
         """Return where it waits or is carried out; None once it is resolved."""
         slot = self.slot
         if slot is None:
@@ -84,7 +84,7 @@ class SubmittedStop:
 
         None where it has had it, or did not wait.
         """
-        line = self.line()
+        line = self.pending_stops()
         running = None if line is None else line.running
         if self.direct or self.extended or not running or self.future.done():
             return None
@@ -120,7 +120,7 @@ class SubmittedStop:
             return True
 
 
-class StopLine:
+class PendingStops:
     """Stops of one target that wait for the same work, and those that are worked on.
 
     One thread works at a time. One that blocks beyond a deadline is given up, and the next goes on with what waits.
@@ -187,7 +187,7 @@ class TargetSlot:
     def __init__(self, name: str, wake: queue.SimpleQueue[TargetSlot | None]) -> None:
         self.name = name
         self.wake = wake
-        self.halts, self.readings = StopLine(), StopLine()
+        self.halts, self.readings = PendingStops(), PendingStops()
         self.owners = 0
         self.thread: threading.Thread | None = None
 
