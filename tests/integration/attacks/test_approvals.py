@@ -36,7 +36,8 @@ def still(site: McpSite, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     site.still()
 
 
-@pytest.mark.parametrize("source", ["second", "second", "mcp"])
+# The long variants run with `make test-all`.
+@pytest.mark.parametrize("source", ["mcp", *(pytest.param("second", marks=pytest.mark.system) for _ in range(2))])
 async def test_a_yes_to_one_motion_starts_no_other_and_is_not_kept_from_starting_it(site: McpSite, source: str) -> None:
     with Spammer(site.port, "metal-1", source) as spammer:
         spammer.begin()

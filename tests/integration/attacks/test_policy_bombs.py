@@ -13,7 +13,8 @@ MEMORY_MAX_MB = 100
 KINDS = ("openpi", "remote", "remote msgpack", "groot")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+# The long variants run with `make test-all`.
+@pytest.mark.parametrize("kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.system) for kind in KINDS[1:])])
 def test_robots_are_stopped_and_memory_stays_while_a_policy_server_sends_bombs(
     kind: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

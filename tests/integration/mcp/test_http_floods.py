@@ -99,6 +99,7 @@ def refused(url: str, token: str, session: dict[str, str]) -> bool:
     return httpx2.post(url, json=call, headers={**bearer(token), **session}, timeout=30).status_code == 503
 
 
+@pytest.mark.system
 def test_sessions_that_nobody_uses_are_ended_for_new_ones(site: McpSite, url: str, tokens: dict[str, str]) -> None:
     ping = {"jsonrpc": "2.0", "id": 2, "method": "ping"}
     with httpx2.Client(headers=bearer(tokens["desk"]), timeout=30) as client:
