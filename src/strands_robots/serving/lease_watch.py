@@ -12,6 +12,7 @@ from functools import partial
 from typing import Protocol
 
 from strands_robots.safety.stop_log import stop_logger
+from strands_robots.safety.turns import undisturbed
 from strands_robots.serving.workers import UNBOUNDED
 
 logger = stop_logger(__name__)
@@ -74,11 +75,14 @@ class LeaseWatch:
                 UNBOUNDED.submit(partial(self._end, each))
 
     def _end(self, lease: TimedLease) -> None:
+        # A whole collection at this moment would hold the halts back.
+        calm = undisturbed(many=False)
         try:
             lease.expire(AHEAD_S)
         except Exception:
             logger.critical("What the holder of a lease moved was not halted at its end.", exc_info=True)
         finally:
+            calm()
             # It may have been renewed meanwhile.
             if lease.due is not None:
                 self.add(lease)
