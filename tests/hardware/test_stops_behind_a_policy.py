@@ -58,13 +58,19 @@ def policy(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
         each.release.set()
 
 
-@pytest.mark.usefixtures("no_deadline")
-def test_an_arm_is_frozen_by_each_stop_while_its_policy_hangs(policy: Any) -> None:
+def hung_arm(policy: Callable[[str], HangingPolicy]) -> tuple[HardwareRobot, RecordingDevice, HangingPolicy]:
+    """Return an arm whose policy hangs."""
     device, hanging = RecordingDevice(), policy("pan.pos")
     robot = HardwareRobot(device, "arm")
     robot.connect()
     robot.start_task("wave")
     assert hanging.hangs.wait(20)
+    return robot, device, hanging
+
+
+@pytest.mark.usefixtures("no_deadline")
+def test_an_arm_is_frozen_by_each_stop_while_its_policy_hangs(policy: Any) -> None:
+    robot, device, hanging = hung_arm(policy)
     stops = []
     for _ in range(10):
         written = len(device.writes)
@@ -80,11 +86,7 @@ def test_an_arm_is_frozen_by_each_stop_while_its_policy_hangs(policy: Any) -> No
 
 @pytest.mark.usefixtures("no_deadline")
 def test_stop_task_freezes_before_the_policy_is_interrupted(policy: Any) -> None:
-    device, hanging = RecordingDevice(), policy("pan.pos")
-    robot = HardwareRobot(device, "arm")
-    robot.connect()
-    robot.start_task("wave")
-    assert hanging.hangs.wait(20)
+    robot, device, hanging = hung_arm(policy)
     written = len(device.writes)
     answers: list[Any] = []
     stopping = threading.Thread(target=lambda: answers.append(robot.stop_task()))

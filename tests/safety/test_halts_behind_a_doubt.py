@@ -163,3 +163,24 @@ def test_robot_whose_attributes_hang_is_submitted_at_once(hang: Hang) -> None:
         submitting.join(20)
         assert not submitting.is_alive()
     assert robot.halts == ["first", "second"]
+
+
+def test_robot_whose_gate_cannot_be_read_is_halted_all_the_same(hang: Hang) -> None:
+    class Gateless:
+        def __init__(self) -> None:
+            self.halts: list[str] = []
+
+        @property
+        def gate(self) -> object:
+            raise RuntimeError("no gate today")
+
+        def halt(self, reason: str = "") -> StopVerdict:
+            self.halts.append(reason)
+            hang()
+            return StopVerdict()
+
+    executor, robot = StopExecutor(), Gateless()
+    executor.submit(robot, "gateless", "first", within=0.1)
+    eventually(lambda: robot.halts == ["first"])
+    executor.submit(robot, "gateless", "second", within=LONG_S)
+    eventually(lambda: robot.halts == ["first", "second"])

@@ -63,11 +63,17 @@ def note_motion(target: object) -> None:
 
 
 def revoke_permits(target: object) -> None:
-    """Void the permits of a target that has a gate of ours."""
+    """Void the permits of a target that has a gate of ours.
+
+    Never raises: a stop follows.
+    """
     try:
         # Without its ``__getattr__``, which may look names up anywhere.
         gate = object.__getattribute__(target, "gate")
     except AttributeError:
+        return
+    except Exception:
+        logger.exception("The gate of a robot could not be read before its stop.")
         return
     if isinstance(gate, MotionGate):
         gate.revoke()
