@@ -21,11 +21,12 @@ from strands_robots.safety.identity import DEFAULT_TENANT, SigningIdentity, loca
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
+from strands_robots.safety.question_ports import Network
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import Share
-from strands_robots.utils import RESERVED_DEVICE_IDS, unreserved
+from strands_robots.utils import RESERVED_DEVICE_IDS, redacted, unreserved
 
 logger = stop_logger(__name__)
 
@@ -80,6 +81,12 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     return made
 
 
+def network_name(link: LinkConfig) -> str:
+    """Return what tells the network of a link, its tenant included, from another one."""
+    where = ",".join(sorted(link.connect)) or link.meeting_point or ",".join(sorted(link.listen)) or "multicast"
+    return f"device-connect {link.transport} {redacted(where)} {link.tenant}"
+
+
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
     own = getattr(robot, "safety_key", None)
     if isinstance(own, str) and own:
@@ -102,6 +109,7 @@ class SafetyRegistration:
         self.driver: Any = None
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
         self._held: Registered | None = self.entry
+        self._network = Network("" if link is None else network_name(link), tenant)
         try:
             self._listener: ListenerRegistration = estop_listener().register(
                 name,
@@ -109,6 +117,7 @@ class SafetyRegistration:
                 lambda: NoStopLink() if link is None else stop_link(link),
                 lambda: self.identity,
                 opened=False,
+                network=self._network,
             )
         except BaseException:
             self.entry.close()
@@ -142,7 +151,9 @@ class SafetyRegistration:
     def runtime_estop(self, source: object, params: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
-            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime", raw)
+            estop_listener().accept_params(
+                source, params if isinstance(params, Mapping) else {}, "runtime", raw, self._network
+            )
 
     def raise_estop(self, params: Mapping[str, Any]) -> None:
         """Lock and halt on this device's own emergency stop; return at once.

@@ -1,0 +1,180 @@
+"""The robots of a process, and a controller, as askers and answerers of missed stops."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.audit import queue_safety_event
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.identity import (
+    DEFAULT_TENANT,
+    ROBOTS,
+    EnrolledKeys,
+    KeyFile,
+    SigningIdentity,
+    local_name,
+)
+from strands_robots.safety.orders import MISSED, RobotReport, StopRefused, StopRules, params_of, stated_epoch
+from strands_robots.safety.originals import Original
+from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.stop_log import stop_logger
+from strands_robots.utils import ValidationError
+
+logger = stop_logger(__name__)
+
+KEYS_AGAIN_S = 10.0
+"""Seconds after which the keys of this machine and the enrolled ones are read again."""
+
+KEYS_MAX = 512
+
+WasServed = Callable[[Collection[str]], bool]
+"""Returns True where one of these robots was served from this machine in the ten minutes before."""
+
+
+def never_served(robot_ids: Collection[str]) -> bool:
+    """Return False: without a record every start is a first one."""
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """A network of robots: what no missed stop crosses.
+
+    Attributes:
+        name: tells it from others, the tenant included; empty where nothing is asked and answered.
+        tenant: where robots of other tenants have other names here.
+    """
+
+    name: str = ""
+    tenant: str = DEFAULT_TENANT
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A robot of this process on one network: its id here, its name there, and what signs for it."""
+
+    robot_id: str
+    name: str
+    identity: Callable[[], SigningIdentity | None]
+
+
+class KnownKeys:
+    """Keys that are known here: of this machine's robots, of enrolled ones, of those who may stop."""
+
+    def __init__(self, tenant: str = DEFAULT_TENANT, stop_keys: Sequence[bytes] = ()) -> None:
+        self._tenant, self._stop_keys = tenant, frozenset(stop_keys)
+        self._known: dict[str, bytes | None] = {}
+        self._enrolled: Mapping[str, bytes] = {}
+        self._read = float("-inf")
+
+    def knows(self, name: str, key: bytes) -> bool:
+        """Return True where ``key`` is that of ``name``, or may stop robots."""
+        if key in self._stop_keys:
+            return True
+        if time.monotonic() - self._read > KEYS_AGAIN_S:
+            self._read, self._known, self._enrolled = time.monotonic(), {}, _enrolled()
+        own = local_name(self._tenant, name)
+        if self._enrolled.get(own) == key:
+            return True
+        if own not in self._known and len(self._known) < KEYS_MAX:
+            self._known[own] = _key_here(own)
+        return self._known.get(own) == key
+
+
+def _enrolled() -> Mapping[str, bytes]:
+    try:
+        return EnrolledKeys().load()
+    except (StrandsRobotsError, OSError):
+        return {}
+
+
+def _key_here(name: str) -> bytes | None:
+    try:
+        identity = KeyFile(ROBOTS, name).load()
+    except (ValidationError, StrandsRobotsError, OSError):
+        return None
+    return None if identity is None else identity.public
+
+
+class RobotsPort:
+    """The robots of a process on one network.
+
+    Args:
+        members: returns those that are served there now.
+        publish: sends fields as an event of a name on that network.
+        on_report: answers a stop, as for one that came directly.
+    """
+
+    def __init__(
+        self,
+        of: SafetyPlane,
+        rules: StopRules,
+        network: Network,
+        *,
+        members: Callable[[], Sequence[Member]],
+        publish: Callable[[str, str, Mapping[str, Any]], bool],
+        on_report: Callable[[RobotReport], None],
+        was_served: WasServed = never_served,
+    ) -> None:
+        self._plane, self._rules, self._network = of, rules, network
+        self._members, self._publish, self._on_report = members, publish, on_report
+        self._was_served = was_served
+        self._keys = KnownKeys(network.tenant, rules.keys)
+
+    def was_here(self) -> bool:
+        """Return True where a robot of this process was served before it started; reads the disk."""
+        robots = self._plane.robots
+        before = [
+            each.robot_id
+            for each in self._members()
+            if each.robot_id in robots and robots[each.robot_id].registered_before
+        ]
+        return bool(before) and self._was_served(before)
+
+    def devices(self) -> Sequence[str]:
+        return [each.name for each in self._members()]
+
+    def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._publish(event, source, fields)
+
+    def signer(self) -> tuple[str, SigningIdentity | None]:
+        members = self._members()
+        # A robot that is locked answers for its process.
+        locked = self._plane.lockouts()
+        for each in sorted(members, key=lambda each: each.robot_id not in locked)[:1]:
+            return each.name, each.identity()
+        return "", None
+
+    def originals(self) -> Sequence[Original]:
+        return self._plane.originals(self._network.name) if self._members() else ()
+
+    def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
+        if not self._rules.signed and not self._rules.open:
+            # Who says that an allowed source stopped is not that source.
+            return False
+        if self._rules.source_refusal(source) is not None:
+            return False
+        params = params_of(payload)
+        epoch = stated_epoch(source, params)
+        if not epoch:
+            return False
+        if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
+            return True
+        order = self._rules.order(source, params, MISSED, payload, network=self._network.name, age_s=age_s)
+        if isinstance(order, StopRefused):
+            return False
+        run = self._plane.begin(order, self._on_report)
+        for robot_id in run.robot_ids if run is not None else ():
+            logger.warning("%s is locked by emergency stop %s, which it had missed.", robot_id, epoch)
+            facts = {"epoch": epoch, "source": source[:256], "answerer": answerer[:256], "age_s": round(age_s, 3)}
+            queue_safety_event("missed_stop_learnt", robot_id, facts)
+        return True
+
+    def knows_key(self, source: str, key: bytes) -> bool:
+        return self._keys.knows(source, key)
+
+    def hold(self, seconds: float) -> None:
+        self._plane.hold(seconds)
