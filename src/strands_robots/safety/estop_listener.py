@@ -536,7 +536,7 @@ class EstopListener:
         return entry.wire_id if entry else robot_id
 
     def _cell(self, report: RobotReport) -> dict[str, str]:
-        """Return the field ``cell`` of a verdict, which only robots that read scopes have."""
+        """Return the field ``cell``, which robots that read scopes have."""
         entry = self._plane.robots.get(report.robot_id)
         cells = frozenset[str]() if entry is None else entry.cells
         return {"cell": report.scope.cell if report.scope.cell in cells else min(cells, default="")}

@@ -45,8 +45,8 @@ class Lockout:
         """Read a lockout that a robot reported, whatever its fields hold."""
         since = row.get("since")
         at = float(since) if isinstance(since, int | float) else 0.0
-        texts = (str(row.get(name, "")) for name in ("epoch", "source", "reason"))
-        return cls(*texts, at, Scope.read(row.get(SCOPE)))
+        epoch, source, reason = (str(row.get(name, "")) for name in ("epoch", "source", "reason"))
+        return cls(epoch, source, reason, at, Scope.read(row.get(SCOPE)))
 
     def fields(self) -> dict[str, Any]:
         """Return the lockout as a robot reports it."""
@@ -172,8 +172,9 @@ def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
     scope = "" if first.scope.everything else f" for {first.scope}"
     others = f" and {more} more stop{'s' if more > 1 else ''}" if more else ""
     return error(
-        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}{scope}{why}, "
-        f"epoch {first.epoch}{others}, since {utc(first.at)}. To resume: {how_to_resume(state, robot_id)}.",
+        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}"
+        f"{scope}{why}, epoch {first.epoch}{others}, since {utc(first.at)}. "
+        f"To resume: {how_to_resume(state, robot_id)}.",
         locked=True,
         robot=robot_id,
         refused=verb,
