@@ -80,7 +80,10 @@ In place of more than :data:`~.orders.PARSED_MAX_BYTES` a link gives their numbe
 """
 
 OnState = Callable[[bool], None]
-"""Called with the link's state, True for up, on a thread of the link, at each change."""
+"""Called with the link's state, True for up, on a thread of the link, at each change.
+
+Also with True while it is up, when a connection is new or a peer that was lost is back.
+"""
 
 
 class StopLink(Protocol):

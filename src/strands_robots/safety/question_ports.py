@@ -9,6 +9,7 @@ from typing import Any
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety import ed25519
 from strands_robots.safety.identity import (
     DEFAULT_TENANT,
     ROBOTS,
@@ -19,8 +20,9 @@ from strands_robots.safety.identity import (
 )
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import MISSED, RobotReport, StopRefused, StopRules, params_of, stated_epoch
-from strands_robots.safety.originals import Original
+from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
@@ -161,3 +163,66 @@ class RobotsPort:
 
     def hold(self, seconds: float) -> None:
         self._plane.hold(seconds)
+
+
+class ControllerPort:
+    """A safety controller, which answers with the stops that it sent and asks nothing.
+
+    A stop is told until each robot that must answer it has; one without such robots for as long as there is the
+    controller.
+
+    Args:
+        key: the private key that signs its stops, if any.
+        enrolled: returns the public keys of robots by name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        key: Any,
+        enrolled: Callable[[], Mapping[str, bytes]],
+        publish: Callable[[str, str, Mapping[str, Any]], bool],
+    ) -> None:
+        self._name, self._enrolled, self._publish = name, enrolled, publish
+        self._identity = None if key is None else SigningIdentity(name, ed25519.public_half(key), key)
+        self._originals = Originals()
+        self._open: dict[str, None] = {}
+
+    def sent(self, estop_id: str, payload: bytes) -> None:
+        """Note a stop that leaves; return at once."""
+        if len(payload) <= ORIGINAL_MAX_BYTES:
+            self._open[estop_id] = None
+            self._originals.add(Original(estop_id, self._name, payload, "", uptime()))
+            while len(self._open) > STOPS_MAX:
+                self._open.pop(next(iter(self._open)), None)
+
+    def answered(self, estop_id: str) -> None:
+        """Note that every robot that must answer this stop has."""
+        self._open.pop(estop_id, None)
+
+    def was_here(self) -> bool:
+        return False
+
+    def devices(self) -> Sequence[str]:
+        return ()
+
+    def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._publish(event, source, fields)
+
+    def signer(self) -> tuple[str, SigningIdentity | None]:
+        return self._name, self._identity
+
+    def originals(self) -> Sequence[Original]:
+        epochs = frozenset(tuple(self._open))
+        self._originals.keep(epochs)
+        return self._originals.of(epochs)
+
+    def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
+        return False
+
+    def knows_key(self, source: str, key: bytes) -> bool:
+        own = self._identity is not None and self._identity.public == key
+        return own or self._enrolled().get(source) == key
+
+    def hold(self, seconds: float) -> None:
+        """It moves nothing."""
