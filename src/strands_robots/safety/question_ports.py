@@ -117,7 +117,7 @@ class RobotsPort:
         robots = self._plane.robots
         back = [robots.get(each.robot_id) for each in self._members() if each.was_here]
         # A state directory that was reset since is that of a newcomer.
-        return any(each is not None and each.registered_before for each in back)
+        return any([each is not None and each.returned() for each in back])
 
     def devices(self) -> Sequence[str]:
         return [each.name for each in self._members()]
