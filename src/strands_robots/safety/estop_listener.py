@@ -18,6 +18,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
+from strands_robots.safety.awake import AWAKE
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
@@ -383,6 +384,7 @@ class EstopListener:
         self._queue: FairQueue | None = None
         self._thread: threading.Thread | None = None
         self._end_short_turns: Callable[[], None] = lambda: None
+        self._end_watch: Callable[[], None] = lambda: None
 
     @property
     def registrations(self) -> tuple[ListenerRegistration, ...]:
@@ -441,6 +443,7 @@ class EstopListener:
         if missed is not None:
             missed.close()
         if events is not None:
+            self._end_watch()
             self._end_short_turns()
             events.close()
         if thread is not None and thread is not threading.current_thread():
@@ -453,7 +456,7 @@ class EstopListener:
 
     def awake(self) -> None:
         """Ask which stops were missed: the process did not run for a while. Return at once."""
-        for missed in tuple(self._open.values()):
+        for missed in list(self._open.values()):
             missed.ask("the process did not run for a while")
 
     def accept_params(
@@ -544,6 +547,7 @@ class EstopListener:
         self._check_ins = CheckInRules(self._rules)
         audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
         self._end_short_turns = shorten_turns()
+        self._end_watch = AWAKE.watch(self.awake)
         self._queue = FairQueue()
         self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)
         self._thread.start()
