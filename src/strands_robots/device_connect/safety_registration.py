@@ -10,9 +10,10 @@ from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
 
-from strands_robots.contract import Haltable
+from strands_robots.contract import Haltable, body_of
 from strands_robots.device_connect._compat import link_of, stated_id
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.device_connect.stop_link import NoStopLink, stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
@@ -21,12 +22,13 @@ from strands_robots.safety.identity import DEFAULT_TENANT, SigningIdentity, loca
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
-from strands_robots.safety.question_ports import Network
 from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.scope import own_cell
+from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import Share
-from strands_robots.utils import RESERVED_DEVICE_IDS, redacted, unreserved
+from strands_robots.utils import RESERVED_DEVICE_IDS, unreserved
 
 logger = stop_logger(__name__)
 
@@ -39,7 +41,13 @@ LEAVE_TIMEOUT_S = 15.0
 
 
 def register_safety(
-    device_id: str, driver: DeviceDriver, link: LinkConfig | None, *, named: bool, tenant: str = DEFAULT_TENANT
+    device_id: str,
+    driver: DeviceDriver,
+    link: LinkConfig | None,
+    *,
+    named: bool,
+    tenant: str = DEFAULT_TENANT,
+    cell: str = "",
 ) -> SafetyRegistration | None:
     """Register a driver's robot with the safety plane; None without a robot.
 
@@ -47,6 +55,7 @@ def register_safety(
         link: the device's; None where it is none that a connection of the listener's own can take.
         tenant: the device's, where there is no ``link``.
         named: the operator gave ``device_id``; a simulation's lockout is kept only then.
+        cell: the cell that it is in; empty for none.
     """
     robot = getattr(driver, "robot", driver)
     gate = getattr(robot, "gate", None)
@@ -54,7 +63,7 @@ def register_safety(
         logger.warning("%s has no robot that the safety plane could halt; it hears no emergency stop.", device_id)
         return None
     key = _key(device_id, driver, robot, named=named)
-    registration = SafetyRegistration(device_id, robot, link, key, link.tenant if link else tenant)
+    registration = SafetyRegistration(device_id, robot, link, key, link.tenant if link else tenant, cell=cell)
     if hasattr(driver, "registration"):
         driver.registration = registration
         registration.driver = driver
@@ -69,7 +78,9 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     """
     link = link_of(runtime)
     device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
-    made = register_safety(device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant)
+    made = register_safety(
+        device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant, cell=cell_of(driver)
+    )
     if made is not None:
         made.open()
     if link is None:
@@ -81,10 +92,14 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     return made
 
 
-def network_name(link: LinkConfig) -> str:
-    """Return what tells the network of a link, its tenant included, from another one."""
-    where = ",".join(sorted(link.connect)) or link.meeting_point or ",".join(sorted(link.listen)) or "multicast"
-    return f"device-connect {link.transport} {redacted(where)} {link.tenant}"
+def cell_of(driver: DeviceDriver, cell: str | None = None) -> str:
+    """Return the cell as given, as driver or robot state it, or of ``STRANDS_CELL``.
+
+    Raises:
+        ValidationError: it is no identifier.
+    """
+    stated = (getattr(each, "cell", None) for each in (driver, body_of(getattr(driver, "robot", None))))
+    return own_cell(next((each for each in (cell, *stated) if isinstance(each, str)), None))
 
 
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
@@ -100,16 +115,24 @@ class SafetyRegistration:
     """One robot in the safety plane and on the e-stop listener."""
 
     def __init__(
-        self, device_id: str, robot: Any, link: LinkConfig | None, key: str | None, tenant: str = DEFAULT_TENANT
+        self,
+        device_id: str,
+        robot: Any,
+        link: LinkConfig | None,
+        key: str | None,
+        tenant: str = DEFAULT_TENANT,
+        *,
+        cell: str = "",
     ) -> None:
         self.device_id = device_id
+        self.cell = cell
         # Two tenants may each have a device of this id in one process.
         name = local_name(tenant, device_id)
         self._name = name
         self.driver: Any = None
-        self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
+        self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
         self._held: Registered | None = self.entry
-        self._network = Network("" if link is None else network_name(link), tenant)
+        self._network = None if link is None else network_of(link)
         try:
             self._listener: ListenerRegistration = estop_listener().register(
                 name,
@@ -118,6 +141,7 @@ class SafetyRegistration:
                 lambda: self.identity,
                 opened=False,
                 network=self._network,
+                was_here=self._network is not None and sightings().was_here(self._network, device_id) is not None,
             )
         except BaseException:
             self.entry.close()
@@ -185,6 +209,7 @@ class SafetyRegistration:
             "lockout": [each.fields() for each in lockouts],
             "check_in": check_in,
             "stop_lane": self.up,
+            "cell": self.cell,
             "statement": signed(self.identity, Purpose.LOCKOUT_STATE, self.device_id, fields),
         }
 

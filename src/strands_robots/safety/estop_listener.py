@@ -23,6 +23,7 @@ from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import (
     LISTENER,
     PARSED_MAX_BYTES,
@@ -33,7 +34,7 @@ from strands_robots.safety.orders import (
     params_of,
 )
 from strands_robots.safety.plane import SafetyPlane, plane
-from strands_robots.safety.question_ports import Member, Network, RobotsPort, WasServed, never_served
+from strands_robots.safety.question_ports import Member, RobotsPort
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -80,7 +81,10 @@ In place of more than :data:`~.orders.PARSED_MAX_BYTES` a link gives their numbe
 """
 
 OnState = Callable[[bool], None]
-"""Called with the link's state, True for up, on a thread of the link, at each change."""
+"""Called with the link's state, True for up, on a thread of the link, at each change.
+
+Also with True while it is up, when a connection is new or a peer that was lost is back.
+"""
 
 
 class StopLink(Protocol):
@@ -118,7 +122,7 @@ def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> b
 
 
 class StopEvent(NamedTuple):
-    """Event from a link: name, declared source, bytes, monotonic s at receipt, network."""
+    """Event from a link: name, source, bytes, monotonic s at receipt, network."""
 
     event: str
     source: str
@@ -333,10 +337,12 @@ class ListenerRegistration:
         link: StopLink,
         identity: Callable[[], SigningIdentity | None],
         *,
-        network: Network,
+        network: NetworkKey | None,
+        was_here: bool,
     ) -> None:
         self.robot_id = robot_id
         self.network = network
+        self.was_here = was_here
         self.identity = identity
         self.key = key
         self.link = link
@@ -357,17 +363,14 @@ class EstopListener:
     Args:
         of: the plane that stops its robots.
         rules: makes the rules by which a stop counts; they are read when the first device registers.
-        was_served: tells a robot that is back from a newcomer.
     """
 
     def __init__(
         self,
         of: SafetyPlane | None = None,
         rules: Callable[[], StopRules] = StopRules,
-        was_served: WasServed = never_served,
     ) -> None:
         self._plane = of or plane()
-        self._was_served = was_served
         self._make_rules = rules
         self._registering = threading.Lock()
         self._registrations: tuple[ListenerRegistration, ...] = ()
@@ -399,12 +402,14 @@ class EstopListener:
         identity: Callable[[], SigningIdentity | None] = lambda: None,
         *,
         opened: bool = True,
-        network: Network = Network(),  # noqa: B008 - frozen
+        network: NetworkKey | None = None,
+        was_here: bool = False,
     ) -> ListenerRegistration:
         """Serve a robot over the link of ``key``; ``make`` the link if it is new.
 
         Args:
-            network: of the link; missed stops are asked for and answered within it.
+            network: of the link; missed stops are asked for and answered within it alone, and not without one.
+            was_here: the robot was served from this machine in the ten minutes before.
             identity: returns what signs the robot's verdicts; None leaves them unsigned.
             opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
@@ -413,7 +418,7 @@ class EstopListener:
                 self._start()
             link = next((each.link for each in self._registrations if each.key == key), None)
             made = make() if link is None else link
-            registration = ListenerRegistration(self, robot_id, key, made, identity, network=network)
+            registration = ListenerRegistration(self, robot_id, key, made, identity, network=network, was_here=was_here)
             self._registrations = (*self._registrations, registration)
         if opened:
             registration.open()
@@ -422,9 +427,11 @@ class EstopListener:
     def open(self, registration: ListenerRegistration) -> None:
         """Open the link of a registration, unless it is open."""
         with self._registering:
-            if registration in self._registrations and registration.key not in self._open:
+            if registration in self._registrations and registration.key in self._open:
+                self._open[registration.key].started()
+            elif registration in self._registrations:
                 missed = self._open[registration.key] = self._missed_stops(registration)
-                receive = functools.partial(self._receive, missed, registration.network.name)
+                receive = functools.partial(self._receive, missed, _text(registration.network))
                 registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else None)
 
     def unregister(self, registration: ListenerRegistration) -> None:
@@ -455,8 +462,8 @@ class EstopListener:
         return self._rules.signed
 
     def awake(self) -> None:
-        """Ask which stops were missed: the process did not run for a while. Return at once."""
-        for missed in list(self._open.values()):
+        """Ask which stops were missed, after a time in which the process did not run."""
+        for missed in tuple(self._open.values()):
             missed.ask("the process did not run for a while")
 
     def accept_params(
@@ -465,7 +472,7 @@ class EstopListener:
         params: Mapping[str, Any],
         path: str,
         raw: bytes | int | None = None,
-        network: Network = Network(),  # noqa: B008 - frozen
+        network: NetworkKey | None = None,
     ) -> None:
         """Act on a parsed emergency stop of another path; return at once.
 
@@ -483,7 +490,7 @@ class EstopListener:
             return
         if self._rules.signed and not self._budget.allows(source, time.monotonic()):
             return
-        order = self._rules.order(source, params, path, raw, network=network.name)
+        order = self._rules.order(source, params, path, raw, network=_text(network))
         if isinstance(order, StopRefused):
             self._budget.record(source, time.monotonic())
             self._refusals.record(order, ESTOP)
@@ -524,8 +531,8 @@ class EstopListener:
         key, link = registration.key, registration.link
 
         def members() -> list[Member]:
-            here = [each for each in self._registrations if each.key == key and each.network.name]
-            return [Member(each.robot_id, self._wire_id(each.robot_id), each.identity) for each in here]
+            here = [each for each in self._registrations if each.key == key and each.network is not None]
+            return [Member(each.robot_id, self._wire_id(each.robot_id), each.identity, each.was_here) for each in here]
 
         def publish(event: str, source: str, fields: Mapping[str, Any]) -> bool:
             return link.publish(source, event, notification(event, fields))
@@ -537,7 +544,6 @@ class EstopListener:
             members=members,
             publish=publish,
             on_report=self._answer,
-            was_served=self._was_served,
         )
         return MissedStops(port)
 
@@ -602,7 +608,7 @@ class EstopListener:
         return entry.wire_id if entry else robot_id
 
     def _cell(self, report: RobotReport) -> dict[str, str]:
-        """Return the field ``cell`` of a verdict, which only robots that read scopes have."""
+        """Return the field ``cell``, which robots that read scopes have."""
         entry = self._plane.robots.get(report.robot_id)
         cells = frozenset[str]() if entry is None else entry.cells
         return {"cell": report.scope.cell if report.scope.cell in cells else min(cells, default="")}
@@ -643,6 +649,10 @@ class EstopListener:
                 self._repeated[same] = payload
                 _bound(self._repeated)
         return payload
+
+
+def _text(network: NetworkKey | None) -> str:
+    return "" if network is None else network.text
 
 
 def _bound(remembered: dict[Any, Any]) -> None:

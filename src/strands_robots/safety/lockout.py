@@ -48,8 +48,8 @@ class Lockout:
         """Read a lockout that a robot reported, whatever its fields hold."""
         since = row.get("since")
         at = float(since) if isinstance(since, int | float) else 0.0
-        texts = (str(row.get(name, "")) for name in ("epoch", "source", "reason"))
-        return cls(*texts, at, Scope.read(row.get(SCOPE)))
+        epoch, source, reason = (str(row.get(name, "")) for name in ("epoch", "source", "reason"))
+        return cls(epoch, source, reason, at, Scope.read(row.get(SCOPE)))
 
     def fields(self) -> dict[str, Any]:
         """Return the lockout as a robot reports it."""
@@ -136,7 +136,7 @@ class LockoutLatch:
 
     @property
     def resumed(self) -> Mapping[str, None]:
-        """Epochs that the robot was resumed from, oldest first; the same object until one is added."""
+        """Epochs that it was resumed from, oldest first; replaced when one is new."""
         return self._resumed
 
     def knows(self, epoch: str) -> bool:
@@ -188,7 +188,7 @@ class LockoutLatch:
 
 
 def with_resumed(resumed: dict[str, None], epochs: Iterable[str]) -> dict[str, None]:
-    """Return the resumed epochs with these, the latest :data:`RESUMED_MAX`; the same where all are known."""
+    """Return the latest resumed epochs with these; the same where all are known."""
     new = [each for each in epochs if each not in resumed and each != OVERFLOW]
     return dict.fromkeys([*resumed, *new][-RESUMED_MAX:]) if new else resumed
 
@@ -203,8 +203,9 @@ def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
     scope = "" if first.scope.everything else f" for {first.scope}"
     others = f" and {more} more stop{'s' if more > 1 else ''}" if more else ""
     return error(
-        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}{scope}{why}, "
-        f"epoch {first.epoch}{others}, since {utc(first.at)}. To resume: {how_to_resume(state, robot_id)}.",
+        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}"
+        f"{scope}{why}, epoch {first.epoch}{others}, since {utc(first.at)}. "
+        f"To resume: {how_to_resume(state, robot_id)}.",
         locked=True,
         robot=robot_id,
         refused=verb,

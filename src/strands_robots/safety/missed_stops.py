@@ -1,4 +1,4 @@
-"""Question of a process that was away, *which stops have I missed?*, and its answers.
+"""Missed stops: the question of a process that was away, and its answers.
 
 A process with a robot that is locked by a stop answers with the original, verbatim, and the asker judges it as if it
 had come directly. An answer can therefore lock nothing that its original would not lock, and hides nothing: the asker
@@ -81,13 +81,13 @@ AUDIT_EVERY_S = 10.0
 
 
 class MissedStopsPort(Protocol):
-    """What a process brings to question and answers on one network.
+    """A process as asker and answerer on one network.
 
     A network supplies it. No method blocks on the network, and none raises for its state.
     """
 
     def was_here(self) -> bool:
-        """Return True where a robot of this process was served before it started; may read the disk."""
+        """Return True where a robot was served from here before its start."""
 
     def devices(self) -> Sequence[str]:
         """Return the names of the robots that ask; none, and nothing is asked."""
@@ -149,7 +149,7 @@ class AnswerQueue:
 
 
 class Asker:
-    """When to ask; times are monotonic s."""
+    """Times of the questions, in monotonic s."""
 
     def __init__(self) -> None:
         self._due = self._asked = float("-inf")
@@ -185,7 +185,7 @@ class Asker:
 
 
 class Answerer:
-    """When to answer, and with which stops; times are monotonic s.
+    """Questions that wait for an answer; times are monotonic s.
 
     Args:
         chance: returns a number from 0 to 1.
@@ -325,16 +325,17 @@ class MissedStops:
         self._wake()
 
     def link_up(self) -> None:
-        """Ask because the subscriptions are declared, or the link is back; return at once.
-
-        The first time that is a start: a robot that was not served before is a newcomer and has missed nothing.
-        """
+        """Ask because the link is back, or at its first time :meth:`started`."""
         if self._linked:
             self.ask(BACK)
         else:
             self._linked = True
-            self._reasons.append(STARTED)
-            self._wake()
+            self.started()
+
+    def started(self) -> None:
+        """Ask because a robot is served from now on, unless it is a newcomer."""
+        self._reasons.append(STARTED)
+        self._wake()
 
     def receive(self, event: str, source: str, payload: bytes | int) -> None:
         """Take a question or an answer from a link's thread; return at once."""

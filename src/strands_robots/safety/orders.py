@@ -227,7 +227,7 @@ def signed_bytes(purpose: Purpose, source: str, params: Mapping[str, Any]) -> by
 def scope_bytes(source: str, params: Mapping[str, Any]) -> bytes:
     """Return the signed bytes of a stop's scope.
 
-    They hold its own purpose, the source, id, both times and nonce of the stop, and the scope: it belongs to one message.
+    They hold its own purpose, the source, id, both times and nonce of the stop, and the scope: those of one message.
     """
     pressed = params.get("pressed_at")
     stated = {name: params.get(name) for name in ("estop_id", "nonce", "t", SCOPE)}
@@ -237,7 +237,7 @@ def scope_bytes(source: str, params: Mapping[str, Any]) -> bytes:
 
 
 def signed_stop(key: Any, purpose: Purpose, source: str, params: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stop or check-in with its signature, and that of its scope if it has one."""
+    """Return a stop or check-in with its signature and that of its scope."""
     sig = ed25519.encode(key.sign(signed_bytes(purpose, source, params)))
     scoped = {SCOPE_SIGNATURE: ed25519.encode(key.sign(scope_bytes(source, params)))} if SCOPE in params else {}
     return {**params, "sig": sig, **scoped}
@@ -391,7 +391,7 @@ class StopRules:
         return None
 
     def scope(self, source: str, params: Mapping[str, Any], *, demanded: bool = True) -> Scope:
-        """Return the scope of a stop that counts; every robot where it is not readable.
+        """Return the scope of a stop that counts; every robot where it is unfit.
 
         Args:
             demanded: False where unsigned stops count in spite of keys; a signature that is there has to be valid all

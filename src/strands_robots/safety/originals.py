@@ -61,7 +61,7 @@ class Original:
 
 
 def since_boot(record: Mapping[str, Any]) -> float:
-    """Return the seconds since boot of a recorded moment, below zero if of an earlier boot.
+    """Return a recorded moment in seconds since boot, below 0 if of an earlier one.
 
     Within a boot no clock that can be set counts.
     """

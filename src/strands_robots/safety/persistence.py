@@ -1,4 +1,4 @@
-"""Lockouts on disk, and what each robot was resumed from: two files for each robot of this machine.
+"""Lockouts and resumed epochs on disk: two files for each robot of this machine.
 
 A robot is kept under a key that outlives the process (see :func:`hardware_key`); a robot without one, an unnamed
 simulation, is not kept. Files of different robots never wait for one another, whichever processes write them. A file

@@ -529,7 +529,7 @@ class SafetyPlane:
         return {name: entry.latch.state.all for name, entry in self._robots.items() if entry.locked}
 
     def originals(self, network: str) -> list[Original]:
-        """Return the stops of ``network`` by which a robot of this process is locked, as they arrived."""
+        """Return the stops of ``network`` that lock robots here, as they arrived."""
         return self._originals.of(self._held(), network)
 
     def hold(self, seconds: float) -> None:

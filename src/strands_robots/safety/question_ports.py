@@ -1,14 +1,15 @@
-"""The robots of a process, and a controller, as askers and answerers of missed stops."""
+"""Askers and answerers of missed stops: robots of a process, controllers."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety import ed25519
 from strands_robots.safety.identity import (
     DEFAULT_TENANT,
     ROBOTS,
@@ -17,9 +18,11 @@ from strands_robots.safety.identity import (
     SigningIdentity,
     local_name,
 )
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import MISSED, RobotReport, StopRefused, StopRules, params_of, stated_epoch
-from strands_robots.safety.originals import Original
+from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
@@ -30,39 +33,26 @@ KEYS_AGAIN_S = 10.0
 
 KEYS_MAX = 512
 
-WasServed = Callable[[Collection[str]], bool]
-"""Returns True where one of these robots was served from this machine in the ten minutes before."""
-
-
-def never_served(robot_ids: Collection[str]) -> bool:
-    """Return False: without a record every start is a first one."""
-    return False
-
-
-@dataclass(frozen=True, slots=True)
-class Network:
-    """A network of robots: what no missed stop crosses.
-
-    Attributes:
-        name: tells it from others, the tenant included; empty where nothing is asked and answered.
-        tenant: where robots of other tenants have other names here.
-    """
-
-    name: str = ""
-    tenant: str = DEFAULT_TENANT
-
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A robot of this process on one network: its id here, its name there, and what signs for it."""
+    """A robot of this process on one network.
+
+    Attributes:
+        robot_id: its id in this process.
+        name: its name on the network.
+        identity: returns what signs for it.
+        was_here: it was served from this machine in the ten minutes before its start.
+    """
 
     robot_id: str
     name: str
     identity: Callable[[], SigningIdentity | None]
+    was_here: bool = False
 
 
 class KnownKeys:
-    """Keys that are known here: of this machine's robots, of enrolled ones, of those who may stop."""
+    """Keys of this machine's robots, of enrolled ones, and of those who may stop."""
 
     def __init__(self, tenant: str = DEFAULT_TENANT, stop_keys: Sequence[bytes] = ()) -> None:
         self._tenant, self._stop_keys = tenant, frozenset(stop_keys)
@@ -103,6 +93,7 @@ class RobotsPort:
     """The robots of a process on one network.
 
     Args:
+        network: no missed stop crosses it; None where nothing is asked and answered.
         members: returns those that are served there now.
         publish: sends fields as an event of a name on that network.
         on_report: answers a stop, as for one that came directly.
@@ -112,27 +103,21 @@ class RobotsPort:
         self,
         of: SafetyPlane,
         rules: StopRules,
-        network: Network,
+        network: NetworkKey | None,
         *,
         members: Callable[[], Sequence[Member]],
         publish: Callable[[str, str, Mapping[str, Any]], bool],
         on_report: Callable[[RobotReport], None],
-        was_served: WasServed = never_served,
     ) -> None:
-        self._plane, self._rules, self._network = of, rules, network
+        self._plane, self._rules, self._network = of, rules, "" if network is None else network.text
         self._members, self._publish, self._on_report = members, publish, on_report
-        self._was_served = was_served
-        self._keys = KnownKeys(network.tenant, rules.keys)
+        self._keys = KnownKeys(DEFAULT_TENANT if network is None else network.tenant, rules.keys)
 
     def was_here(self) -> bool:
-        """Return True where a robot of this process was served before it started; reads the disk."""
         robots = self._plane.robots
-        before = [
-            each.robot_id
-            for each in self._members()
-            if each.robot_id in robots and robots[each.robot_id].registered_before
-        ]
-        return bool(before) and self._was_served(before)
+        back = [robots.get(each.robot_id) for each in self._members() if each.was_here]
+        # A state directory that was reset since is that of a newcomer.
+        return any(each is not None and each.registered_before for each in back)
 
     def devices(self) -> Sequence[str]:
         return [each.name for each in self._members()]
@@ -149,7 +134,7 @@ class RobotsPort:
         return "", None
 
     def originals(self) -> Sequence[Original]:
-        return self._plane.originals(self._network.name) if self._members() else ()
+        return self._plane.originals(self._network) if self._network else ()
 
     def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
         if not self._rules.signed and not self._rules.open:
@@ -163,7 +148,7 @@ class RobotsPort:
             return False
         if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
             return True
-        order = self._rules.order(source, params, MISSED, payload, network=self._network.name, age_s=age_s)
+        order = self._rules.order(source, params, MISSED, payload, network=self._network, age_s=age_s)
         if isinstance(order, StopRefused):
             return False
         run = self._plane.begin(order, self._on_report)
@@ -178,3 +163,66 @@ class RobotsPort:
 
     def hold(self, seconds: float) -> None:
         self._plane.hold(seconds)
+
+
+class ControllerPort:
+    """A safety controller, which answers with the stops that it sent and asks nothing.
+
+    A stop is told until each robot that must answer it has; one without such robots for as long as there is the
+    controller.
+
+    Args:
+        key: the private key that signs its stops, if any.
+        enrolled: returns the public keys of robots by name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        key: Any,
+        enrolled: Callable[[], Mapping[str, bytes]],
+        publish: Callable[[str, str, Mapping[str, Any]], bool],
+    ) -> None:
+        self._name, self._enrolled, self._publish = name, enrolled, publish
+        self._identity = None if key is None else SigningIdentity(name, ed25519.public_half(key), key)
+        self._originals = Originals()
+        self._open: dict[str, None] = {}
+
+    def sent(self, estop_id: str, payload: bytes) -> None:
+        """Note a stop that leaves; return at once."""
+        if len(payload) <= ORIGINAL_MAX_BYTES:
+            self._open[estop_id] = None
+            self._originals.add(Original(estop_id, self._name, payload, "", uptime()))
+            while len(self._open) > STOPS_MAX:
+                self._open.pop(next(iter(self._open)), None)
+
+    def answered(self, estop_id: str) -> None:
+        """Note that every robot that must answer this stop has."""
+        self._open.pop(estop_id, None)
+
+    def was_here(self) -> bool:
+        return False
+
+    def devices(self) -> Sequence[str]:
+        return ()
+
+    def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._publish(event, source, fields)
+
+    def signer(self) -> tuple[str, SigningIdentity | None]:
+        return self._name, self._identity
+
+    def originals(self) -> Sequence[Original]:
+        epochs = frozenset(tuple(self._open))
+        self._originals.keep(epochs)
+        return self._originals.of(epochs)
+
+    def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
+        return False
+
+    def knows_key(self, source: str, key: bytes) -> bool:
+        own = self._identity is not None and self._identity.public == key
+        return own or self._enrolled().get(source) == key
+
+    def hold(self, seconds: float) -> None:
+        """It moves nothing."""

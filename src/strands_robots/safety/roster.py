@@ -1,0 +1,154 @@
+"""Roster of a network: the robots that must answer a stop.
+
+Exit code rule: where no robot is enrolled for the network, every row counts. Where some are, rows that are ENROLLED,
+SERVED or SIGNED count; names that were only HEARD are told and do not alter the exit code, so made-up names cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.sightings import Known, Moment, Sighting, Sightings, sightings
+
+__all__ = ["Exemption", "Known", "Moment", "NetworkKey", "Roster", "RosterRow", "Sighting", "Sightings", "bounded"]
+
+REPORTED_MAX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Exemption:
+    """An operator's note that an enrolled robot need not answer.
+
+    Attributes:
+        state: ``retired`` or ``off``.
+        by: the operator.
+        reason: or "".
+        at: wall-clock seconds.
+    """
+
+    state: str
+    by: str
+    reason: str
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class RosterRow:
+    """A robot that must answer.
+
+    Attributes:
+        name: its id on the network.
+        known: the surest way in which it is known.
+        age_s: seconds since it was last heard here; None where it was not within ten minutes, below 0 after the press.
+        order: lower for a robot that was heard first earlier.
+        cell: or "".
+        signed_only: it locks for signed stops alone (``--key``); None where that is unknown.
+        stoppable: False for a device without a stop: told, not counted. None where that is unknown.
+        departed: it said, unsigned, that it left.
+        alive: its process on this machine lives; None where it is not served from here.
+        pid: of that process.
+        exemption: of rows of :attr:`Roster.exempt`.
+        reported_by: the controller that reported it, "" where this machine heard it.
+    """
+
+    name: str
+    known: Known
+    age_s: float | None = None
+    order: int = 0
+    cell: str = ""
+    signed_only: bool | None = None
+    stoppable: bool | None = None
+    departed: bool = False
+    alive: bool | None = None
+    pid: int | None = None
+    exemption: Exemption | None = None
+    reported_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Roster:
+    """Robots of one network.
+
+    Attributes:
+        network: asked for.
+        rows: that must answer, in the order of :class:`Known`, then longest heard first; devices without a stop too.
+        exempt: robots that are retired or off. ``age_s`` tells whether one of this name was heard all the same.
+        elsewhere: enrolled or served robots of other networks.
+        enrolled: number of robots enrolled for this network, without the exempt ones.
+        problems: sentences on what could not be read; with one of them no exit code is 0.
+    """
+
+    network: NetworkKey
+    rows: tuple[RosterRow, ...] = ()
+    exempt: tuple[RosterRow, ...] = ()
+    elsewhere: int = 0
+    enrolled: int = 0
+    problems: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        network: NetworkKey,
+        pressed: float | None = None,
+        *,
+        store: Sightings | None = None,
+    ) -> Roster:
+        """Read the roster from this machine's state; it reads the disk, so call it once the stop has left.
+
+        Args:
+            network: of the stop.
+            pressed: :func:`~.state_files.uptime` at the press; now by default. Robots count that were heard from ten
+                minutes before it until now.
+            store: in place of the state directory's.
+        """
+        found, problem = (store or sightings()).read()
+        rows = tuple(
+            RosterRow(
+                each.name,
+                each.known,
+                each.age_s,
+                each.order,
+                each.cell,
+                each.signed_only,
+                each.stoppable,
+                each.departed,
+                each.alive,
+                each.pid,
+            )
+            for each in found
+            if each.network.meets(network)
+        )
+        return cls(network, in_order(rows), problems=(problem,) if problem else ())
+
+    def counts(self, row: RosterRow) -> bool:
+        """True when the exit code depends on this row."""
+        return row.stoppable is not False and (not self.enrolled or row.known is not Known.HEARD)
+
+    @property
+    def must_answer(self) -> tuple[RosterRow, ...]:
+        """The rows that the exit code depends on."""
+        return tuple(row for row in self.rows if self.counts(row))
+
+    @property
+    def told_only(self) -> tuple[RosterRow, ...]:
+        """The rows that are printed as a group and do not alter the exit code."""
+        return tuple(row for row in self.rows if not self.counts(row))
+
+    def with_reported(self, rows: Iterable[RosterRow], by: str) -> Roster:
+        """Return the roster with what the controller ``by`` reported; a row known here stays as it is."""
+        here = {row.name for row in (*self.rows, *self.exempt)}
+        added = tuple(replace(row, reported_by=by) for row in rows if row.name not in here)
+        return replace(self, rows=in_order((*self.rows, *added)))
+
+
+def in_order(rows: Iterable[RosterRow]) -> tuple[RosterRow, ...]:
+    """Return the rows, surest first, then longest heard first."""
+    return tuple(sorted(rows, key=lambda row: (row.known, row.order, row.name)))
+
+
+def bounded(rows: Sequence[RosterRow], most: int = REPORTED_MAX) -> tuple[tuple[RosterRow, ...], int]:
+    """Return the first ``most`` rows in order, and the number of the others."""
+    kept = in_order(rows)[:most]
+    return kept, len(rows) - len(kept)
