@@ -29,7 +29,15 @@ from strands_robots.safety.estop_listener import (
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import (
+    EVERY_ROBOT,
+    WIDEN_S,
+    KnownRobots,
+    Remembers,
+    Scope,
+    none_known,
+    report_widened,
+)
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -57,9 +65,6 @@ RENEW_S = 6.0
 
 SETTLE_S = 1.0
 """A stop goes on for at least so long before it has the connection made anew."""
-
-WIDEN_S = 0.2
-"""Seconds after which a stop of some robots becomes one of every robot, where none of them answered or is known."""
 
 DEADLINE_S = 3.0
 INBOX_PER_ROBOT = 16
@@ -167,7 +172,7 @@ class SafetyController:
         on_link: Callable[[bool], None] = lambda up: None,
         enrolled: Callable[[], Mapping[str, bytes]] = dict,
         require_signed: bool = False,
-        remembers: Callable[[Scope], bool] = lambda scope: False,
+        remembers: Remembers = none_known,
     ) -> None:
         self.controller_id = device_id("controller_id", controller_id)
         self._key = signing_key
@@ -238,7 +243,7 @@ class SafetyController:
             # The first one is sent before anything else is done.
             self._send(run)
             if not scope.everything:
-                threading.Thread(target=self._remember, args=(run,), name="stop scope", daemon=True).start()
+                run.known = KnownRobots(scope, self._remembers)
             self._load_keys()
             run.graded = Answers(self._keys, required=self._require_signed, pressed_at=press.wall)
             self._repeat(run, deadline_s, on_progress)
@@ -272,22 +277,6 @@ class SafetyController:
             while len(self._presses) > PRESSES_MAX:
                 del self._presses[next(iter(self._presses))]
         return press
-
-    def _remember(self, run: _Running) -> None:
-        """Find out whether this machine knows a robot in the scope."""
-        try:
-            run.remembered = self._remembers(run.scope)
-        except Exception:
-            logger.critical("The robots known here cannot be read, so none counts as known.", exc_info=True)
-
-    def _widen(self, run: _Running) -> None:
-        """Make it a stop of every robot: none in its scope is there."""
-        run.widened = True
-        logger.critical(
-            "Emergency stop %s was for %s. None of these has answered or is known here: EVERY ROBOT IS STOPPED.",
-            run.estop_id,
-            run.scope,
-        )
 
     def expect(self, estop_id: str, names: Collection[str]) -> bool:
         """Name further robots that must answer ``estop_id``; False when it is over."""
@@ -345,7 +334,8 @@ class SafetyController:
             with self._changed:
                 finished = run.complete or now - run.started >= deadline_s
                 if run.widens_at <= now and not run.settled_scope:
-                    self._widen(run)
+                    run.widened = True
+                    report_widened(run.estop_id, run.scope)
                     pauses, next_send, finished = iter(quick_first), 0.0, False
                 state = hash((run.changes, len(run.expected), late, run.widened, self._link.up))
             if state != reported or finished:
@@ -472,7 +462,7 @@ class _Running:
     press: Press
     reason: str
     scope: Scope = EVERY_ROBOT
-    remembered: bool = False
+    known: KnownRobots | None = None
     widened: bool = False
     inbox: dict[str, deque[Received]] = field(default_factory=dict)
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
@@ -497,7 +487,9 @@ class _Running:
     @property
     def widens_at(self) -> float:
         """Monotonic s at which it widens, unless a robot in its scope answers."""
-        scoped = self.left is not None and not (self.scope.everything or self.widened or self.remembered)
+        scoped = self.left is not None and not (
+            self.scope.everything or self.widened or (self.known is not None and self.known.known)
+        )
         return self.left + WIDEN_S if scoped and self.left is not None else float("inf")
 
     @property
