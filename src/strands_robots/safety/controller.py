@@ -23,13 +23,18 @@ from strands_robots.safety.estop_listener import (
     ESTOP,
     VERDICT,
     FailureBudget,
+    OnEvent,
     RenewableLink,
+    ReportingLink,
     StopLink,
     notification,
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_bytes
+from strands_robots.safety.roster_inbox import OnReport, RosterInbox
+from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -144,6 +149,7 @@ class SafetyController:
         on_link: called at once when the link is lost or back.
         enrolled: gives the public keys of robots, read when this is made and once each stop has left.
         require_signed: count a robot that is not enrolled as *claimed* only.
+        stands: receive the stops of other controllers, too, for :meth:`hear_others`.
     """
 
     def __init__(
@@ -155,6 +161,7 @@ class SafetyController:
         on_link: Callable[[bool], None] = lambda up: None,
         enrolled: Callable[[], Mapping[str, bytes]] = dict,
         require_signed: bool = False,
+        stands: bool = False,
     ) -> None:
         self.controller_id = device_id("controller_id", controller_id)
         self._key = signing_key
@@ -170,14 +177,40 @@ class SafetyController:
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
         self._witness, self._heads = HeadWitness(always=True), FailureBudget()
+        self._reports = RosterInbox()
+        self._others: OnEvent | None = None
         self._link = make_link()
         self._end_short_turns = shorten_turns()
-        self._link.open((VERDICT, CHECK_IN_ANSWER), self._receive, self._link_changed)
+        events = (VERDICT, CHECK_IN_ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
+        self._link.open(events, self._receive, self._link_changed)
 
     @property
     def link_up(self) -> bool:
         """True while the link reaches a peer."""
         return self._link.up
+
+    @property
+    def sending(self) -> Sending:
+        """The way its stops leave: signed or not, and the broker's refusal."""
+        tells = isinstance(self._link, ReportingLink)
+        denied = self._link.denied if isinstance(self._link, ReportingLink) else ""
+        return Sending(signed=self._key is not None, denied=denied, tells=tells)
+
+    @property
+    def signing_key(self) -> Any:
+        """The key that signs its stops, or None."""
+        return self._key
+
+    def hear_others(self, hear: OnEvent) -> None:
+        """Give the stops of others, and the answers of robots, to ``hear``.
+
+        It is called on a thread of the link: it returns at once, parses nothing and may not raise.
+        """
+        self._others = hear
+
+    def publish(self, event: str, payload: bytes) -> bool:
+        """Send an event under this controller's name; False when the link is down."""
+        return self._link.publish(self.controller_id, event, payload)
 
     def wait_link(self, timeout: float) -> bool:
         """True when the link is up within ``timeout`` seconds."""
@@ -191,7 +224,9 @@ class SafetyController:
         *,
         deadline_s: float = DEADLINE_S,
         estop_id: str = "",
+        more: bool = False,
         on_progress: OnProgress = lambda progress: None,
+        on_report: OnReport = lambda report: None,
     ) -> StopReport:
         """Stop every robot of the tenant, now, and wait for their answers.
 
@@ -204,19 +239,22 @@ class SafetyController:
             reason: for the robots and their logs, at most 200 characters.
             deadline_s: seconds until silence is reported as silence.
             estop_id: 32 hex digits; a fresh one by default.
+            more: :meth:`expect` will name further robots, so the stop goes on until then.
             on_progress: called at each answer, when the link changes, and once 100 ms have passed.
+            on_report: called with what standing controllers say they miss, on a thread of its own.
         """
         number("deadline_s", deadline_s, above=0, high=3600)
         if isinstance(expected, str):
             raise ValidationError(f"expected must be a collection of robot ids, not the text {expected!r}.")
         estop_id = estop_id or new_epoch()
         press = self.press(estop_id)
-        run = _Running(estop_id, frozenset(expected), time.monotonic(), press, reason[:REASON_MAX])
+        run = _Running(estop_id, frozenset(expected), time.monotonic(), press, reason[:REASON_MAX], more=more)
         with self._changed:
             self._stops[run.estop_id] = run
         try:
             # The first one is sent before anything else is done.
             self._send(run)
+            self._reports.open(run.estop_id, on_report)
             self._load_keys()
             run.graded = Answers(self._keys, required=self._require_signed, pressed_at=press.wall)
             self._repeat(run, deadline_s, on_progress)
@@ -224,6 +262,7 @@ class SafetyController:
             with self._changed:
                 del self._stops[run.estop_id]
                 self._ended = run
+            self._reports.close(run.estop_id)
         return self._report(run)
 
     def review(self, report: StopReport) -> StopReport:
@@ -251,12 +290,17 @@ class SafetyController:
                 del self._presses[next(iter(self._presses))]
         return press
 
-    def expect(self, estop_id: str, names: Collection[str]) -> bool:
-        """Name further robots that must answer ``estop_id``; False when it is over."""
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer ``estop_id``; False when it is over.
+
+        Args:
+            more: further ones will be named, so the stop goes on until then.
+        """
         with self._changed:
             run = self._stops.get(estop_id)
             if run is not None:
                 run.expected |= frozenset(names)
+                run.more = more
                 self._changed.notify_all()
         return run is not None
 
@@ -280,6 +324,7 @@ class SafetyController:
         if self._check_in is not None:
             self._check_in.join(2.0)
         self._link.close()
+        self._reports.end()
         self._end_short_turns()
 
     def _send(self, run: _Running) -> None:
@@ -323,9 +368,9 @@ class SafetyController:
                 next_send = now + max(pause, min(REPEAT_EACH_S * len(run.expected), longest_s))
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
             with self._changed:
-                seen = (self._link.up, len(run.expected))
+                seen = (self._link.up, len(run.expected), run.more)
                 self._changed.wait_for(
-                    lambda seen=seen: run.inbox or seen != (self._link.up, len(run.expected)),  # type: ignore[misc]
+                    lambda seen=seen: run.inbox or seen != (self._link.up, len(run.expected), run.more),  # type: ignore[misc]
                     max(0.0, min(marks) - time.monotonic()),
                 )
                 if self._link.up and not seen[0]:
@@ -374,6 +419,13 @@ class SafetyController:
 
     def _receive(self, event: str, source: str, payload: bytes | int) -> None:
         at, wall = time.monotonic(), time.time()
+        if event == STOP_ROSTER:
+            self._reports.put(source, payload)
+            return
+        if self._others is not None and event in (ESTOP, VERDICT) and source != self.controller_id:
+            self._others(event, source, payload)
+        if event == ESTOP:
+            return
         params = params_of(payload)
         if "estop_id" not in params:
             logger.warning("An answer of %s is not to be read; it counts as none.", shown(source))
@@ -429,6 +481,7 @@ class _Running:
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
     changes: int = 0
+    more: bool = False
 
     def receive(self, source: str, received: Received) -> None:
         """Take a verdict; a flood in a robot's name pushes out only that robot's own."""
@@ -447,7 +500,7 @@ class _Running:
 
     @property
     def complete(self) -> bool:
-        return bool(self.expected) and not self.graded.unsettled(self.expected)
+        return bool(self.expected) and not self.more and not self.graded.unsettled(self.expected)
 
     @property
     def unanswered(self) -> bool:
