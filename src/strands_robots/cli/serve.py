@@ -29,7 +29,7 @@ from strands_robots.envelope import text_of
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
-from strands_robots.utils import ValidationError, number, own_device_id, redacted, shown, text
+from strands_robots.utils import ValidationError, identifier, number, own_device_id, redacted, shown, text
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -103,6 +103,9 @@ def serve(
         typer.Option("--detector", help="What sees objects for a real arm: a callable that makes it, module:name."),
     ] = None,
     state_hz: Annotated[float | None, typer.Option("--state-hz", help="stateUpdate events a second, idle.")] = None,
+    cell: Annotated[
+        str | None, typer.Option("--cell", help="The cell that it is in, for stops of one cell; none by default.")
+    ] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Also record joints, pictures and events: a new .mcap file.")
     ] = None,
@@ -124,6 +127,8 @@ def serve(
     for name, value in flags.items():
         if value is not None:
             settings.put(name, value)
+    if cell is not None:
+        settings.put("STRANDS_CELL", identifier("--cell", cell))
     if policies is not None:
         load_profiles(policies.expanduser())
         settings.put("STRANDS_POLICIES", str(policies))

@@ -40,6 +40,8 @@ def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> En
         "link": report.link,
         "elapsed_ms": round(report.elapsed_ms, 3),
         "left_ms": round(report.left_ms, 3),
+        **report.scope.field(),
+        **({"widened": True} if report.widened else {}),
     }
     if report.ok:
         return success(f"Stopped {', '.join(sorted(report.stopped))}.", **fields)
@@ -51,4 +53,6 @@ def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> En
     failures += [f"{name} gave no answer{f' ({why[name]})' if name in why else ''}" for name in report.silent]
     if not report.link:
         failures.append("the stop was not sent: the link is down")
+    if report.widened:
+        failures.append(f"no robot was there for {report.scope}, so every robot was stopped")
     return error(f"{'; '.join(failures) or 'No robot answered the emergency stop'}.", **fields)

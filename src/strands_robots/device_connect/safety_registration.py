@@ -10,7 +10,7 @@ from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
 
-from strands_robots.contract import Haltable
+from strands_robots.contract import Haltable, body_of
 from strands_robots.device_connect._compat import link_of, stated_id
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.stop_link import NoStopLink, stop_link
@@ -22,6 +22,7 @@ from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.scope import own_cell
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import Share
@@ -38,7 +39,13 @@ LEAVE_TIMEOUT_S = 15.0
 
 
 def register_safety(
-    device_id: str, driver: DeviceDriver, link: LinkConfig | None, *, named: bool, tenant: str = DEFAULT_TENANT
+    device_id: str,
+    driver: DeviceDriver,
+    link: LinkConfig | None,
+    *,
+    named: bool,
+    tenant: str = DEFAULT_TENANT,
+    cell: str = "",
 ) -> SafetyRegistration | None:
     """Register a driver's robot with the safety plane; None without a robot.
 
@@ -46,6 +53,7 @@ def register_safety(
         link: the device's; None where it is none that a connection of the listener's own can take.
         tenant: the device's, where there is no ``link``.
         named: the operator gave ``device_id``; a simulation's lockout is kept only then.
+        cell: the cell that it is in; empty for none.
     """
     robot = getattr(driver, "robot", driver)
     gate = getattr(robot, "gate", None)
@@ -53,7 +61,7 @@ def register_safety(
         logger.warning("%s has no robot that the safety plane could halt; it hears no emergency stop.", device_id)
         return None
     key = _key(device_id, driver, robot, named=named)
-    registration = SafetyRegistration(device_id, robot, link, key, link.tenant if link else tenant)
+    registration = SafetyRegistration(device_id, robot, link, key, link.tenant if link else tenant, cell=cell)
     if hasattr(driver, "registration"):
         driver.registration = registration
         registration.driver = driver
@@ -68,7 +76,9 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     """
     link = link_of(runtime)
     device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
-    made = register_safety(device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant)
+    made = register_safety(
+        device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant, cell=cell_of(driver)
+    )
     if made is not None:
         made.open()
     if link is None:
@@ -78,6 +88,16 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
             runtime.device_id,
         )
     return made
+
+
+def cell_of(driver: DeviceDriver, cell: str | None = None) -> str:
+    """Return the cell as given, as driver or robot state it, or of ``STRANDS_CELL``.
+
+    Raises:
+        ValidationError: it is no identifier.
+    """
+    stated = (getattr(each, "cell", None) for each in (driver, body_of(getattr(driver, "robot", None))))
+    return own_cell(next((each for each in (cell, *stated) if isinstance(each, str)), None))
 
 
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
@@ -93,14 +113,22 @@ class SafetyRegistration:
     """One robot in the safety plane and on the e-stop listener."""
 
     def __init__(
-        self, device_id: str, robot: Any, link: LinkConfig | None, key: str | None, tenant: str = DEFAULT_TENANT
+        self,
+        device_id: str,
+        robot: Any,
+        link: LinkConfig | None,
+        key: str | None,
+        tenant: str = DEFAULT_TENANT,
+        *,
+        cell: str = "",
     ) -> None:
         self.device_id = device_id
+        self.cell = cell
         # Two tenants may each have a device of this id in one process.
         name = local_name(tenant, device_id)
         self._name = name
         self.driver: Any = None
-        self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
+        self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
         self._held: Registered | None = self.entry
         try:
             self._listener: ListenerRegistration = estop_listener().register(
@@ -174,6 +202,7 @@ class SafetyRegistration:
             "lockout": [each.fields() for each in lockouts],
             "check_in": check_in,
             "stop_lane": self.up,
+            "cell": self.cell,
             "statement": signed(self.identity, Purpose.LOCKOUT_STATE, self.device_id, fields),
         }
 

@@ -42,6 +42,7 @@ from strands_robots.mesh.wire_identity import Identity, signature_policy
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.scope import own_cell
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
 from strands_robots.utils import number, text
@@ -70,6 +71,7 @@ class Parts:
         identity: gives the signer and verifier of a transport.
         audit: where safety events go; the audit log by default.
         keep: the lockout outlives the process under the peer's id.
+        cell: the cell that the robot is in; empty for none.
     """
 
     acquire: Callable[[], Transport | None] = session.acquire
@@ -82,6 +84,7 @@ class Parts:
     audit: AuditSink | None = None
     plane: SafetyPlane | None = None
     keep: bool = False
+    cell: str = ""
 
     def recorder(self, name: str) -> AuditThrottle:
         """Return the audit of a peer."""
@@ -113,7 +116,7 @@ class Mesh(SensorLoopsMixin):
         self._newest_input: dict[tuple[str, str], tuple[float, float]] = {}
         key = _safety_key(self.robot, self.peer_id, keep=self._parts.keep)
         # A locked robot that leaves the mesh stays on the safety plane: to leave and join again must not unlock it.
-        self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane)
+        self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane, self._parts.cell)
         self._compose()
 
     def _compose(self) -> None:
@@ -564,19 +567,23 @@ def identity_of(transport: Transport) -> Identity:
     return Identity.from_settings(TlsCredentials.from_settings() if signature_policy() == "1" else None)
 
 
-def init_mesh(robot: Any, peer_id: str | None = None, peer_type: str = "robot", mesh: bool = True) -> Mesh | None:
+def init_mesh(
+    robot: Any, peer_id: str | None = None, peer_type: str = "robot", mesh: bool = True, *, cell: str | None = None
+) -> Mesh | None:
     """Make and start a mesh peer for ``robot``; None when the mesh is off.
 
     Args:
         peer_id: default ``<tool_name_str or "robot">-<8 hex>``.
+        cell: the cell that the robot is in, for stops of one cell; that of ``STRANDS_CELL`` by default, "" for none.
 
     Raises:
-        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process.
+        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process, or
+            ``cell`` is no identifier.
     """
     if not mesh or mesh_disabled_by_env():
         return None
     named = peer_id if peer_id is not None else _default_id(robot)
-    started = Mesh(robot, named, peer_type, parts=Parts(keep=peer_id is not None))
+    started = Mesh(robot, named, peer_type, parts=Parts(keep=peer_id is not None, cell=own_cell(cell)))
     started.start()
     return started
 

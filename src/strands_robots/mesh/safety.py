@@ -98,17 +98,23 @@ class SafetyAdapter:
         robot: None for a peer without one.
         key: under which its lockout survives a restart; None for one that is not stored.
         own: another plane than the process's; for tests with several peers in one process.
+        cell: the cell that the robot is in; empty for none.
     """
 
     def __init__(
-        self, peer_id: str, robot: Stoppable | None, key: str | None = None, own: SafetyPlane | None = None
+        self,
+        peer_id: str,
+        robot: Stoppable | None,
+        key: str | None = None,
+        own: SafetyPlane | None = None,
+        cell: str = "",
     ) -> None:
         self._plane = own or plane()
         self._peer_id = peer_id
         self._robot = robot or NoRobot()
         self.identity = None if robot is None else robot_identity(peer_id)
         self._announcer = LockoutAnnouncer(self.identity)
-        self._key = key
+        self._key, self._cell = key, cell
         self._entry: Registered | None = None
         self._decision = StopRules()
         self._check_ins = CheckInRules(self._decision if self._decision.required else StopRules(keys=()))
@@ -123,7 +129,7 @@ class SafetyAdapter:
             ValidationError: another robot of this process has this name.
         """
         if self._entry is None:
-            self._entry = self._plane.register(self._peer_id, self._robot, key=self._key)
+            self._entry = self._plane.register(self._peer_id, self._robot, key=self._key, cell=self._cell)
 
     def epochs(self) -> tuple[str, ...]:
         """The epochs that lock this robot, oldest first; empty while it may move."""
@@ -137,9 +143,9 @@ class SafetyAdapter:
         return {"locked": bool(epochs), "epochs": list(epochs)}
 
     def announced(self, peer_id: str = "") -> dict[str, Any]:
-        """Return :meth:`facts`, signed; of a robot of its world by its id."""
+        """Return :meth:`facts`, signed, and the cell; of a robot of its world by its id."""
         facts = self.facts()
-        return self._announcer.of(peer_id or self._peer_id, facts) if facts else {}
+        return {**self._announcer.of(peer_id or self._peer_id, facts), "cell": self._cell} if facts else {}
 
     def lockouts(self) -> list[dict[str, Any]]:
         """Return each lockout with its source, reason and time."""
@@ -149,7 +155,7 @@ class SafetyAdapter:
         """Return lockouts and check-in; of a robot of its world by its id."""
         check_in = self._plane.checkin.fields(time.monotonic())
         facts = with_lockout_statement(self.identity, peer_id or self._peer_id, self.facts(), nonce)
-        return {**facts, "lockout": self.lockouts(), "check_in": check_in}
+        return {**facts, "lockout": self.lockouts(), "check_in": check_in, "cell": self._cell}
 
     def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
         """The reason why an e-stop of ``source`` does not count, or None."""

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.audit import log_witness
-from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
 from strands_robots.safety.estop_listener import (
     CHECK_IN,
@@ -31,9 +30,10 @@ from strands_robots.safety.estop_listener import (
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_bytes
+from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
 from strands_robots.safety.roster_inbox import OnReport, RosterInbox
 from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
@@ -63,6 +63,9 @@ RENEW_S = 6.0
 SETTLE_S = 1.0
 """A stop goes on for at least so long before it has the connection made anew."""
 
+WIDEN_S = 0.2
+"""Seconds after which a stop of some robots becomes one of every robot, where none of them answered or is known."""
+
 DEADLINE_S = 3.0
 INBOX_PER_ROBOT = 16
 """Answers of one robot that wait to be graded; a robot answers again at each repetition."""
@@ -87,7 +90,8 @@ class StopReport:
     stopped when its signature was needed and is missing. ``silent`` are the expected ones that gave no answer, and
     ``alarms`` those in whose name a wrong key answered, with the reason. ``link``: the stop left this machine at least
     once. ``elapsed_ms`` is the time from the press until the last answer or the deadline, ``left_ms`` until the stop
-    first left this machine.
+    first left this machine. ``scope`` are the robots that the press was for; ``widened``: none of them was there, and
+    every robot was stopped.
     """
 
     estop_id: str
@@ -100,6 +104,8 @@ class StopReport:
     left_ms: float = 0.0
     claimed: Mapping[str, Answer] = field(default_factory=dict)
     alarms: Mapping[str, str] = field(default_factory=dict)
+    scope: Scope = EVERY_ROBOT
+    widened: bool = False
 
     @property
     def answered(self) -> Mapping[str, Answer]:
@@ -118,8 +124,11 @@ class StopReport:
 
     @property
     def ok(self) -> bool:
-        """True when every robot is known to be still; no answer at all is not ok."""
-        missing = self.not_stopped or self.refused or self.silent or self.claimed or self.alarmed
+        """True when every robot is known to be still.
+
+        No answer at all is not ok, nor one of no robot in its scope.
+        """
+        missing = self.not_stopped or self.refused or self.silent or self.claimed or self.alarmed or self.widened
         return bool(self.stopped) and not missing
 
 
@@ -134,6 +143,8 @@ class Progress:
     elapsed_ms: float
     left_ms: float = 0.0
     alarms: Mapping[str, str] = field(default_factory=dict)
+    scope: Scope = EVERY_ROBOT
+    widened: bool = False
 
 
 OnProgress = Callable[[Progress], None]
@@ -150,6 +161,7 @@ class SafetyController:
         enrolled: gives the public keys of robots, read when this is made and once each stop has left.
         require_signed: count a robot that is not enrolled as *claimed* only.
         stands: receive the stops of other controllers, too, for :meth:`hear_others`.
+        remembers: says whether this machine knows a robot in a scope; asked on a thread once such a stop has left.
     """
 
     def __init__(
@@ -162,10 +174,12 @@ class SafetyController:
         enrolled: Callable[[], Mapping[str, bytes]] = dict,
         require_signed: bool = False,
         stands: bool = False,
+        remembers: Callable[[Scope], bool] = lambda scope: False,
     ) -> None:
         self.controller_id = device_id("controller_id", controller_id)
         self._key = signing_key
         self._enrolled, self._require_signed = enrolled, require_signed
+        self._remembers = remembers
         self._keys: Mapping[str, bytes] = {}
         self._load_keys()
         self._on_link = on_link
@@ -227,12 +241,16 @@ class SafetyController:
         more: bool = False,
         on_progress: OnProgress = lambda progress: None,
         on_report: OnReport = lambda report: None,
+        scope: Scope = EVERY_ROBOT,
     ) -> StopReport:
-        """Stop every robot of the tenant, now, and wait for their answers.
+        """Stop every robot of the tenant, or those of ``scope``; wait for answers.
 
         The stop is sent at once and again until each ``expected`` robot has answered or ``deadline_s`` is over; while
         the link is down it waits for it and is sent in the moment it is back. Without ``expected`` it is repeated to
         the deadline, and every robot that answers is in the report.
+
+        A stop for some robots of which none has answered ``WIDEN_S`` after it left, and none is known here, becomes a
+        stop of every robot: a name may be mistyped.
 
         Args:
             expected: ids of the robots that must answer.
@@ -242,19 +260,25 @@ class SafetyController:
             more: :meth:`expect` will name further robots, so the stop goes on until then.
             on_progress: called at each answer, when the link changes, and once 100 ms have passed.
             on_report: called with what standing controllers say they miss, on a thread of its own.
+            scope: the robots that it is for; those that read no scope stop all the same.
         """
         number("deadline_s", deadline_s, above=0, high=3600)
         if isinstance(expected, str):
             raise ValidationError(f"expected must be a collection of robot ids, not the text {expected!r}.")
         estop_id = estop_id or new_epoch()
         press = self.press(estop_id)
-        run = _Running(estop_id, frozenset(expected), time.monotonic(), press, reason[:REASON_MAX], more=more)
+        run = _Running(
+            estop_id, frozenset(expected) | scope.only, time.monotonic(), press, reason[:REASON_MAX], scope, more=more
+        )
+        deadline_s = deadline_s if scope.everything else max(deadline_s, 2 * WIDEN_S)
         with self._changed:
             self._stops[run.estop_id] = run
         try:
             # The first one is sent before anything else is done.
             self._send(run)
             self._reports.open(run.estop_id, on_report)
+            if not scope.everything:
+                threading.Thread(target=self._remember, args=(run,), name="stop scope", daemon=True).start()
             self._load_keys()
             run.graded = Answers(self._keys, required=self._require_signed, pressed_at=press.wall)
             self._repeat(run, deadline_s, on_progress)
@@ -289,6 +313,22 @@ class SafetyController:
             while len(self._presses) > PRESSES_MAX:
                 del self._presses[next(iter(self._presses))]
         return press
+
+    def _remember(self, run: _Running) -> None:
+        """Find out whether this machine knows a robot in the scope."""
+        try:
+            run.remembered = self._remembers(run.scope)
+        except Exception:
+            logger.critical("The robots known here cannot be read, so none counts as known.", exc_info=True)
+
+    def _widen(self, run: _Running) -> None:
+        """Make it a stop of every robot: none in its scope is there."""
+        run.widened = True
+        logger.critical(
+            "Emergency stop %s was for %s. None of these has answered or is known here: EVERY ROBOT IS STOPPED.",
+            run.estop_id,
+            run.scope,
+        )
 
     def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
         """Name further robots that must answer ``estop_id``; False when it is over.
@@ -330,6 +370,7 @@ class SafetyController:
     def _send(self, run: _Running) -> None:
         """Send the stop, issued now and pressed at its press."""
         fields: dict[str, Any] = {"estop_id": run.estop_id, "reason": run.reason, "pressed_at": run.press.wall}
+        fields |= {} if run.widened else run.scope.field()
         # Expected ones first: a flood of answers in invented names crowds none of them out.
         fields |= answered_field(sorted(run.graded.final(), key=lambda name: name not in run.expected))
         payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
@@ -337,7 +378,8 @@ class SafetyController:
             run.left = now
 
     def _repeat(self, run: _Running, deadline_s: float, on_progress: OnProgress) -> None:
-        pauses, reported = iter(REPEAT_S if self._key is None else REPEAT_SIGNED_S), -1
+        quick_first = REPEAT_S if self._key is None else REPEAT_SIGNED_S
+        pauses, reported = iter(quick_first), -1
         longest_s = REPEAT_EACH_MAX_S if self._key is None else REPEAT_EACH_SIGNED_MAX_S
         pause, next_send, again = 0.0, run.started, 0
         renew_at = run.started + max(SETTLE_S, RENEW_S - self._unanswered_s)
@@ -348,8 +390,11 @@ class SafetyController:
             now = time.monotonic()
             late = now - run.started >= UNCONFIRMED_S
             with self._changed:
-                state = hash((run.changes, len(run.expected), late, self._link.up))
                 finished = run.complete or now - run.started >= deadline_s
+                if run.widens_at <= now and not run.settled_scope:
+                    self._widen(run)
+                    pauses, next_send, finished = iter(quick_first), 0.0, False
+                state = hash((run.changes, len(run.expected), late, run.widened, self._link.up))
             if state != reported or finished:
                 reported = state
                 on_progress(run.progress(self._link.up, now))
@@ -367,6 +412,7 @@ class SafetyController:
                 pause = next(pauses, pause)
                 next_send = now + max(pause, min(REPEAT_EACH_S * len(run.expected), longest_s))
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
+            marks += [run.widens_at] if run.widens_at > now else []
             with self._changed:
                 seen = (self._link.up, len(run.expected), run.more)
                 self._changed.wait_for(
@@ -399,6 +445,8 @@ class SafetyController:
             run.left_ms,
             {name: each for name, each in answers.items() if each.stopped is True and each.claimed},
             alarms,
+            run.scope,
+            run.widened,
         )
         for name, each in {**report.not_stopped, **refused}.items():
             logger.critical("%s DID NOT STOP: %s", name, each.why or each.facts)
@@ -466,7 +514,7 @@ class SafetyController:
     def _signed(self, event: str, purpose: Purpose, params: Mapping[str, Any]) -> bytes:
         stated: dict[str, Any] = {**params, "purpose": purpose, "t": time.time(), "nonce": secrets.token_hex(16)}
         if self._key is not None:
-            stated["sig"] = ed25519.encode(self._key.sign(signed_bytes(purpose, self.controller_id, stated)))
+            stated = signed_stop(self._key, purpose, self.controller_id, stated)
         return notification(event, stated)
 
 
@@ -477,6 +525,9 @@ class _Running:
     started: float
     press: Press
     reason: str
+    scope: Scope = EVERY_ROBOT
+    remembered: bool = False
+    widened: bool = False
     inbox: dict[str, deque[Received]] = field(default_factory=dict)
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
@@ -497,6 +548,23 @@ class _Running:
         for source, received in inbox.items():
             if self.knows(source) or len(self.graded.by_robot) < ANSWERS_MAX:
                 self.changes += sum(self.graded.take(source, each) for each in received)
+
+    @property
+    def widens_at(self) -> float:
+        """Monotonic s at which it widens, unless a robot in its scope answers."""
+        scoped = self.left is not None and not (self.scope.everything or self.widened or self.remembered)
+        return self.left + WIDEN_S if scoped and self.left is not None else float("inf")
+
+    @property
+    def settled_scope(self) -> bool:
+        """A robot in the scope has answered.
+
+        What is claimed for an enrolled one is no answer.
+        """
+        return any(
+            self.scope.names(name, each.facts.get("cell")) and not (each.claimed and each.enrolled)
+            for name, each in self.graded.by_robot.items()
+        )
 
     @property
     def complete(self) -> bool:
@@ -521,4 +589,6 @@ class _Running:
         open_ = self.graded.unsettled(self.expected) if late or not link_up else ()
         elapsed_ms = self.since_press_ms(now)
         answers, alarms = dict(self.graded.by_robot), dict(self.graded.alarms)
-        return Progress(self.estop_id, answers, open_, link_up, elapsed_ms, self.left_ms, alarms)
+        return Progress(
+            self.estop_id, answers, open_, link_up, elapsed_ms, self.left_ms, alarms, self.scope, self.widened
+        )

@@ -544,6 +544,12 @@ class EstopListener:
         entry = self._plane.robots.get(robot_id)
         return entry.wire_id if entry else robot_id
 
+    def _cell(self, report: RobotReport) -> dict[str, str]:
+        """Return the field ``cell``, which robots that read scopes have."""
+        entry = self._plane.robots.get(report.robot_id)
+        cells = frozenset[str]() if entry is None else entry.cells
+        return {"cell": report.scope.cell if report.scope.cell in cells else min(cells, default="")}
+
     def _answer(self, report: RobotReport) -> None:
         key, now = (report.robot_id, report.epoch), time.monotonic()
         if not report.names_its_epoch and not self._latch_answers.allows(report.robot_id, report.epoch, now):
@@ -574,7 +580,7 @@ class EstopListener:
         halted_now = report.received_at is not None and not report.repeated
         payload = None if halted_now else self._repeated.get(same)
         if payload is None:
-            fields = {**report.fields(), "device_id": device_id, "audit": audit_head()}
+            fields = {**report.fields(), "device_id": device_id, "audit": audit_head(), **self._cell(report)}
             payload = notification(VERDICT, signed(identity, Purpose.STOP_VERDICT, device_id, fields))
             if not halted_now:
                 self._repeated[same] = payload

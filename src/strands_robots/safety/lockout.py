@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error
+from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.utils import shown
 
 MAX_EPOCHS = 64
@@ -28,23 +29,29 @@ OVERFLOW = "overflow"
 
 @dataclass(frozen=True, slots=True)
 class Lockout:
-    """One epoch that locks a robot: ``at`` in wall-clock s, declared ``source``."""
+    """One epoch that locks a robot: ``at`` in wall-clock s, declared ``source``.
+
+    ``scope`` is that of the message that locked it; a stop may have been widened since.
+    """
 
     epoch: str
     source: str = ""
     reason: str = ""
     at: float = 0.0
+    scope: Scope = EVERY_ROBOT
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> Lockout:
         """Read a lockout that a robot reported, whatever its fields hold."""
         since = row.get("since")
         at = float(since) if isinstance(since, int | float) else 0.0
-        return cls(str(row.get("epoch", "")), str(row.get("source", "")), str(row.get("reason", "")), at)
+        epoch, source, reason = (str(row.get(name, "")) for name in ("epoch", "source", "reason"))
+        return cls(epoch, source, reason, at, Scope.read(row.get(SCOPE)))
 
     def fields(self) -> dict[str, Any]:
         """Return the lockout as a robot reports it."""
-        return {"epoch": self.epoch, "source": self.source, "reason": self.reason, "since": self.at}
+        stated = {"epoch": self.epoch, "source": self.source, "reason": self.reason, "since": self.at}
+        return {**stated, **self.scope.field()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,13 +133,13 @@ class LockoutLatch:
         """Return the refusal of ``verb`` while locked, or None while free."""
         return refusal(self._state, self.robot_id, verb)
 
-    def engage(self, epoch: str, source: str, reason: str) -> bool:
+    def engage(self, epoch: str, source: str, reason: str, scope: Scope = EVERY_ROBOT) -> bool:
         """Lock under ``epoch``; False, without a change, when it was seen before."""
         with self._writing:
             if epoch in self._seen:
                 return False
             self._seen[epoch] = None
-            self._state = self._state.engage(Lockout(epoch, source, reason, self._clock()))
+            self._state = self._state.engage(Lockout(epoch, source, reason, self._clock(), scope))
             self._forget()
             return True
 
@@ -162,10 +169,12 @@ def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
     first = state.all[0]
     why = f" ({shown(first.reason)})" if first.reason else ""
     more = len(state.all) - 1
+    scope = "" if first.scope.everything else f" for {first.scope}"
     others = f" and {more} more stop{'s' if more > 1 else ''}" if more else ""
     return error(
-        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}{why}, "
-        f"epoch {first.epoch}{others}, since {utc(first.at)}. To resume: {how_to_resume(state, robot_id)}.",
+        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}"
+        f"{scope}{why}, epoch {first.epoch}{others}, since {utc(first.at)}. "
+        f"To resume: {how_to_resume(state, robot_id)}.",
         locked=True,
         robot=robot_id,
         refused=verb,
@@ -173,6 +182,7 @@ def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
         stopped_by=first.source,
         stop_reason=first.reason,
         since=first.at,
+        **first.scope.field(),
     )
 
 

@@ -23,6 +23,7 @@ from typing import Any
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.scope import SCOPE, Scope
 from strands_robots.safety.state_files import StateFileError, adopt, make_private, read_private, require_private
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import field_values
@@ -200,10 +201,15 @@ class LockoutStore:
 def _record(kept: StoredLockout) -> dict[str, Any]:
     return {
         "name": kept.name,
-        "holds": [field_values(each) for each in kept.state.lockouts],
-        "overflow": field_values(kept.state.overflow) if kept.state.overflow else None,
+        "holds": [_fields(each) for each in kept.state.lockouts],
+        "overflow": _fields(kept.state.overflow) if kept.state.overflow else None,
         "seen": list(kept.seen),
     }
+
+
+def _fields(lockout: Lockout) -> dict[str, Any]:
+    # Releases that know no scope read the other fields, and write none.
+    return {**field_values(lockout), SCOPE: lockout.scope.value()}
 
 
 def _kept(record: Mapping[str, Any]) -> StoredLockout:
@@ -223,7 +229,7 @@ def _stored(record: Mapping[str, Any]) -> StoredLockout:
 
 
 def _lockout(data: Mapping[str, Any]) -> Lockout:
-    lockout = Lockout(data["epoch"], data["source"], data["reason"], float(data["at"]))
+    lockout = Lockout(data["epoch"], data["source"], data["reason"], float(data["at"]), Scope.read(data.get(SCOPE)))
     if not all(isinstance(part, str) for part in (lockout.epoch, lockout.source, lockout.reason)):
         raise ValueError("a lockout whose fields are not text")
     return lockout

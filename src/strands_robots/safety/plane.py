@@ -61,10 +61,19 @@ class Registered:
     """One robot in the plane. ``close`` takes it out; the lockout on disk stays."""
 
     def __init__(
-        self, plane: SafetyPlane, robot_id: str, robot: Stoppable, *, key: str | None, kept: StoredLockout, wire_id: str
+        self,
+        plane: SafetyPlane,
+        robot_id: str,
+        robot: Stoppable,
+        *,
+        key: str | None,
+        kept: StoredLockout,
+        wire_id: str,
+        cells: frozenset[str] = frozenset(),
     ) -> None:
         self.robot_id = robot_id
         self.wire_id = wire_id
+        self.cells = cells
         self.robot = robot
         self.key = key
         self.users = 1
@@ -112,7 +121,7 @@ class Registered:
     def inherit(self, state: LockoutState) -> None:
         """Take over the lockouts of another entry, except what was resumed here since."""
         for each in state.all:
-            self.latch.engage(each.epoch, each.source, each.reason)
+            self.latch.engage(each.epoch, each.source, each.reason, each.scope)
 
     def come_up_locked(self) -> None:
         """Halt motion that began before the lock was known; return at once."""
@@ -135,11 +144,10 @@ class Registered:
 
         A stop is known, or one of a flood that locks nothing more: the latest halt answers for it.
         """
+        lock = functools.partial(self.latch.engage, order.epoch, order.source, order.reason, order.scope)
         if not self.crowded:
-            return self.latch.engage(order.epoch, order.source, order.reason)
-        if order.received - self._halted_at < HALT_AGAIN_S or not self.latch.engage(
-            order.epoch, order.source, order.reason
-        ):
+            return lock()
+        if order.received - self._halted_at < HALT_AGAIN_S or not lock():
             return False
         self._halted_at = order.received
         return True
@@ -231,7 +239,9 @@ class SafetyPlane:
         """The ids of the robots held now."""
         return frozenset(self._robots)
 
-    def register(self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "") -> Registered:
+    def register(
+        self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "", cell: str = ""
+    ) -> Registered:
         """Put ``robot`` under the plane, which locks and halts it.
 
         Args:
@@ -239,6 +249,7 @@ class SafetyPlane:
             wire_id: the name it answers by on its network and that a resume targets; ``robot_id`` by default.
             key: under which its lockout is stored over a restart, from :func:`~.persistence.hardware_key` or
                 :func:`~.persistence.simulation_key`. None: it is not kept.
+            cell: the cell that it is in, if any; under a second name of its own a further one.
 
         Registering the same robot again under its name, as its second network does, returns the same entry, which
         lives until it was closed as often.
@@ -253,6 +264,7 @@ class SafetyPlane:
                 if body_of(known.robot) is not body_of(robot):
                     raise ValidationError(f"robot_id {shown(robot_id)} is taken by another robot of this process.")
                 known.users += 1
+                known.cells |= {cell} if cell else frozenset()
                 if robot.gate not in known.gates:
                     robot.gate.attach(known.latch)
                     known.gates = (*known.gates, robot.gate)
@@ -263,7 +275,15 @@ class SafetyPlane:
                         self._kept([known])
                 return known
             kept = self.store.load(key) if key else StoredLockout()
-            entry = Registered(self, robot_id, robot, key=key, kept=kept, wire_id=wire_id or robot_id)
+            entry = Registered(
+                self,
+                robot_id,
+                robot,
+                key=key,
+                kept=kept,
+                wire_id=wire_id or robot_id,
+                cells=frozenset({cell} if cell else ()),
+            )
             robot.gate.attach(entry.latch)
             self._inherit(entry)
             if not self._robots:
@@ -385,13 +405,18 @@ class SafetyPlane:
         return begun is not None and begun[0] == epoch and begun[1] is self._robots
 
     def _engage(self, order: StopOrder, by_name: dict[str, Registered]) -> tuple[list[Registered], list[Registered]]:
-        """Lock the robots; return those to halt, and those that know the stop."""
+        """Lock the robots in its scope; return those to halt, and those that know it.
+
+        A robot outside of the scope is neither: it remembers nothing of this stop, so that a wider one locks it.
+        """
         fresh: list[Registered] = []
         known: list[Registered] = []
-        listener = order.path == LISTENER
-        if listener:
+        listener, scope = order.path == LISTENER, order.scope
+        if listener and scope.everything:
             self._begun = (order.epoch, by_name)
         for entry in by_name.values():
+            if not scope.everything and not scope.covers(entry.wire_id, entry.cells):
+                continue
             if not listener and self.under_way(order.epoch):
                 # It came over another path meanwhile: the e-stop listener's thread halts and reports the others.
                 return fresh, []
@@ -534,6 +559,7 @@ class SafetyPlane:
                 "pressed_at": order.pressed,
                 "delay_s": order.delay_s(order.received_at),
                 "timing": order.timing(order.received_at),
+                **order.scope.field(),
             }
             queue_safety_event(event, report.robot_id, facts)
         if len(self._issued) < 1024 or order.source in self._issued:

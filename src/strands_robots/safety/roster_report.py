@@ -10,7 +10,8 @@ from strands_robots.safety.consoles import kept_consoles, stated_consoles
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import estop_keys
 from strands_robots.safety.resume import is_epoch
-from strands_robots.safety.roster import REPORTED_MAX, Known, RosterRow, bounded
+from strands_robots.safety.roster import REPORTED_MAX, RosterRow, bounded
+from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, own_key
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier

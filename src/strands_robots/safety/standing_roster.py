@@ -16,8 +16,9 @@ from strands_robots.safety.consoles import console_key
 from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
-from strands_robots.safety.roster import Known, Roster, RosterRow
+from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import report_fields
+from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_roster import counts

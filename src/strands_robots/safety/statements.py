@@ -22,6 +22,7 @@ class Purpose(StrEnum):
     """The use of a signature, part of the signed bytes."""
 
     EMERGENCY_STOP = "emergency-stop"
+    STOP_SCOPE = "emergency-stop-scope"
     CHECK_IN = "check-in"
     CHECK_IN_ANSWER = "check-in-answer"
     STOP_VERDICT = "stop-verdict"

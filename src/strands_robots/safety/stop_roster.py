@@ -11,9 +11,9 @@ from strands_robots.audit import queue_safety_event
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.roster import Known, Roster, RosterRow
+from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import RosterReport
-from strands_robots.safety.sightings import sightings
+from strands_robots.safety.sightings import Known, sightings
 from strands_robots.safety.silence import Sending, reason_of
 from strands_robots.safety.state_files import uptime
 from strands_robots.safety.statements import Purpose
