@@ -28,6 +28,7 @@ class Purpose(StrEnum):
     STOP_VERDICT = "stop-verdict"
     LOCKOUT_STATE = "lockout-state"
     RESUME_ANSWER = "resume-answer"
+    MISSED_STOPS = "missed-stops"
 
 
 def covered(purpose: Purpose, source: str, fields: Mapping[str, Any]) -> bytes:
