@@ -13,6 +13,7 @@ from device_connect_edge.drivers import DeviceDriver
 from strands_robots.contract import Haltable, body_of
 from strands_robots.device_connect._compat import link_of, stated_id
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.device_connect.stop_link import NoStopLink, stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
@@ -23,6 +24,7 @@ from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.scope import own_cell
+from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import Share
@@ -130,6 +132,7 @@ class SafetyRegistration:
         self.driver: Any = None
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
         self._held: Registered | None = self.entry
+        self._network = None if link is None else network_of(link)
         try:
             self._listener: ListenerRegistration = estop_listener().register(
                 name,
@@ -137,6 +140,8 @@ class SafetyRegistration:
                 lambda: NoStopLink() if link is None else stop_link(link),
                 lambda: self.identity,
                 opened=False,
+                network=self._network,
+                was_here=self._network is not None and sightings().was_here(self._network, device_id) is not None,
             )
         except BaseException:
             self.entry.close()
@@ -170,7 +175,9 @@ class SafetyRegistration:
     def runtime_estop(self, source: object, params: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
-            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime", raw)
+            estop_listener().accept_params(
+                source, params if isinstance(params, Mapping) else {}, "runtime", raw, self._network
+            )
 
     def raise_estop(self, params: Mapping[str, Any]) -> None:
         """Lock and halt on this device's own emergency stop; return at once.

@@ -30,7 +30,9 @@ from strands_robots.safety.estop_listener import (
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
+from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
+from strands_robots.safety.question_ports import ControllerPort
 from strands_robots.safety.roster_inbox import OnReport, RosterInbox
 from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.scope import (
@@ -198,9 +200,11 @@ class SafetyController:
         self._witness, self._heads = HeadWitness(always=True), FailureBudget()
         self._reports = RosterInbox()
         self._others: OnEvent | None = None
-        self._link = make_link()
+        self._link, self._linked = make_link(), False
         self._end_short_turns = shorten_turns()
-        events = (VERDICT, CHECK_IN_ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
+        self._sent = ControllerPort(self.controller_id, signing_key, lambda: self._keys, self._publish)
+        self._missed = MissedStops(self._sent)
+        events = (VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
         self._link.open(events, self._receive, self._link_changed)
 
     @property
@@ -292,6 +296,8 @@ class SafetyController:
                 del self._stops[run.estop_id]
                 self._ended = run
             self._reports.close(run.estop_id)
+            if run.complete:
+                self._sent.answered(run.estop_id)
         return self._report(run)
 
     def review(self, report: StopReport) -> StopReport:
@@ -354,6 +360,7 @@ class SafetyController:
             self._check_in.join(2.0)
         self._link.close()
         self._reports.end()
+        self._missed.close()
         self._end_short_turns()
 
     def _send(self, run: _Running) -> None:
@@ -365,6 +372,9 @@ class SafetyController:
         payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
         if self._link.publish(self.controller_id, ESTOP, payload) and run.left is None:
             run.left = now
+        if run.sent != run.widened:
+            run.sent = run.widened
+            self._sent.sent(run.estop_id, payload)
 
     def _repeat(self, run: _Running, deadline_s: float, on_progress: OnProgress) -> None:
         quick_first = REPEAT_S if self._key is None else REPEAT_SIGNED_S
@@ -462,6 +472,9 @@ class SafetyController:
             return
         if self._others is not None and event in (ESTOP, VERDICT) and source != self.controller_id:
             self._others(event, source, payload)
+        if event in (QUESTION, ANSWER):
+            self._missed.receive(event, source, payload)
+            return
         if event == ESTOP:
             return
         params = params_of(payload)
@@ -493,13 +506,18 @@ class SafetyController:
     def _link_changed(self, up: bool) -> None:
         with self._changed:
             self._changed.notify_all()
-        self._on_link(up)
+            changed, self._linked = up != self._linked, up
+        if changed:
+            self._on_link(up)
 
     def _check_in_loop(self, interval_s: float) -> None:
         due = time.monotonic()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
             due = max(due + interval_s, time.monotonic())
             self.check_in()
+
+    def _publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._link.publish(source, event, notification(event, fields))
 
     def _signed(self, event: str, purpose: Purpose, params: Mapping[str, Any]) -> bytes:
         stated: dict[str, Any] = {**params, "purpose": purpose, "t": time.time(), "nonce": secrets.token_hex(16)}
@@ -521,6 +539,7 @@ class _Running:
     inbox: dict[str, deque[Received]] = field(default_factory=dict)
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
+    sent: bool | None = None
     changes: int = 0
     more: bool = False
 
