@@ -115,6 +115,15 @@ class RenewableLink(Protocol):
         """Open a connection in place of the present one; return at once."""
 
 
+@runtime_checkable
+class ReportingLink(Protocol):
+    """A link of a network that tells a sender what it refuses."""
+
+    @property
+    def denied(self) -> str:
+        """The broker's refusal of a stop of this connection, or ""."""
+
+
 def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:
     """Encode an event as a JSON-RPC 2.0 notification with ``event_id`` and ``ts``."""
     stamp = {"event_id": event_id or uuid.uuid4().hex, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
