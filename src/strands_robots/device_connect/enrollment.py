@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.safety.identity import EnrolledKeys, local_name
+from strands_robots.safety.identity import EnrolledKeys, of_tenant
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 
 
@@ -13,10 +13,7 @@ def enrolled_robots(link: LinkConfig) -> dict[str, bytes]:
     Raises:
         KeyFileError, OSError: the enrolled keys cannot be used.
     """
-    prefix = local_name(link.tenant, "")
-    robots = {name.removeprefix(prefix): key for name, key in EnrolledKeys().load().items() if name.startswith(prefix)}
-    # A device id has no dot: what has one belongs to another tenant.
-    return {name: key for name, key in robots.items() if "." not in name}
+    return of_tenant(EnrolledKeys().load(), link.tenant)
 
 
 def network_of(link: LinkConfig) -> NetworkKey:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, VERDICT, OnEvent, OnState, StopLink
+from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, OnEvent, OnState, StopLink
 from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.stop_log import stop_logger
@@ -263,10 +263,19 @@ class NatsStopLink:
         self._sending: set[asyncio.Future[None]] = set()
         self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
+        self._stops: set[str] = set()
 
     @property
     def up(self) -> bool:
         return self._state.up
+
+    @property
+    def denied(self) -> str:
+        """The server's refusal of a stop of this connection, or ""."""
+        client, said = self._client, ""
+        for subject in tuple(self._stops):
+            said = said or (client.denied(subject) if client is not None else "")
+        return said
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._state = _State(on_state)
@@ -279,7 +288,10 @@ class NatsStopLink:
         loop = self._loop
         if loop is None or loop.is_closed() or not self._state.up:
             return False
-        loop.call_soon_threadsafe(self._send, f"{self._root}.{source}.event.{event}", payload)
+        subject = f"{self._root}.{source}.event.{event}"
+        if event == ESTOP:
+            self._stops.add(subject)
+        loop.call_soon_threadsafe(self._send, subject, payload)
         return True
 
     def close(self) -> None:

@@ -52,12 +52,12 @@ class NetworkKey:
         return f"{self.kind} {self.tenant} {','.join(self.where)}"
 
     def meets(self, other: NetworkKey) -> bool:
-        """True when both are the same network: of one kind and tenant, with a common endpoint."""
+        """True when both have one kind and tenant, and a common endpoint."""
         return (self.kind, self.tenant) == (other.kind, other.tenant) and not set(self.where).isdisjoint(other.where)
 
 
 def _plain(endpoint: str) -> str:
-    """Return an endpoint as host and port, without credentials, scheme and spelling of this machine."""
+    """Return an endpoint as host and port, without credentials and scheme."""
     rest = endpoint.strip().lower().rsplit("@", 1)[-1]
     rest = rest.partition("://")[2] or rest
     rest = rest.partition("/")[2] if rest.split("/", 1)[0] in ("tcp", "tls", "quic", "udp", "ws", "wss") else rest

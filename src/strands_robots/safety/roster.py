@@ -9,29 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.identity import EnrolledKeys, EnrolledRobot, Exemption, of_tenant
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.sightings import Known, Moment, Sighting, Sightings, sightings
-
-__all__ = ["Exemption", "Known", "Moment", "NetworkKey", "Roster", "RosterRow", "Sighting", "Sightings", "bounded"]
+from strands_robots.safety.sightings import Known, Sighting, Sightings, sightings, this_moment
+from strands_robots.safety.state_files import uptime
+from strands_robots.utils import field_values
 
 REPORTED_MAX = 64
-
-
-@dataclass(frozen=True, slots=True)
-class Exemption:
-    """An operator's note that an enrolled robot need not answer.
-
-    Attributes:
-        state: ``retired`` or ``off``.
-        by: the operator.
-        reason: or "".
-        at: wall-clock seconds.
-    """
-
-    state: str
-    by: str
-    reason: str
-    at: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +60,7 @@ class Roster:
         network: asked for.
         rows: that must answer, in the order of :class:`Known`, then longest heard first; devices without a stop too.
         exempt: robots that are retired or off. ``age_s`` tells whether one of this name was heard all the same.
-        elsewhere: enrolled or served robots of other networks.
+        elsewhere: number of enrolled or served robots of other networks of this user.
         enrolled: number of robots enrolled for this network, without the exempt ones.
         problems: sentences on what could not be read; with one of them no exit code is 0.
     """
@@ -95,7 +80,7 @@ class Roster:
         *,
         store: Sightings | None = None,
     ) -> Roster:
-        """Read the roster from this machine's state; it reads the disk, so call it once the stop has left.
+        """Read the roster from the disk; call it once the stop has left.
 
         Args:
             network: of the stop.
@@ -103,24 +88,39 @@ class Roster:
                 minutes before it until now.
             store: in place of the state directory's.
         """
-        found, problem = (store or sightings()).read()
-        rows = tuple(
-            RosterRow(
-                each.name,
-                each.known,
-                each.age_s,
-                each.order,
-                each.cell,
-                each.signed_only,
-                each.stoppable,
-                each.departed,
-                each.alive,
-                each.pid,
-            )
-            for each in found
-            if each.network.meets(network)
+        store = store or sightings()
+        now = this_moment()
+        at = now if pressed is None else now.earlier(uptime() - pressed)
+        found, problem = store.read(at)
+        problems = [problem] if problem else []
+        try:
+            enrolled = of_tenant(EnrolledKeys(store.directory).robots(), network.tenant)
+        except (StrandsRobotsError, OSError) as exc:
+            enrolled = {}
+            problems.append(f"the enrolled robots cannot be read: {exc}")
+        rows: dict[str, RosterRow] = {}
+        for each in sorted((each for each in found if each.network.meets(network)), key=_surest_first):
+            rows.setdefault(each.name, _row_of(each))
+        here = {name: robot for name, robot in enrolled.items() if _is_at(robot, network)}
+        exempt: list[RosterRow] = []
+        for name, robot in here.items():
+            known = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), exemption=robot.exemption)
+            if robot.exemption is not None and not known.alive:
+                exempt.append(known)
+                rows.pop(name, None)
+            else:
+                # A robot that this machine serves now is there, whatever was decided about it.
+                rows[name] = replace(known, known=Known.ENROLLED, exemption=None)
+        others = {name for name, robot in enrolled.items() if name not in here and robot.exemption is None}
+        served = {each.name for each in found if each.alive and not each.network.meets(network)}
+        return cls(
+            network,
+            in_order(rows.values()),
+            in_order(exempt),
+            len(others | served),
+            sum(robot.exemption is None for robot in here.values()),
+            tuple(problems),
         )
-        return cls(network, in_order(rows), problems=(problem,) if problem else ())
 
     def counts(self, row: RosterRow) -> bool:
         """True when the exit code depends on this row."""
@@ -137,10 +137,25 @@ class Roster:
         return tuple(row for row in self.rows if not self.counts(row))
 
     def with_reported(self, rows: Iterable[RosterRow], by: str) -> Roster:
-        """Return the roster with what the controller ``by`` reported; a row known here stays as it is."""
+        """Return the roster with rows that ``by`` reported; one known here stays."""
         here = {row.name for row in (*self.rows, *self.exempt)}
         added = tuple(replace(row, reported_by=by) for row in rows if row.name not in here)
         return replace(self, rows=in_order((*self.rows, *added)))
+
+
+def _is_at(robot: EnrolledRobot, network: NetworkKey) -> bool:
+    """Return True where a robot is enrolled here; an old record is for all."""
+    return not robot.networks or any(map(network.meets, robot.networks))
+
+
+def _surest_first(sighting: Sighting) -> tuple[int, float]:
+    return sighting.known, sighting.age_s
+
+
+def _row_of(sighting: Sighting) -> RosterRow:
+    fields = field_values(sighting)
+    del fields["network"]
+    return RosterRow(**fields)
 
 
 def in_order(rows: Iterable[RosterRow]) -> tuple[RosterRow, ...]:
