@@ -117,7 +117,8 @@ class RobotsPort:
         robots = self._plane.robots
         back = [robots.get(each.robot_id) for each in self._members() if each.was_here]
         # A state directory that was reset since is that of a newcomer.
-        return any([each is not None and each.returned() for each in back])
+        returned = [each.robot_id for each in back if each is not None and each.returned()]
+        return bool(returned)
 
     def devices(self) -> Sequence[str]:
         return [each.name for each in self._members()]
