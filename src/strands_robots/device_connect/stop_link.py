@@ -19,6 +19,7 @@ from device_connect_edge.messaging import MessagingError
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, OnEvent, OnState, StopLink
 from strands_robots.safety.orders import PARSED_MAX_BYTES
+from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.stop_log import stop_logger
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ LEASE_MS = 4000
 OVERLAP_S = 2.0
 """Time in which a replaced session still carries stops: peers learn of the new one and of one another meanwhile."""
 
-ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER))
+ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER, STOP_ROSTER))
 """Events that answer; any other one is a stop or a check-in, and goes first."""
 
 CLOSE_S = 10.0
