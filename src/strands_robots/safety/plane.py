@@ -23,6 +23,7 @@ from strands_robots.safety.orders import LISTENER, RobotReport, StopOrder, new_e
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.sightings import sightings
 from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
 from strands_robots.safety.stop_log import stop_logger
@@ -583,6 +584,7 @@ class SafetyPlane:
 
     def _chore(self) -> None:
         self._keep_again()
+        sightings().refresh()
         if any(entry.locked for entry in self._robots.values()):
             self._clearance.look()
 
