@@ -135,6 +135,7 @@ class SafetyRegistration:
         """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
         self._held: Registered | None = self.entry
+        self._network = None if link is None else network_of(link)
         try:
             self._listener: ListenerRegistration = estop_listener().register(
                 name,
@@ -142,6 +143,8 @@ class SafetyRegistration:
                 lambda: NoStopLink() if link is None else stop_link(link),
                 lambda: self.identity,
                 opened=False,
+                network=self._network,
+                was_here=self._network is not None and sightings().was_here(self._network, device_id) is not None,
             )
         except BaseException:
             self.entry.close()
@@ -185,7 +188,9 @@ class SafetyRegistration:
     def runtime_estop(self, source: object, params: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
-            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime", raw)
+            estop_listener().accept_params(
+                source, params if isinstance(params, Mapping) else {}, "runtime", raw, self._network
+            )
 
     def raise_estop(self, params: Mapping[str, Any]) -> None:
         """Lock and halt on this device's own emergency stop; return at once.

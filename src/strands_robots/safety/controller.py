@@ -30,11 +30,21 @@ from strands_robots.safety.estop_listener import (
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
+from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
+from strands_robots.safety.question_ports import ControllerPort
 from strands_robots.safety.roster_inbox import OnReport, RosterInbox
 from strands_robots.safety.roster_report import STOP_ROSTER
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import (
+    EVERY_ROBOT,
+    WIDEN_S,
+    KnownRobots,
+    Remembers,
+    Scope,
+    none_known,
+    report_widened,
+)
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
@@ -63,9 +73,6 @@ RENEW_S = 6.0
 
 SETTLE_S = 1.0
 """A stop goes on for at least so long before it has the connection made anew."""
-
-WIDEN_S = 0.2
-"""Seconds after which a stop of some robots becomes one of every robot, where none of them answered or is known."""
 
 DEADLINE_S = 3.0
 INBOX_PER_ROBOT = 16
@@ -177,7 +184,7 @@ class SafetyController:
         require_signed: bool = False,
         stands: bool = False,
         network: NetworkKey | None = None,
-        remembers: Callable[[Scope], bool] = lambda scope: False,
+        remembers: Remembers = none_known,
     ) -> None:
         self.controller_id, self.network = device_id("controller_id", controller_id), network
         self._key = signing_key
@@ -196,9 +203,11 @@ class SafetyController:
         self._witness, self._heads = HeadWitness(always=True), FailureBudget()
         self._reports = RosterInbox()
         self._others: OnEvent | None = None
-        self._link = make_link()
+        self._link, self._linked = make_link(), False
         self._end_short_turns = shorten_turns()
-        events = (VERDICT, CHECK_IN_ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
+        self._sent = ControllerPort(self.controller_id, signing_key, lambda: self._keys, self._publish)
+        self._missed = MissedStops(self._sent)
+        events = (VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
         self._link.open(events, self._receive, self._link_changed)
 
     @property
@@ -281,7 +290,7 @@ class SafetyController:
             self._send(run)
             self._reports.open(run.estop_id, on_report)
             if not scope.everything:
-                threading.Thread(target=self._remember, args=(run,), name="stop scope", daemon=True).start()
+                run.known = KnownRobots(scope, self._remembers)
             self._load_keys()
             run.graded = Answers(self._keys, required=self._require_signed, pressed_at=press.wall)
             self._repeat(run, deadline_s, on_progress)
@@ -290,6 +299,8 @@ class SafetyController:
                 del self._stops[run.estop_id]
                 self._ended = run
             self._reports.close(run.estop_id)
+            if run.complete:
+                self._sent.answered(run.estop_id)
         return self._report(run)
 
     def review(self, report: StopReport) -> StopReport:
@@ -316,22 +327,6 @@ class SafetyController:
             while len(self._presses) > PRESSES_MAX:
                 del self._presses[next(iter(self._presses))]
         return press
-
-    def _remember(self, run: _Running) -> None:
-        """Find out whether this machine knows a robot in the scope."""
-        try:
-            run.remembered = self._remembers(run.scope)
-        except Exception:
-            logger.critical("The robots known here cannot be read, so none counts as known.", exc_info=True)
-
-    def _widen(self, run: _Running) -> None:
-        """Make it a stop of every robot: none in its scope is there."""
-        run.widened = True
-        logger.critical(
-            "Emergency stop %s was for %s. None of these has answered or is known here: EVERY ROBOT IS STOPPED.",
-            run.estop_id,
-            run.scope,
-        )
 
     def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
         """Name further robots that must answer ``estop_id``; False when it is over.
@@ -368,6 +363,7 @@ class SafetyController:
             self._check_in.join(2.0)
         self._link.close()
         self._reports.end()
+        self._missed.close()
         self._end_short_turns()
 
     def _send(self, run: _Running) -> None:
@@ -379,6 +375,9 @@ class SafetyController:
         payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
         if self._link.publish(self.controller_id, ESTOP, payload) and run.left is None:
             run.left = now
+        if run.sent != run.widened:
+            run.sent = run.widened
+            self._sent.sent(run.estop_id, payload)
 
     def _repeat(self, run: _Running, deadline_s: float, on_progress: OnProgress) -> None:
         quick_first = REPEAT_S if self._key is None else REPEAT_SIGNED_S
@@ -395,7 +394,8 @@ class SafetyController:
             with self._changed:
                 finished = run.complete or now - run.started >= deadline_s
                 if run.widens_at <= now and not run.settled_scope:
-                    self._widen(run)
+                    run.widened = True
+                    report_widened(run.estop_id, run.scope)
                     pauses, next_send, finished = iter(quick_first), 0.0, False
                 state = hash((run.changes, len(run.expected), late, run.widened, self._link.up))
             if state != reported or finished:
@@ -475,6 +475,9 @@ class SafetyController:
             return
         if self._others is not None and event in (ESTOP, VERDICT) and source != self.controller_id:
             self._others(event, source, payload)
+        if event in (QUESTION, ANSWER):
+            self._missed.receive(event, source, payload)
+            return
         if event == ESTOP:
             return
         params = params_of(payload)
@@ -506,13 +509,18 @@ class SafetyController:
     def _link_changed(self, up: bool) -> None:
         with self._changed:
             self._changed.notify_all()
-        self._on_link(up)
+            changed, self._linked = up != self._linked, up
+        if changed:
+            self._on_link(up)
 
     def _check_in_loop(self, interval_s: float) -> None:
         due = time.monotonic()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
             due = max(due + interval_s, time.monotonic())
             self.check_in()
+
+    def _publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._link.publish(source, event, notification(event, fields))
 
     def _signed(self, event: str, purpose: Purpose, params: Mapping[str, Any]) -> bytes:
         stated: dict[str, Any] = {**params, "purpose": purpose, "t": time.time(), "nonce": secrets.token_hex(16)}
@@ -529,11 +537,12 @@ class _Running:
     press: Press
     reason: str
     scope: Scope = EVERY_ROBOT
-    remembered: bool = False
+    known: KnownRobots | None = None
     widened: bool = False
     inbox: dict[str, deque[Received]] = field(default_factory=dict)
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
+    sent: bool | None = None
     changes: int = 0
     more: bool = False
 
@@ -555,7 +564,9 @@ class _Running:
     @property
     def widens_at(self) -> float:
         """Monotonic s at which it widens, unless a robot in its scope answers."""
-        scoped = self.left is not None and not (self.scope.everything or self.widened or self.remembered)
+        scoped = self.left is not None and not (
+            self.scope.everything or self.widened or (self.known is not None and self.known.known)
+        )
         return self.left + WIDEN_S if scoped and self.left is not None else float("inf")
 
     @property

@@ -29,6 +29,7 @@ class Purpose(StrEnum):
     LOCKOUT_STATE = "lockout-state"
     RESUME_ANSWER = "resume-answer"
     STOP_ROSTER = "stop-roster"
+    MISSED_STOPS = "missed-stops"
 
 
 def covered(purpose: Purpose, source: str, fields: Mapping[str, Any]) -> bytes:

@@ -113,7 +113,7 @@ class Simulation(ArmMixin, TeleopMixin):
         self.observers = RolloutObservers()
         self._torque = StopTorque(stop_level, rest_pose, self.gate, self.observers)
         self.physics = Physics(compile_stage(Plan.checked(timestep, gravity, density, viscosity)))
-        self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime))
+        self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime), held=lambda: self.gate.held)
         self._speed_limit = None if speed_limit is None else number("speed_limit", speed_limit, above=0, high=SPEED_MAX)
         self._bodies: dict[str, RobotBody] = {}
         self._rollouts: dict[str, Rollout] = {}
