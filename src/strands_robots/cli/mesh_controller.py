@@ -12,9 +12,12 @@ from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.roster_inbox import OnReport
+from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stopping import explain
-from strands_robots.tools.networks import stop_outcome
+from strands_robots.tools.mesh_roster import MeshReports, mesh_network
+from strands_robots.tools.roster_verdict import stop_outcome
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
@@ -33,7 +36,11 @@ class MeshController:
         self._key = signing_key
         self._press = ("", Press(0.0, 0.0))
         self._keys = enrolled_peers()
-        self.controller_id = mesh.peer_id
+        self._named: frozenset[str] = frozenset()
+        self.controller_id, self.network = mesh.peer_id, mesh_network()
+        self.sending = Sending(signed=signing_key is not None)
+        self._reports = MeshReports(mesh)
+        self._reports.listen()
 
     @property
     def link_up(self) -> bool:
@@ -54,9 +61,12 @@ class MeshController:
         reason: str = "",
         *,
         estop_id: str = "",
+        more: bool = False,
         on_progress: OnProgress = lambda progress: None,
+        on_report: OnReport = lambda report: None,
     ) -> StopReport:
         """Stop every peer of the mesh and wait for their answers, at most three seconds."""
+        self._named = frozenset(expected)
         epoch = estop_id or new_epoch()
         if self._press[0] != epoch:
             self.press(epoch)
@@ -71,26 +81,32 @@ class MeshController:
                     alarms[name] = why
                 elif name not in answers or answers[name].stopped is not True or answers[name].claimed:
                     answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000, claimed=bool(why))
-            silent = tuple(sorted(set(expected) - answers.keys()))
+            silent = tuple(sorted(self._named - answers.keys()))
             elapsed = (time.monotonic() - pressed.at) * 1000
             on_progress(Progress(epoch, dict(answers), silent, self.link_up, elapsed, alarms=dict(alarms)))
 
-        note([])
         up = self.link_up
+        self._reports.inbox.open(epoch, on_report)
         note(self._mesh.emergency_stop(self._key, estop_id=epoch, on_answers=note))
-        robots = {*expected, *lockable_peers(self._mesh)}
+        self._reports.inbox.close(epoch)
+        robots = {*self._named, *lockable_peers(self._mesh)}
         told = {name: each for name, each in answers.items() if name in robots}
         return StopReport(
             epoch,
             {name: each for name, each in told.items() if each.stopped is True and not each.claimed},
             {name: each for name, each in told.items() if each.stopped is not True},
             {},
-            tuple(sorted(set(expected) - told.keys() - alarms.keys())),
+            tuple(sorted(self._named - told.keys() - alarms.keys())),
             up,
             (time.monotonic() - pressed.at) * 1000,
             claimed={name: each for name, each in told.items() if each.stopped is True and each.claimed},
             alarms=alarms,
         )
+
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer; the mesh asks those in reach by itself."""
+        self._named |= frozenset(names)
+        return True
 
     def review(self, report: StopReport) -> StopReport:
         """Return the report as it is: a peer answers a stop once."""

@@ -92,7 +92,7 @@ class StopOutcome:
         """Return what a script reads besides the report's own fields."""
         return {
             "roster": {"size": self.size, "still": len(self.report.stopped), "enrolled": self.roster.enrolled},
-            "reasons": dict(self.reasons),
+            "reasons": dict(list(self.reasons.items())[:NAMED_MAX]),
             "retired": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "retired"],
             "off": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "off"],
             "elsewhere": self.roster.elsewhere,
