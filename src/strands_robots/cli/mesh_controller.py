@@ -12,7 +12,9 @@ from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import ALARM
+from strands_robots.safety.stop_roster import robots_known_at
 from strands_robots.safety.stopping import explain
 from strands_robots.tools.networks import stop_outcome
 
@@ -55,14 +57,22 @@ class MeshController:
         *,
         estop_id: str = "",
         on_progress: OnProgress = lambda progress: None,
+        scope: Scope = EVERY_ROBOT,
     ) -> StopReport:
-        """Stop every peer of the mesh and wait for their answers, at most three seconds."""
+        """Stop every peer of the mesh, or those of ``scope``, and wait at most 3 s.
+
+        Where no robot in the scope is there, every robot is stopped.
+        """
+        from strands_robots.mesh.session import network  # noqa: PLC0415 - loaded when it is used
+
         epoch = estop_id or new_epoch()
         if self._press[0] != epoch:
             self.press(epoch)
         pressed = self._press[1]
         answers: dict[str, Answer] = {}
         alarms: dict[str, str] = {}
+        widened: list[bool] = []
+        expected = frozenset(expected) | scope.only
 
         def note(replies: list[dict[str, Any]]) -> None:
             for reply in replies:
@@ -73,11 +83,31 @@ class MeshController:
                     answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000, claimed=bool(why))
             silent = tuple(sorted(set(expected) - answers.keys()))
             elapsed = (time.monotonic() - pressed.at) * 1000
-            on_progress(Progress(epoch, dict(answers), silent, self.link_up, elapsed, alarms=dict(alarms)))
+            on_progress(
+                Progress(
+                    epoch,
+                    dict(answers),
+                    silent,
+                    self.link_up,
+                    elapsed,
+                    alarms=dict(alarms),
+                    scope=scope,
+                    widened=bool(widened),
+                )
+            )
 
         note([])
         up = self.link_up
-        note(self._mesh.emergency_stop(self._key, estop_id=epoch, on_answers=note))
+        note(
+            self._mesh.emergency_stop(
+                self._key,
+                estop_id=epoch,
+                on_answers=note,
+                scope=scope,
+                remembers=robots_known_at(network),
+                on_widened=lambda: widened.append(True),
+            )
+        )
         robots = {*expected, *lockable_peers(self._mesh)}
         told = {name: each for name, each in answers.items() if name in robots}
         return StopReport(
@@ -90,6 +120,8 @@ class MeshController:
             (time.monotonic() - pressed.at) * 1000,
             claimed={name: each for name, each in told.items() if each.stopped is True and each.claimed},
             alarms=alarms,
+            scope=scope,
+            widened=bool(widened),
         )
 
     def review(self, report: StopReport) -> StopReport:

@@ -95,7 +95,8 @@ def say_outcome(screen: Screen, outcome: StopOutcome) -> None:
 
 def outcome_lines(outcome: StopOutcome) -> list[str]:
     """Return the sentences on groups, on missing robots, and on other networks."""
-    lines = [plain(f"{each[:1].upper()}{each[1:].rstrip('.')}.", 500) for each in outcome.problems]
+    lines = [scope_line(outcome.report)] if scope_line(outcome.report) else []
+    lines += [plain(f"{each[:1].upper()}{each[1:].rstrip('.')}.", 500) for each in outcome.problems]
     lines += [outcome.worth] if outcome.worth else []
     lines += [group_line(outcome)] if group_line(outcome) else []
     if outcome.unproven:
@@ -110,6 +111,15 @@ def outcome_lines(outcome: StopOutcome) -> list[str]:
     if outcome.report.silent and not outcome.sending.tells:
         lines.append(UNTOLD)
     return lines
+
+
+def scope_line(report: StopReport | Progress) -> str:
+    """Return the sentence on a stop of some robots, or ""."""
+    if report.widened:
+        return f"NO ROBOT WAS THERE for {report.scope}: EVERY ROBOT WAS STOPPED."
+    if report.scope.everything:
+        return ""
+    return f"This stop was for {report.scope}. Bare devices and robots of earlier releases stop all the same."
 
 
 def group_line(outcome: StopOutcome) -> str:

@@ -6,20 +6,23 @@ from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.enrollment import enrolled_robots
+from strands_robots.device_connect.enrollment import enrolled_robots, network_of
 from strands_robots.device_connect.links import usual_link
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.controller import SafetyController, StopReport
+from strands_robots.safety.stop_roster import robots_known_at
 
 
 def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
     """Return a :class:`SafetyController` on ``link``, else on the environment's.
 
-    Further arguments are those of :class:`SafetyController`. The robots enrolled at this machine have to sign.
+    Further arguments are those of :class:`SafetyController`. The robots enrolled at this machine have to sign, and its
+    roster says whether a stop of some robots means one that is known.
     """
     link = link or usual_link()
     options.setdefault("enrolled", lambda: enrolled_robots(link))
+    options.setdefault("remembers", robots_known_at(lambda: network_of(link)))
     return SafetyController(controller_id, lambda: stop_link(link), **options)
 
 

@@ -18,7 +18,9 @@ from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import ALARM
+from strands_robots.safety.stop_roster import robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import MissingExtraError, ValidationError
 
@@ -160,16 +162,26 @@ class NativeMesh:
 
         return _on_mesh(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str, signing_key: Any = None) -> Envelope:
+    def emergency_stop(self, reason: str, signing_key: Any = None, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
         A peer that was seen and did not answer is named. Every repetition is the same stop, ``estop_id``.
+
+        Args:
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
         """
         estop_id = new_epoch()
 
         def stopped(mesh: Mesh) -> Envelope:
+            if not scope.everything:
+                some = _stop_some(mesh, scope, signing_key, estop_id)
+                if some is not None:
+                    return some
             answer = _stop_all(mesh, lambda: mesh.emergency_stop(signing_key, estop_id=estop_id))
-            return {**answer, "estop_id": estop_id}
+            if not scope.everything:
+                why = f"No robot was there for {scope}, so every robot was stopped. {text_of(answer)}"
+                answer = {**error(why, **{**_fields(answer), "stopped": answer.get("stopped")}), "widened": True}
+            return {**answer, "estop_id": estop_id, **scope.field()}
 
         return _on_mesh(stopped, stopped=None)
 
@@ -211,6 +223,39 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
         send()
     silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in seen}
     return combined_verdict(silent | answers)
+
+
+def _stop_some(mesh: Mesh, scope: Scope, signing_key: Any, estop_id: str) -> Envelope | None:
+    """Stop the robots of a scope; None where none of them is there."""
+    from strands_robots.mesh.session import network as mesh_network  # noqa: PLC0415 - loaded when it is used
+
+    widened: list[bool] = []
+    replies = mesh.emergency_stop(
+        signing_key,
+        estop_id=estop_id,
+        scope=scope,
+        remembers=robots_known_at(mesh_network),
+        on_widened=lambda: widened.append(True),
+    )
+    if widened:
+        return None
+    keys = enrolled_peers()
+    answers = {str(each["responder_id"]): _stop_answer(str(each["responder_id"]), each, keys) for each in replies}
+    free = [
+        str(each["responder_id"])
+        for each in replies
+        if not (isinstance(each.get("result"), Mapping) and each["result"].get("locked") is True)
+    ]
+    expected = scope.only or {
+        row["peer_id"] for row in mesh.peers if row["reachable"] and row.get("cell") == scope.cell
+    }
+    silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in expected}
+    answer = combined_verdict(silent | answers)
+    return {**answer, "estop_id": estop_id, **scope.field(), **({"not_locked": free} if free else {})}
+
+
+def _fields(answer: Envelope) -> dict[str, Any]:
+    return {name: value for name, value in answer.items() if name not in ("status", "content", "reason")}
 
 
 def _stop_answer(target: str, reply: dict[str, Any], keys: Mapping[str, bytes] | None) -> Envelope:
@@ -321,18 +366,21 @@ class DeviceConnect:
 
         return _on_fleet(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str) -> Envelope:
+    def emergency_stop(self, reason: str, signing_key: None = None, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Send an emergency stop on a connection of its own; answers by name.
 
         A device that is in reach and did not answer it gets a plain ``stop`` as well.
+
+        Args:
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
         """
-        return _on_fleet(lambda fleet: stop_and_lock(fleet, reason), stopped=None)
+        return _on_fleet(lambda fleet: stop_and_lock(fleet, reason, scope), stopped=None)
 
 
-def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
+def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
     """Send an emergency stop under the client's name; answers by name.
 
-    A device that is in reach and did not answer it gets a plain ``stop`` as well.
+    A device of its scope that is in reach and did not answer it gets a plain ``stop`` as well.
     """
     from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415
 
@@ -340,12 +388,17 @@ def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
         controller = safety_controller(fleet.source, fleet.link)
         try:
             seen = pool.submit(fleet.peers)
-            report = controller.stop((), reason, deadline_s=ESTOP_S)
+            report = controller.stop((), reason, deadline_s=ESTOP_S, scope=scope)
         finally:
             controller.close()
     failed = {**report.not_stopped, **report.refused}
     rest = [
-        peer.id for peer in seen.result() if peer.stop_verb and peer.id not in failed and peer.id not in report.stopped
+        peer.id
+        for peer in seen.result()
+        if peer.stop_verb
+        and peer.id not in failed
+        and peer.id not in report.stopped
+        and (report.widened or scope.covers(peer.id, {peer.cell or ""} - {""}))
     ]
     if not rest:
         return envelope(report)
