@@ -110,7 +110,7 @@ class Peer:
 
     @property
     def cell(self) -> str | None:
-        """The cell that it is in, "" for none; None where it states neither, and reads no scope of a stop."""
+        """Its cell, "" for none; None where it states neither, and reads no scope."""
         cell = self.status.get("cell")
         return cell if isinstance(cell, str) else None
 
